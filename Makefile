@@ -1,6 +1,7 @@
 # make demo: set everything up, detect what is in the demo run, compare it with the truth, make a page.
 # make test: set everything up, compile the kernels, pass the tests.
 # make docs: the documentation as a site, build/docs/index.html; what leads nowhere is an error.
+# make figures: measure everything that documents quote, and put it into them (tools/evaluation/figures.mk); half an hour.
 # make package: build wheel and source distribution, install and use each in an empty environment.
 # make lowest: pass the tests of what packages are used for, with the lowest versions that are allowed.
 # make lowest-more: pass more of them with these versions; takes long.
@@ -13,7 +14,7 @@ BIN := $(VENV)/bin
 # What Python has compiled once is kept, whatever the environment says: tests start many processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo kernels test check lint docs package lowest lowest-more lowest-setup audit clean setup
+.PHONY: demo kernels test check lint docs figures package lowest lowest-more lowest-setup audit clean setup
 
 # The environment is made anew whenever it is not complete, was moved, or pyproject.toml has changed.
 setup:
@@ -53,6 +54,10 @@ lint: setup
 
 docs: setup
 	$(BIN)/sphinx-build -q -j 2 --fail-on-warning docs build/docs
+
+# A figure is made again where code is newer than it is; no figure depends on documents.
+figures: setup
+	$(MAKE) -f tools/evaluation/figures.mk BIN=$(BIN)
 
 package: setup
 	$(BIN)/python tools/try_package.py

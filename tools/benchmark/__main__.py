@@ -14,13 +14,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from detect import __version__
+from detect.cli import carry_out
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from redetect.array_types import ByteArray
-from redetect.storage.command_line import exit_code_of
 from tools.benchmark import functions as f
 from tools.benchmark.material import (
     Picture,
@@ -38,7 +37,8 @@ from tools.benchmark.material import (
     wall_with_edges,
 )
 from tools.benchmark.timing import decodings, measure_in_turn, number, spread
-from tools.evaluation.tables import markdown_table
+from tools.evaluation.figures import Figures, Study, run_quietly, study_main
+from tools.evaluation.tables import Table
 
 #: Pictures of each point of the growth curves.
 _GROWTH_PICTURES = 2
@@ -51,7 +51,7 @@ Cases = Iterable[tuple[str, Sequence[Picture], dict[str, f.Function]]]
 
 
 @dataclass(frozen=True)
-class Benchmark:
+class Benchmark(Study):
     """Time the detectors, their parts and peers side by side, in one process.
 
     Prints Markdown tables: ratios to decoding first, since they hold on any machine.
@@ -71,7 +71,7 @@ class Benchmark:
     jobs: tuple[int, ...] = (1, 2)  # Numbers of jobs, for the growing runs.
     seed: int = 0  # Of noise and places.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         import cv2
         import numba
 
@@ -80,11 +80,7 @@ class Benchmark:
         numba.set_num_threads(1)
         run = open_run(self.run)
         detectors = f.whole_detectors(run.camera)
-        settings = (
-            f"{key} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
-            for key, value in vars(self).items()
-        )
-        print(f"- {this_machine()}\n- settings: {', '.join(settings)}\n")
+        print(f"- {this_machine()}\n- settings: {self}\n")
         print("Median processor time per image, in times that decoding the same image takes "
               "(quartiles; milliseconds):\n")  # fmt: skip
         self._print_table(self._kinds(run))
@@ -107,8 +103,10 @@ class Benchmark:
               "decodes the same files, or reads and decodes them, for comparison:\n")  # fmt: skip
         head = ("command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
                 "times one job", "decoding alone", "with reading")  # fmt: skip
-        print("\n".join(markdown_table(head, self._runs(run))))
-        return 0
+        table = Table(dict.fromkeys(head, "<"), keys=3)
+        for row in self._runs(run):
+            table.row(*row)
+        return table.figures
 
     def _kinds(self, run: Run) -> Cases:
         everything = {**f.all_detectors(run.camera), **f.peers()}
@@ -134,16 +132,16 @@ class Benchmark:
             bound = {name: _on_each(of, pictures) for name, of in timed.items()}
             seconds = measure_in_turn(bound, len(pictures), self.rounds, self.budget_s)
             columns[case] = decodings(seconds, f.DECODING)
-        names = next(iter(columns.values()), {})
-        rows = ([name, *(column[name] for column in columns.values())] for name in names)
-        print("\n".join(markdown_table(["", *columns], rows)))
+        table = Table(dict.fromkeys(["", *columns], "<"))
+        for name in next(iter(columns.values()), {}):
+            table.row(name, *(column[name] for column in columns.values()))
 
     def _runs(self, run: Run) -> Iterator[list[str]]:
         """Whole runs: all commands once, and `detect all` over growing lengths and jobs."""
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             for command in f.commands(self.run, folder).values():
-                f.perform(command)  # compiles what is to be compiled
+                perform(command)  # compiles what is to be compiled
             whole = repeated_run(run, folder / "whole", self.run_frames)
             every = [(command, 1) for command in f.commands(whole, folder)]
             yield from measure_runs(whole, every, folder, self.run_rounds)
@@ -151,6 +149,11 @@ class Benchmark:
                 growing = repeated_run(run, folder / f"frames{frames}", frames)
                 by_jobs = [("detect all", jobs) for jobs in self.jobs]
                 yield from measure_runs(growing, by_jobs, folder, self.run_rounds)
+
+
+def perform(command: f.Command) -> None:
+    """Carry out a command as ``detect`` does, but silently."""
+    run_quietly("detect", lambda: carry_out(command))
 
 
 def _on_each(function: f.Function, pictures: Sequence[Picture]) -> Callable[[int], object]:
@@ -172,13 +175,13 @@ def measure_runs(
         for content in contents:
             decode(content)
 
-    def perform(name: str, jobs: int, _: int) -> None:
-        f.perform(f.commands(run, folder, jobs)[name])
+    def timed(name: str, jobs: int, _: int) -> None:
+        perform(f.commands(run, folder, jobs)[name])
 
     functions: dict[str, Callable[[int], object]] = {
         "decoding": lambda _: decode_all(files),
         "reading": lambda _: decode_all(np.fromfile(path, np.uint8) for path in paths),
-        **{f"{name} {jobs}": partial(perform, name, jobs) for name, jobs in chosen},
+        **{f"{name} {jobs}": partial(timed, name, jobs) for name, jobs in chosen},
     }
     # By the clock on the wall, since jobs are processes of their own.
     seconds = measure_in_turn(
@@ -211,8 +214,7 @@ def this_machine() -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    command = tyro.cli(Benchmark, prog="python -m tools.benchmark", args=arguments)
-    return exit_code_of(command)
+    return study_main(Benchmark, "python -m tools.benchmark", arguments or sys.argv[1:])
 
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +9,6 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
-from detect.cli import carry_out
 from detect.discs.quality import quality_of_centres
 from detect.grey_values import estimate_noise
 from detect.levelling import levelled
@@ -22,7 +19,7 @@ from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
-from tools.benchmark.material import BenchmarkError, Picture
+from tools.benchmark.material import Picture
 
 #: What everything else is compared with.
 DECODING = "decoding"
@@ -114,19 +111,3 @@ def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
         "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),
         "detect all": All(run=run, output=output, force=True, jobs=jobs),
     }
-
-
-def perform(command: Command) -> None:
-    """Carry out a command as ``detect`` does, but silently.
-
-    Raises
-    ------
-    BenchmarkError
-        If it does not end well.
-    """
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        code = carry_out(command)
-    if code != 0:
-        report = " ".join(said.getvalue().split())
-        raise BenchmarkError(f"detect ended with {code}: expected 0: {report}")

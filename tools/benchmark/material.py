@@ -14,13 +14,9 @@ from camera import Camera, write_camera
 from detect.sources.interface import Run
 from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import Frame, write_frames
-from tools.simulator.markers.things import photograph_files
+from tools.evaluation.figures import StudyError
+from tools.simulator.markers.things import photograph_files, photograph_of
 from tools.simulator.single_disc import render_disc
-
-
-class BenchmarkError(ValueError):
-    """A benchmark could not be carried out; the message says what was expected."""
-
 
 _JPEG_QUALITY = 90
 
@@ -45,7 +41,7 @@ def decode(encoded: ByteArray) -> ByteArray:
 
     grey = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
     if grey is None:
-        raise BenchmarkError("an image file's content cannot be decoded: expected an image")
+        raise StudyError("an image file's content cannot be decoded: expected an image")
     return np.asarray(grey, dtype=np.uint8)
 
 
@@ -61,7 +57,7 @@ def run_pictures(run: Run, count: int) -> list[Picture]:
     """Some frames of a run, evenly spread over it, as their files are."""
     paths = _spread_out([frame.image for frame in run.frames if frame.image is not None], count)
     if not paths:
-        raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
+        raise StudyError(f"{run.folder}: no frame has an image: expected at least one")
     files = [np.fromfile(path, np.uint8) for path in paths]
     return [Picture(content, decode(content)) for content in files]
 
@@ -79,10 +75,8 @@ def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Pictur
 
     pictures = []
     for path in _spread_out(list(photograph_files(folder)), count):
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if grey is None:
-            raise BenchmarkError(f"{path}: cannot be decoded: expected an image")
-        scaled = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        size = camera.width, camera.height
+        scaled = cv2.resize(photograph_of(path), size, interpolation=cv2.INTER_AREA)
         pictures.append(jpeg_picture(np.asarray(scaled, dtype=np.uint8)))
     return pictures
 
@@ -123,7 +117,7 @@ def repeated_run(run: Run, folder: Path, frames: int, most_copies: int | None = 
     """
     sources = [(frame.image, frame.step) for frame in run.frames if frame.image is not None]
     if not sources:
-        raise BenchmarkError(f"{run.folder}: no frame has an image: expected at least one")
+        raise StudyError(f"{run.folder}: no frame has an image: expected at least one")
     (folder / "images").mkdir(parents=True)
     write_camera(run.camera, folder / f"{folder.name}.cam")
     count = max(_MOST_COPIES if most_copies is None else most_copies, len(sources))
@@ -184,7 +178,7 @@ def disc_places(camera: Camera, count: int, seed: int) -> FloatArray:
         near = float(np.hypot(*place)) <= _FARTHEST_M  # false for NaN, above the horizon
         if near and np.all(np.hypot(*(places - place).T) >= _APART_M):
             places = np.vstack([places, place])
-    raise BenchmarkError(f"{count} discs do not find room on the floor: expected fewer")
+    raise StudyError(f"{count} discs do not find room on the floor: expected fewer")
 
 
 def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-import tyro
+from tools.evaluation.figures import study_main
 
-from redetect.storage.command_line import exit_code_of
-
-#: Module and class of each study: a dataclass of its flags, which carries it out when called.
+#: Module and class of each study.
 STUDIES = {
     "accuracy": "accuracy.AccuracyStudy",
     "association": "association.Association",
@@ -17,6 +15,7 @@ STUDIES = {
     "camera-photographs": "calibration.CameraPhotographs",
     "camera-rendered": "calibration.CameraRendered",
     "disturbed": "disturbed.Disturbed",
+    "documents": "figures.Documents",
     "fusion": "sessions.FusionStudy",
     "joining": "association.Joining",
     "joining-pairs": "association.JoiningPairs",
@@ -26,6 +25,7 @@ STUDIES = {
     "markers": "markers.Markers",
     "photographs": "detection.Photographs",
     "pictures": "pictures.Pictures",
+    "programs": "figures.Programs",
     "real-run": "real_run.RealRun",
     "rendered": "detection.Rendered",
     "tilt": "detection.Tilt",
@@ -46,8 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 0 if asked else 2
     module, _, study = STUDIES[name].partition(".")
     options = getattr(import_module(f"tools.evaluation.{module}"), study)
-    command = tyro.cli(options, prog=f"python -m tools.evaluation {name}", args=flags)
-    return exit_code_of(command)
+    return study_main(options, f"python -m tools.evaluation {name}", flags)
 
 
 if __name__ == "__main__":

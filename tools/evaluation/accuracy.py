@@ -19,6 +19,7 @@ from lut import cached_vote_table
 from lut.outlines import floor_positions, pixels_within, size_down
 from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
 
@@ -35,11 +36,6 @@ class Accuracy:
     normalised_error: FloatArray
     """(N,) Squared error over the predicted covariance, per degree of freedom."""
     failed: int  # Discs that were not found.
-
-    @property
-    def rms_px(self) -> float:
-        """Root mean square of the errors of either coordinate, pixels."""
-        return float(np.sqrt(np.mean(self.error_px**2)))
 
 
 @dataclass(frozen=True)
@@ -94,18 +90,18 @@ def _render(
 
 
 @dataclass(frozen=True)
-class AccuracyStudy:
+class AccuracyStudy(Study):
     """Refined centres of rendered single discs against the truth, by blur and distance."""
 
     camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
     discs: int = 400  # Discs per blur.
     seed: int = 1  # Of places and noise.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         table = Table(
             {"blur px": ".1f", "distance m": "<10", "discs": "d", "rms u px": "9.4f",
-             "rms v px": "9.4f", "normalised error^2 / dof": ".3f"}
+             "rms v px": "9.4f", "both px": "8.4f", "normalised": ".3f"}, keys=2
         )  # fmt: skip
         for blur_px in _BLURS_PX:
             settings, scene = CircleSettings(tilt_sigma_deg=0.0), Scene(blur_px=blur_px)
@@ -114,8 +110,8 @@ class AccuracyStudy:
             for label, low, high in [*bins, ("all", 0.0, np.inf)]:
                 chosen = (result.distance_m >= low) & (result.distance_m < high)
                 if chosen.any():
-                    rms = np.sqrt(np.mean(result.error_px[chosen] ** 2, axis=0))
+                    squares = np.mean(result.error_px[chosen] ** 2, axis=0)
+                    rms = *np.sqrt(squares), np.sqrt(squares.mean())
                     normalised = result.normalised_error[chosen].mean()
                     table.row(blur_px, label, chosen.sum(), *rms, normalised)
-            print(f"both coordinates {result.rms_px:.4f} px rms, {result.failed} failed")
-        return 0
+        return {"rendered": self.discs, **table.figures}

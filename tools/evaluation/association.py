@@ -23,11 +23,12 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import first_poses, joined, read_recording
 from redetect.slam.settings import AssociateSettings
+from tools.evaluation.figures import Figures, Study, print_figures
 from tools.evaluation.tables import Table
 
 
 @dataclass(frozen=True)
-class Association:
+class Association(Study):
     """Associate runs with each method at several levels of noise, and score the results.
 
     They are compared with the runs' own IDs, before and after the map level.
@@ -42,11 +43,11 @@ class Association:
     sigma_scale: float = 1.4  # Factor on the discs' standard deviations in all gates.
     seed: int = 1  # Of the noise.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         table = Table(
             {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
              "precision": ".4f", "recall": ".4f", "rows right": ".4f", "landmarks": "d",
-             "true": "d", "wrong merges": "d", "splits": "d", "s": "6.1f"}
+             "true": "d", "wrong merges": "d", "splits": "d", "s": "6.1f"}, keys=5
         )  # fmt: skip
         for path in self.runs:
             name = path.name if path.is_dir() else f"{path.parent.name}/"
@@ -68,11 +69,11 @@ class Association:
                             s.right_rows, s.found_landmarks, s.true_landmarks, s.wrong_merges,
                             s.splits, seconds,
                         )  # fmt: skip
-        return 0
+        return table.figures
 
 
 @dataclass(frozen=True)
-class WakingUp:
+class WakingUp(Study):
     """Let a robot wake up along a run, its identifiers unknown, and compare with a known path."""
 
     run: Positional[Path]  # Run folder or `.circles` file.
@@ -80,7 +81,7 @@ class WakingUp:
     path: Path  # `path.csv` of the same run in that map.
     every: int = 50  # Frames from one waking to the next.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         recording, discs = read_recording(self.run), read_map(self.map).discs.xy
         poses = read_path(self.path).poses
         off, turned, taken, squared = [], [], [], []
@@ -95,18 +96,16 @@ class WakingUp:
             turned.append(abs(np.degrees(difference[2])))
             taken.append(woken.frames)
             squared.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
-        print(f"{len(off)} of {len(starts)} times it knew where it was")
-        if off:
-            print(
-                f"off by {np.median(off):.2f} m and {np.median(turned):.1f} deg (medians), at most "
-                f"{max(off):.2f} m and {max(turned):.1f} deg; after {np.median(taken):.0f} frames "
-                f"(median), at most {max(taken)}; error^2 / sigma^2 {np.mean(squared):.2f}"
-            )
-        return 0
+        table = Table({"": "<6", "off m": ".2f", "turned deg": ".1f", "after frames": ".0f"})
+        for name, of in (("median", np.median), ("most", np.max)):
+            table.row(name, *(of(values) if values else np.nan for values in (off, turned, taken)))
+        known = {"known": len(off), "times": len(starts), "normalised": np.mean(squared)}
+        print_figures(known)
+        return {**known, **table.figures}
 
 
 @dataclass(frozen=True)
-class Joining:
+class Joining(Study):
     """Cut a run into several, join them without their identifiers, and compare with the whole.
 
     Each part is in a frame of its own. The whole is associated and mapped the same way.
@@ -115,7 +114,7 @@ class Joining:
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
     at: tuple[int, ...] = ()  # The frames with which new runs begin; by default half way.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         whole = read_recording(self.run)
         starts = [0, *(self.at or (len(whole) // 2,))]
         parts = [whole.part(a, b) for a, b in zip(starts, [*starts[1:], len(whole)])]
@@ -123,12 +122,7 @@ class Joining:
         began = time.thread_time()
         found = associate_run(recording)
         seconds = time.thread_time() - began
-        s = score_run(recording, found)["circles"]["map"]
-        print(
-            f"precision {s.pair_precision:.4f}, recall {s.pair_recall:.4f}, rows right "
-            f"{s.right_rows:.4f}, landmarks {s.found_landmarks} of {s.true_landmarks}, wrong "
-            f"merges {s.wrong_merges}, splits {s.splits}, {seconds:.1f} s"
-        )
+        score = score_run(recording, found)["circles"]["map"]
         apart, one = (
             map_run(replace(run, circles=replace(run.circles, ids=labels)))
             for run, labels in (
@@ -136,28 +130,31 @@ class Joining:
                 (whole, associate_run(whole).circle_labels),
             )
         )
-        print(f"chi-squared factor {apart.table.factor:.2f}, of the whole {one.table.factor:.2f}")
+        figures = {
+            **vars(score), "factor": apart.table.factor, "factor of the whole": one.table.factor,
+            "seconds": seconds,
+        }  # fmt: skip
+        print_figures(figures)
+        table = Table({"run": "d", "frames": "d", "median m": ".3f", "median deg": ".2f",
+                       "most m": ".3f", "most deg": ".2f"})  # fmt: skip
         for k, (first, start) in enumerate(zip(first_poses(parts), starts)):
             poses = apart.estimate.poses[first : first + len(parts[k]) + 1]
             off = poses - one.estimate.poses[start : start + len(poses)]
             distance, turn = np.hypot(*off[:, :2].T), np.degrees(np.abs(wrap_angle(off[:, 2])))
-            print(
-                f"run {k + 1}: {len(parts[k])} frames; its path off the whole's by "
-                f"{np.median(distance):.3f} m and {np.median(turn):.2f} deg (medians), at most "
-                f"{distance.max():.3f} m and {turn.max():.2f} deg"
-            )
-        return 0
+            table.row(k + 1, len(parts[k]), np.median(distance), np.median(turn), distance.max(),
+                      turn.max())  # fmt: skip
+        return {**figures, "path off the whole's": table.figures}
 
 
 @dataclass(frozen=True)
-class JoiningPairs:
+class JoiningPairs(Study):
     """Cut a run into pieces, join each with each other one, and see which have discs in common."""
 
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
     frames: int = 300  # In a piece.
     least: int = 5  # Discs that pieces have in common if they show one place.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         whole = read_recording(self.run)
         starts = range(0, len(whole) - self.frames + 1, self.frames)
         pieces = [whole.part(start, start + self.frames) for start in starts]
@@ -175,9 +172,9 @@ class JoiningPairs:
             score = score_run(both, found)["circles"]["map"]
             off.append(score.pair_precision)
             wrong += score.wrong_merges
-        print(
-            f"{joined_pairs[True]} of {counts[True]} pairs with {self.least} or more discs in "
-            f"common joined, and {joined_pairs[False]} of the {counts[False]} others; precision "
-            f"{np.mean(off):.4f} on average, {min(off):.4f} at least, wrong merges {wrong}"
-        )
-        return 0
+        table = Table({"discs in common": "<", "pairs": "d", "joined": "d"})
+        table.row(f"{self.least} or more", counts[True], joined_pairs[True])
+        table.row("fewer", counts[False], joined_pairs[False])
+        figures = {"precision": np.mean(off), "least precision": min(off), "wrong merges": wrong}
+        print_figures(figures)
+        return {**table.figures, **figures}

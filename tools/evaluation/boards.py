@@ -15,6 +15,7 @@ from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError
+from tools.evaluation.figures import Figures, Study
 
 #: Standard deviations of a board's turns about its axes.
 _TILTS_RAD = np.array([0.45, 0.45, 0.3])
@@ -194,7 +195,7 @@ FLOOR_ORIGIN = (0.0, -1.3)
 
 
 @dataclass(frozen=True)
-class TutorialPhotographs:
+class TutorialPhotographs(Study):
     """Render the tutorial's photographs through the demo run's camera, so that truth is known."""
 
     output: Positional[Path]  # Folder for `boards/*.png` and `floor.png`.
@@ -202,7 +203,7 @@ class TutorialPhotographs:
     count: int = 14  # Photographs of the board in the hand.
     seed: int = 3  # Of the board's places, and the noise.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         import cv2
 
         camera = read_camera(self.camera)
@@ -224,4 +225,4 @@ class TutorialPhotographs:
         cv2.imwrite(str(self.output / "floor.png"), image)
         print(f"{boards}: {self.count} photographs of a board")
         print(f"{self.output / 'floor.png'}: it lies {-FLOOR_ORIGIN[1]:g} m ahead")
-        return 0
+        return {}

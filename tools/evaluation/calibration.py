@@ -19,13 +19,10 @@ from camera.calibration.choice import holdout_error
 from camera.calibration.images import read_grey
 from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
-from camera.uncertainty import (
-    intrinsics_of,
-    projection_sigma,
-    with_intrinsics,
-)
+from camera.uncertainty import intrinsics_of, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 
 BOARDS = {
@@ -205,21 +202,18 @@ def compare(
     return Comparison(len(points.counts), len(points.board), lens, errors)
 
 
-_TYPES = ("checkerboard", "charuco", "asymmetric-circles")
-
-
 @dataclass(frozen=True)
-class CameraRendered:
+class CameraRendered(Study):
     """Calibrate from rendered pictures of a known camera: noise floor, and how near the truth."""
 
     camera: Positional[Path]  # The true camera.
-    boards: tuple[str, ...] = _TYPES  # `checkerboard`, `charuco`, `asymmetric-circles`.
+    boards: tuple[str, ...] = tuple(BOARDS)  # `checkerboard`, `charuco`, `asymmetric-circles`.
     views: int = 24  # Pictures.
     blur_px: float = 0.6  # Standard deviation of a Gaussian blur.
     noise: float = 2.0  # Standard deviation of a pixel's noise; ink and paper differ by 160.
     seed: int = 7  # Everything random follows from it.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         print("Points' own error, held out, projection (worst, median, predicted) in px")
         table = Table(
@@ -242,11 +236,11 @@ class CameraRendered:
                 result.holdout_px[result.lens], turned.max(), fixed, np.median(turned),
                 sigma.max(), np.median(sigma),
             )  # fmt: skip
-        return 0
+        return table.figures
 
 
 @dataclass(frozen=True)
-class CameraPhotographs:
+class CameraPhotographs(Study):
     """Hold-out error on photographs of disc boards, against OpenCV's models.
 
     The points are the centroids of the discs, found from where the truth has them; both
@@ -258,7 +252,7 @@ class CameraPhotographs:
     free_aspect: bool = True  # Both scales free, as OpenCV has them; else equal.
     polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
         errors = dict.fromkeys(("ours", "rational", "radial"), "8.4f")
         table = Table(
@@ -271,4 +265,4 @@ class CameraPhotographs:
             )
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
-        return 0
+        return table.figures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -11,21 +12,28 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 from tyro.conf import Positional
 
-from detect.comparison.compare import compare_with_file
-from detect.comparison.result import DiscComparison
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.runs.plan import FramePlan, Job, Known
 from detect.runs.stream import detect_run
 from detect.settings import CircleSettings, Polarity
 from detect.sources.opening import open_run
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import FrameTilt, read_frames, read_tilts, squared_mahalanobis
+from redetect.landmarks.arrays import circle_arrays
+from tools.evaluation.figures import Figures, Study, StudyError, compared, print_figures
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
+#: Rows this near a disc of a photograph have found it; the scorer has the same limit.
+_MATCH_M = 0.05
+#: A line of that scorer, and what its numbers are.
+_LINE = re.compile(
+    r"(\S+) +images +(\d+) discs +(\d+) recall +([\d.]+) +FP/img +([\d.]+) +err mm med +([\d.]+)"
+)
+_NAMES = ("images", "discs", "recall", "false", "median_mm")
 
 
 def _detect(
@@ -45,45 +53,64 @@ def _detect_lines(run: Path, settings: LineSettings, output: Path) -> dict[str, 
     return read_tilts(tilts)
 
 
-def _score(script: Path, *arguments: object, folder: str | None = None) -> int:
+def _scored(script: Path, *arguments: object, folder: str | None = None) -> str:
+    """What a scorer prints, which is printed, too."""
     # A scorer may bring a module named camera: in a folder of its own it does not find ours.
     words = [sys.executable, str(script.resolve()), *map(str, arguments)]
-    return subprocess.run(words, check=False, cwd=folder).returncode
-
-
-def _score_photographs(data: Path, kind: str, settings: Any) -> int:
-    """Detect one kind of landmarks in every folder below `data`/dev, and score the files."""
-    with tempfile.TemporaryDirectory() as folder:
-        files = []
-        for run in sorted(path.parent for path in data.glob("dev/*/truth.json")):
-            files.append(Path(folder) / f"{run.name}.{kind}")
-            _detect(run, {kind: files[-1]}, **{kind: settings})
-        return _score(data / "evaluate.py", f"--{kind}", *files)
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False, cwd=folder)
+    print(done.stdout, end="", flush=True)
+    if done.returncode != 0:
+        raise StudyError(f"{script} ended with {done.returncode}")
+    return done.stdout
 
 
 @dataclass(frozen=True)
-class Photographs:
+class Photographs(Study):
     """Detect the discs of every folder below DATA/dev and score them with DATA/evaluate.py."""
 
     data: Positional[Path] = Path("../shared/data/discs")  # Folder with `evaluate.py` and `dev`.
 
-    def __call__(self) -> int:
-        return _score_photographs(self.data, "circles", CircleSettings())
+    def measured(self) -> Figures:
+        normalised: list[float] = []
+        with tempfile.TemporaryDirectory() as folder:
+            files = []
+            for truth in sorted(self.data.glob("dev/*/truth.json")):
+                files.append(Path(folder) / f"{truth.parent.name}.circles")
+                _detect(truth.parent, {"circles": files[-1]}, circles=CircleSettings())
+                (frame,) = read_frames(files[-1])
+                true = [(d["px"], d["py"]) for d in json.loads(truth.read_text())["discs"]]
+                rows = circle_arrays(frame.circles)
+                distance, nearest = cKDTree(true).query(rows.xy)
+                off = rows.xy - np.array(true)[nearest]
+                squared = squared_mahalanobis(off, rows.covariance)
+                normalised += (squared[distance < _MATCH_M] / 2.0).tolist()
+            text = _scored(self.data / "evaluate.py", "--circles", *files)
+        print(f"normalised error^2 / dof {np.mean(normalised):.2f}")
+        groups = {g: dict(zip(_NAMES, map(float, values))) for g, *values in _LINE.findall(text)}
+        return {"found": len(normalised), "normalised": np.mean(normalised), **groups}
 
 
 @dataclass(frozen=True)
-class Buildings:
+class Buildings(Study):
     """Detect the verticals of every folder below DATA/dev and score them with DATA/evaluate.py."""
 
     data: Positional[Path] = Path("../shared/data/york")  # Folder with `evaluate.py` and `dev`.
     preset: Preset = "default"  # Of the line detector.
 
-    def __call__(self) -> int:
-        return _score_photographs(self.data, "lines", LINE_PRESETS[self.preset])
+    def measured(self) -> Figures:
+        with tempfile.TemporaryDirectory() as folder:
+            files = []
+            for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
+                files.append(Path(folder) / f"{run.name}.lines")
+                _detect(run, {"lines": files[-1]}, lines=LINE_PRESETS[self.preset])
+            scores = Path(folder) / "scores.json"
+            said = _scored(self.data / "evaluate.py", "--lines", *files, "--json", scores)
+            (within,) = re.findall(r"< ?2 sigma ([.\d]+)", said)
+            return {**json.loads(scores.read_text())["lines"], "within_2_sigma": float(within)}
 
 
 @dataclass(frozen=True)
-class Rendered:
+class Rendered(Study):
     """Detect a rendered run's light discs, its verticals and the tilt, and level the discs.
 
     Scored by its evaluate.py: the discs, the verticals, and the discs levelled.
@@ -93,67 +120,52 @@ class Rendered:
     preset: Preset = "default"  # Of the line detector.
     polarity: Polarity = "light"  # Stated to the detector of discs.
 
-    def __call__(self) -> int:
-        code = 0
+    def measured(self) -> Figures:
+        figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             discs, lines, levelled = (
-                Path(folder) / name
-                for name in ("detected.circles", "detected.lines", "levelled.circles")
+                Path(folder) / name for name in ("discs.circles", "lines.lines", "levelled.circles")
             )
             settings = CircleSettings(polarity=self.polarity)
             _detect(self.run, {"circles": discs}, circles=settings)
             tilts = _detect_lines(self.run, LINE_PRESETS[self.preset], lines)
             _detect(self.run, {"circles": levelled}, Known(tilts=tilts), circles=settings)
+            script = self.run.parent / "evaluate.py"
             for path in (discs, lines, levelled):
                 print(path.name, flush=True)
-                code |= _score(self.run.parent / "evaluate.py", self.run.name, path, folder=folder)
-        _print_tilt_errors(self.run, tilts)
-        return code
+                text = _scored(script, self.run.name, path, folder=folder)
+                figures[path.stem] = json.loads(text)
+        return {**figures, "tilt": _tilt_errors(self.run, tilts)}
 
 
 @dataclass(frozen=True)
-class Tilt:
+class Tilt(Study):
     """Detect the tilt of a simulated run, level its discs, and compare both with the truth."""
 
     run: Positional[Path] = Path("images/e")  # Run made by `python -m tools.simulator`.
     tilt_prior_deg: float = LINE_PRESETS["default"].tilt_prior_deg
     """What is known of the tilt beforehand: its standard deviation about level, degrees."""
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
             lines = replace(LINE_PRESETS["default"], tilt_prior_deg=self.tilt_prior_deg)
             tilts = _detect_lines(self.run, lines, Path(folder) / "detected.lines")
-            _print_tilt_errors(self.run, tilts)
+            errors = _tilt_errors(self.run, tilts)
             settings = CircleSettings(polarity="light", far_limit=0.5)
-            table = Table(
-                {"discs": "<17", "median error / m": ".4f", "from 3 m on, by bin / m": "<",
-                 "normalised error^2 / dof": ".2f"}
-            )  # fmt: skip
+            medians = dict.fromkeys(("median m", "3-3.5 m", "3.5-4 m"), ".4f")
+            table = Table({"tilt": "<7", **medians, "normalised": ".2f"})
             for label, known in (("without", Known()), ("with", Known(tilts=tilts))):
                 discs = Path(folder) / f"{label}.circles"
                 _detect(self.run, {"circles": discs}, known, circles=settings)
-                result = compare_with_file(
-                    "circles",
-                    Path(self.run) / "map.circles",
-                    read_frames(discs),
-                    CompareOptions(gate_m=0.3),
-                )
-                assert isinstance(result, DiscComparison)
-                if result.error_median_m is None:
-                    print(f"discs {label} the tilt: none is near one of {result.reference_name}")
-                    continue
-                far = [b for b in result.bins if b.from_m is not None and b.from_m >= 3.0]
-                errors = [b.error_median_m for b in far if b.error_median_m is not None]
-                table.row(
-                    f"{label} the tilt", result.error_median_m,
-                    " ".join(f"{error:.4f}" for error in errors),
-                    result.normalised_error.per_dof,
-                )  # fmt: skip
-        return 0
+                result = compared(self.run, discs, "--gate-m", 0.3)
+                far = {b["from_m"]: b["error_median_m"] for b in result["bins"]}
+                known_m = result["error_median_m"], far.get(3.0), far.get(3.5)
+                table.row(label, *known_m, result["normalised_error"]["per_dof"])
+        return {"tilt": errors, **table.figures}
 
 
-def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
-    """Compare tilts with the truth of a rendered or simulated run."""
+def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> Figures:
+    """Tilts against the truth of a rendered or simulated run, on frames with five lines."""
     truth = json.loads((run / "truth.json").read_text())
     errors, normalised = [], []
     for frame in truth["frames"]:
@@ -164,7 +176,7 @@ def _print_tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> None:
             errors.append(np.degrees(error))
             normalised.append(squared_mahalanobis(error, covariance) / 2.0)
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    print(
-        f"tilt: {len(errors)} frames with 5 lines, rms error pitch {rms[0]:.3f} deg "
-        f"roll {rms[1]:.3f} deg, normalised error^2 / dof {np.mean(normalised):.2f}"
-    )
+    figures = {"frames": len(errors), "pitch rms deg": rms[0], "roll rms deg": rms[1],
+               "normalised": np.mean(normalised)}  # fmt: skip
+    print_figures(figures)
+    return figures

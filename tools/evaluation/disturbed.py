@@ -20,9 +20,12 @@ from camera import Camera, read_camera
 from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.settings import CircleSettings
 from redetect.array_types import ByteArray, FloatArray
-from redetect.storage import write_whole
+from redetect.landmarks import squared_mahalanobis
+from redetect.storage import write_bytes
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
-from tools.evaluation.tables import markdown_table
+from tools.evaluation.figures import Figures, Study
+from tools.evaluation.tables import Table
+from tools.simulator.files import encoded
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -227,36 +230,11 @@ def _count(
             continue
         nearest = int(np.argmin(distance))
         tally.found += 1
-        tally.error_px.append(
-            camera.project_floor(found.floor_xy[nearest]) - camera.project_floor(place)
-        )
-        error, covariance = off[nearest], found.covariance[nearest]
-        tally.normalised.append(float(error @ np.linalg.solve(covariance, error)) / 2.0)
+        seen, true = camera.project_floor(np.stack([found.floor_xy[nearest], place]))
+        tally.error_px.append(seen - true)
+        squared = squared_mahalanobis(off[nearest], found.covariance[nearest])
+        tally.normalised.append(float(squared) / 2.0)
     tally.elsewhere += int((~taken).sum())
-
-
-def table_of(results: Sequence[tuple[str, float, Tally]]) -> str:
-    """Two tables in Markdown: what is found of disturbed discs, and what look-alikes give."""
-    shares = sorted({share for _, share, _ in results if share > 0.0})
-    by_kind: dict[str, dict[float, Tally]] = {}
-    for kind, share, tally in results:
-        by_kind.setdefault(kind, {})[share] = tally
-    lines = markdown_table(
-        ["family", *(f"{100 * share:.0f} %" for share in shares)],
-        ([kind, *(_cell(by_kind[kind][s]) for s in shares)] for kind in (*DISTURBANCES, BORDER)),
-    )
-    blurred = ((kind, _cell(by_kind[kind][0.0])) for kind in BLURRED)
-    lines += ["", *markdown_table(("family", "found, error, normalised"), blurred)]
-    others = ((kind, f"{by_kind[kind][0.0].recall:.3f}") for kind in LOOK_ALIKES)
-    lines += ["", *markdown_table(("look-alike", "rows for each"), others)]
-    elsewhere = sum(tally.elsewhere for _, _, tally in results)
-    scenes = sum(tally.shown for _, _, tally in results) / _PER_SCENE
-    lines += ["", f"Rows elsewhere: {elsewhere} in some {scenes:.0f} images."]
-    return "\n".join(lines)
-
-
-def _cell(tally: Tally) -> str:
-    return f"{tally.recall:.3f}, {tally.rms_px:.2f} px, {tally.normalised_error:.2f}"
 
 
 def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> ByteArray:
@@ -287,7 +265,7 @@ def _panel(image: ByteArray, outline: FloatArray, name: str) -> ByteArray:
 
 
 @dataclass(frozen=True)
-class Disturbed:
+class Disturbed(Study):
     """Discs partly hidden, stained, badly lit or blurred, and look-alikes, rendered."""
 
     camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
@@ -297,15 +275,19 @@ class Disturbed:
     seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
     picture: Path | None = None  # Draw one disc of every family, and detect nothing.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         settings = CircleSettings(polarity=self.polarity, tilt_sigma_deg=0.0)
         if self.picture is not None:
             drawn = picture_of(camera, settings.radius_m, self.shares[-1], self.seed)
-            _, png = cv2.imencode(".png", drawn)
-            with write_whole(self.picture, overwrite=True) as stream:
-                stream.write(png.tobytes())
-            return 0
+            write_bytes(self.picture, encoded(drawn, ".png"), overwrite=True)
+            return {}
+        table = Table(
+            {"family": "<18", "share %": ".0f", "shown": "d", "found": ".3f", "rms px": ".2f",
+             "normalised": ".2f", "elsewhere": "d"}, keys=2
+        )  # fmt: skip
         results = measure(camera, settings, discs=self.discs, shares=self.shares, seed=self.seed)
-        print(table_of(list(results)))
-        return 0
+        for kind, share, t in results:
+            table.row(kind, 100.0 * share, t.shown, t.recall, t.rms_px, t.normalised_error,
+                      t.elsewhere)  # fmt: skip
+        return table.figures

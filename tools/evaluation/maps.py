@@ -23,6 +23,7 @@ from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, read_recording
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 from tools.simulator.driving import step_covariance
 
@@ -75,7 +76,7 @@ def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Record
 
 
 @dataclass(frozen=True)
-class MapStudy:
+class MapStudy(Study):
     """Map simulated runs (python -m tools.simulator rows) and compare with their truth.
 
     Each is mapped twice: as simulated (odometry wrong on the outside stretch), and with odometry
@@ -85,11 +86,11 @@ class MapStudy:
     runs: Positional[tuple[Path, ...]]  # Run folders.
     seed: int = 1  # Of the odometry that takes the place of the wrong one.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         table = Table(
             {"run": "<8", "variant": "<20", "p": "5d", "n": "4d", "m": "6d", "chi-sq.": "9.1f",
              "expected": "d", "factor": "6.3f", "path before / m": ".2f", "after / m": ".2f",
-             "discs / m": ".2f", "NEES/2": ".2f", "s": "6.2f"}
+             "discs / m": ".2f", "NEES/2": ".2f", "s": "6.2f"}, keys=2
         )  # fmt: skip
         for run in self.runs:
             recording, truth = read_recording(run), read_truth(run)
@@ -105,7 +106,7 @@ class MapStudy:
                     path_distance(mapped.estimate.poses, truth), *disc_errors(mapped, truth),
                     seconds,
                 )  # fmt: skip
-        return 0
+        return table.figures
 
 
 def _plain_gtsam(kind: str, graph: Graph, start: Estimate) -> tuple[float, int]:
@@ -119,13 +120,13 @@ def _plain_gtsam(kind: str, graph: Graph, start: Estimate) -> tuple[float, int]:
 
 
 @dataclass(frozen=True)
-class MapSpeed:
+class MapSpeed(Study):
     """Time the least squares of a run beside plain GTSAM on the same factors, in one process."""
 
     run: Positional[Path]  # Run folder or .circles file.
     repeats: int = 3  # Rounds, in each of which every solver has its turn.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         graph = graph_of_recording(read_recording(self.run))
         start = first_sight(graph)
 
@@ -153,4 +154,4 @@ class MapSpeed:
             ratio = min(seconds[own]) / min(times)
             table.row(name, steps, chi_squared, min(times), float(np.median(times)), ratio)
         print("ratio: time of slam map's solver by that of the row's, least of each")
-        return 0
+        return table.figures

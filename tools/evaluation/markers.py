@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from tools.benchmark.material import decode, jpeg_picture
-from tools.benchmark.timing import decodings, measure_in_turn
+from tools.benchmark.timing import measure_in_turn
+from tools.evaluation.figures import WRONG, Figures, Study
 from tools.evaluation.markers_statistics import (
     FOUND,
     MISIDENTIFIED,
@@ -19,15 +20,16 @@ from tools.evaluation.markers_statistics import (
     PEERS,
     ScoredFrame,
     binned,
-    bins_lines,
     counts_lines,
     detector_of,
     known_to_opencv,
+    print_bins,
     scored_frame,
     table_of,
 )
+from tools.evaluation.tables import Table
 from tools.simulator.markers.samples import SampleFrame, SampleSettings, sample_frame
-from tools.simulator.markers.things import photograph_files
+from tools.simulator.markers.things import photograph_files, photograph_of
 from tools.simulator.parallel import in_order
 
 #: Dictionaries of the search for false markers: all kinds, small and large.
@@ -105,24 +107,22 @@ def search_photographs(
 
 
 def _search(state: tuple[str, tuple[str, ...]], path: Path) -> list[Offence]:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise ValueError(f"{path}: cannot be read as an image")
-    name, dictionaries = state
+    (name, dictionaries), image = state, photograph_of(path)
     return [
         Offence(name, "false", f"{path.name} {dictionary} id {i}")
         for dictionary in dictionaries
-        for i in detector_of(name)(np.asarray(image, dtype=np.uint8), None, dictionary).ids
+        for i in detector_of(name)(image, None, dictionary).ids
     ]
 
 
 def time_searches(
     settings: SampleSettings, frames: int, seed: int, *, rounds: int = 5
-) -> dict[str, str]:
+) -> dict[str, Any]:
     """Time the search of rendered frames, decoding them, and OpenCV's detectors, in turn.
 
     The frames are those of the statistics, stored as JPEG files of quality 90. Our detector is
-    timed twice: with no width given, and with the median width of the frame's markers.
+    timed twice: with no width given, and with the median width of the frame's markers. Prints, and
+    returns, medians and quartiles of the times in those of decoding, and milliseconds.
     """
     from detect.markers.candidates import closing
     from detect.markers.detect import detect_markers
@@ -155,11 +155,17 @@ def time_searches(
         **{f"closing, radius {radius} px": close(radius) for radius in _RADII_PX},
         **{name: peer(name) for name in (_TIMED_PEERS if known_to_opencv(dictionary) else ())},
     }
-    return decodings(measure_in_turn(functions, frames, rounds, _BUDGET_S), DECODING)
+    seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
+    columns = ("decodings", "lower", "upper", "ms")
+    table = Table({"": "<24", **dict.fromkeys(columns, "8.2f")})
+    for name, taken in seconds.items():
+        lower, median, upper = np.nanpercentile(taken / seconds[DECODING], [25, 50, 75])
+        table.row(name, median, lower, upper, 1e3 * np.nanmedian(taken))
+    return table.figures
 
 
 @dataclass(frozen=True)
-class Markers:
+class Markers(Study):
     """Markers in rendered frames: corner errors, detection rate, false ones; beside OpenCV's ArUco.
 
     Four parts: statistics of `--statistics` frames with one dictionary, all detectors; the
@@ -179,69 +185,72 @@ class Markers:
     seed: int = 1  # Of all frames.
     jobs: int = 1  # Processes.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         wrong: list[Offence] = []
+        figures: dict[str, Any] = {}
         measured = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
         if self.statistics:
             frames = self._scored(measured, self.statistics)
             table = table_of(frames)
             print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
-            print("\n".join([*counts_lines(table), *bins_lines(binned(table))]))
+            print("\n".join(counts_lines(table)))
+            figures["statistics"] = print_bins(binned(table))
             wrong += _printed([one for one in offences(frames) if one.detector == OURS])
             if self.spot:
-                self._spot(measured)
+                figures["spot"] = self._spot(measured)
         if self.timing:
-            times = time_searches(measured, self.timing, self.seed)
             print(f"Processor time in decodings, {self.timing} frames of the statistics")
-            print("\n".join(f"{name:>24}: {taken}" for name, taken in times.items()))
+            figures["timing"] = time_searches(measured, self.timing, self.seed)
         if self.frames:
-            wrong += _printed(self._search_frames())
+            figures["frames"], found = self._search_frames()
+            wrong += _printed(found)
         if self.photographs:
             count, found = search_photographs(self.photographs, OURS, self.dictionaries, self.jobs)
             print(
                 f"{count} photographs, each searched for {len(self.dictionaries)} dictionaries: "
                 f"{len(found)} false markers"
             )
+            figures["photographs"] = {"photographs": count, "false": len(found)}
             wrong += _printed(found)
-        return 1 if wrong else 0
+        return {WRONG: len(wrong), **figures}
 
     def _scored(self, settings: SampleSettings, frames: int) -> list[ScoredFrame]:
         """Frames that all detectors have searched."""
         detectors = (OURS, *(PEERS if known_to_opencv(self.dictionary) else ()))
         return score_frames(settings, detectors, frames, self.seed, self.jobs)
 
-    def _spot(self, measured: SampleSettings) -> None:
+    def _spot(self, measured: SampleSettings) -> dict[str, Any]:
         """Corners at a width of 60 px and a noise of 3: any light and blur, and good light."""
         common = replace(
             measured, empty=0.0, markers=(2, 4), width_px=(58.0, 62.0), noise_grey=(3.0, 3.0)
         )
         good = replace(common, contrast_grey=(100.0, 200.0), blur_px=(0.5, 1.3), motion=0.0)
         cases = {"any light and blur": common, "contrast 100-200, blur 0.5-1.3 px, still": good}
+        figures = {}
         for label, settings in cases.items():
+            print(f"Width 58-62 px, noise 3, {label}")
             frames = self._scored(settings, max(20, self.statistics // 5))
-            everything = binned(table_of(frames))[:1]
-            print("\n".join([f"Width 58-62 px, noise 3, {label}", *bins_lines(everything)]))
+            figures[label] = print_bins(binned(table_of(frames))[:1])["all"]
+        return figures
 
-    def _search_frames(self) -> list[Offence]:
+    def _search_frames(self) -> tuple[dict[str, Any], list[Offence]]:
         settings = SampleSettings(
             dictionaries=self.dictionaries, samples=_SEARCHED_SAMPLES, photographs=self.backgrounds
         )
         frames = score_frames(settings, (OURS,), self.frames, self.seed, self.jobs)
-        empty = sum(len(frame.rows) == 0 for frame in frames)
-        print(f"Search of {len(frames)} frames, {empty} of them without any marker")
-        print("\n".join(counts_lines(table_of(frames))))
-        for name in self.dictionaries:
-            if not (chosen := [frame for frame in frames if frame.dictionary == name]):
-                continue
-            table = table_of(chosen)
-            outcome, clear = table.outcomes[OURS], table.columns["clear"] > 0.0
-            print(
-                f"{name:>16}: frames {table.frames}, clear {clear.sum()}, "
-                f"found {(clear & (outcome.status == FOUND)).sum()}, "
-                f"misidentified {(outcome.status == MISIDENTIFIED).sum()}, "
-                f"false {len(outcome.false)}"
-            )
-        return offences(frames)
+        print(f"Search of {len(frames)} frames")
+        columns = ("frames", "empty", "markers", "clear", "found", "misidentified", "false")
+        printed = Table({"dictionary": "<16", **dict.fromkeys(columns, "d")})
+        for name in (*self.dictionaries, "all"):
+            if chosen := [frame for frame in frames if name in (frame.dictionary, "all")]:
+                table = table_of(chosen)
+                outcome, clear = table.outcomes[OURS], table.columns["clear"] > 0.0
+                printed.row(
+                    name, table.frames, sum(len(frame.rows) == 0 for frame in chosen), len(clear),
+                    clear.sum(), (clear & (outcome.status == FOUND)).sum(),
+                    (outcome.status == MISIDENTIFIED).sum(), len(outcome.false),
+                )  # fmt: skip
+        return printed.figures, offences(frames)
 
 
 def _printed(found: list[Offence]) -> list[Offence]:

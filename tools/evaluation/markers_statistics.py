@@ -6,13 +6,14 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from camera import Camera
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
+from tools.evaluation import tables
 from tools.simulator.markers.samples import SampleFrame
 from tools.simulator.markers.truth import MarkerTruth
 
@@ -233,15 +234,10 @@ class Bin(NamedTuple):
     """By peer: our median error and the peer's over the markers that both found, pixels."""
 
     @property
-    def ahead_in_error(self) -> bool | None:
-        """Whether our median error is below every peer's; None where there are too few markers."""
-        known = [medians for medians in self.shared.values() if np.isfinite(medians[1])]
-        return all(ours < peer for ours, peer in known) if known else None
-
-    @property
-    def ahead_in_rate(self) -> bool:
-        """Whether we find at least as many markers as every peer."""
-        return all(f.rate <= self.own[OURS].rate for f in self.own.values())
+    def ahead(self) -> bool:
+        """Whether we find at least as many as every peer, at smaller medians as far as known."""
+        fewer = any(f.rate > self.own[OURS].rate for f in self.own.values())
+        return not fewer and not any(ours >= peer for ours, peer in self.shared.values())
 
 
 def binned(table: Table) -> list[Bin]:
@@ -299,27 +295,20 @@ def counts_lines(table: Table) -> list[str]:
     return lines
 
 
-def bins_lines(bins: list[Bin]) -> list[str]:
-    """Detection rate and corner errors by bins, and whether this project's detector is ahead.
+def print_bins(bins: list[Bin]) -> dict[str, Any]:
+    """Print detection rate and corner errors (pixels) by bins, and where a peer is ahead.
 
     Errors over the markers that each detector found itself; then our median and the peer's over
-    those that both found.
+    those that both found. Returns the figures.
     """
-    above = "".join(f"  {name:>29}" for name in bins[0].own)
-    lines = [
-        f"{'':32}{'markers':>8}{above}   error^2/dof  shared: ours peer ...",
-        " " * 40 + f"  {'found  median    rms    95 %':>29}" * len(bins[0].own),
-    ]
-    for b in bins:
-        if not b.markers:
-            continue
-        line = f"{b.label:32.32}{b.markers:8d}"
-        for f in b.own.values():
-            line += f"  {f.rate:8.3f} {f.median_px:6.3f} {f.rms_px:6.3f} {f.q95_px:6.3f}"
-        line += f"  {next(iter(b.own.values())).normalised:10.2f}  "
-        line += "".join(f" {ours:.3f}<{peer:.3f}" for ours, peer in b.shared.values())
-        if b.shared:
-            error = {True: "ahead", False: "BEHIND", None: "-"}[b.ahead_in_error]
-            line += f"  error {error}, rate {'ahead' if b.ahead_in_rate else 'BEHIND'}"
-        lines.append(line)
-    return lines
+    table = tables.Table(
+        {"": "<28", "detector": "<14", "markers": "d", "found": ".3f", "median": ".3f",
+         "rms": ".3f", "95 %": ".3f", "error^2/dof": ".2f", "both: ours": ".3f", "peer": ".3f"},
+        keys=2,
+    )  # fmt: skip
+    for b in (b for b in bins if b.markers):
+        for name, own in b.own.items():
+            table.row(b.label, name, b.markers, *own, *b.shared.get(name, (np.nan, np.nan)))
+    behind = [b.label for b in bins if not b.ahead]
+    print(f"BEHIND a peer in error or rate: {', '.join(behind) or 'nowhere'}")
+    return table.figures

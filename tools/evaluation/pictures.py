@@ -28,6 +28,7 @@ from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.maps import read_truth
 from tools.evaluation.tables import picture
 
@@ -283,7 +284,7 @@ def _turning(times_s: Any, theta_rad: Any) -> tuple[Any, Any]:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class Pictures(Study):
     """Draw the pictures of the documentation anew, as far as there is input for them.
 
     The run of `--rows` R and the session of `--session` S come from
@@ -306,7 +307,7 @@ class Pictures:
     rows: Path | None = None  # A simulated run, associated and mapped.
     session: Path | None = None  # A simulated session, evaluated.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         self.output.mkdir(parents=True, exist_ok=True)
         run, markers = Path("images/e"), Path("images/m/a")
         self._save("discs", (8, 9.4), lambda f: draw_discs(f, run, 4), 72)
@@ -323,7 +324,7 @@ class Pictures:
         if (session := self.session) is not None:
             self._save("laser", (11, 4.6), lambda f: draw_laser(f, session, 8.0), 80)
             self._save("clocks-and-fusion", (13, 4), lambda f: draw_clock(f, session), 80)
-        return 0
+        return {}
 
     def _save(
         self, name: str, size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int

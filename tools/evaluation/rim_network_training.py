@@ -17,6 +17,7 @@ from tyro.conf import Positional
 
 from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
 from redetect.storage import write_whole
+from tools.evaluation.figures import Figures, Study
 from tools.evaluation.rim_data import Looks, gather
 
 FloatArray = NDArray[np.floating]
@@ -225,7 +226,7 @@ def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> ND
 
 
 @dataclass(frozen=True)
-class TrainRimNetwork:
+class TrainRimNetwork(Study):
     """Train the networks that judge candidates of discs."""
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
@@ -236,7 +237,7 @@ class TrainRimNetwork:
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
     force: bool = False  # Replace that file.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         glances, looks = gather(self.data, self.every, self.scenes, self.seed)
         for kind, of in (("glances", glances), ("looks", looks)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
@@ -250,4 +251,4 @@ class TrainRimNetwork:
         with write_whole(self.output, overwrite=self.force) as stream:
             np.savez(stream, **weights)
         print(f"{self.output}: {sum(array.size for array in weights.values())} weights")
-        return 0
+        return {}

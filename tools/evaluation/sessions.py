@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,7 +15,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.cli import main as groundtruth
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.clock import ClockSegment, read_clock
 from redetect.groundtruth.lasers.acquisition import load_session
@@ -39,6 +36,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
+from tools.evaluation.figures import Figures, Study, StudyError, run_program
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session
 from tools.simulator.laser.settings import Faults, LaserSettings
@@ -50,46 +48,36 @@ _LASER_COLUMNS = {
 }  # fmt: skip
 
 
-def run_groundtruth(*arguments: object) -> None:
-    """Run a command of `groundtruth` quietly, and fail if it does."""
-    out = io.StringIO()
-    words = [*map(str, arguments), "--force"]
-    with redirect_stdout(out):
-        code = groundtruth(words)
-    if code != 0:
-        raise GroundTruthError(f"groundtruth {' '.join(words)} ended with {code}: {out.getvalue()}")
-
-
-def table_of_sessions(
-    columns: Mapping[str, str], seeds: range, measure: Callable[[Path, int], dict[str, float]]
-) -> tuple[Table, FloatArray]:
-    """Measure a session, in a folder of its own, for each seed, and print a row of it.
-
-    Returns the rows (N, columns), too.
-    """
-    table, rows = Table({"seed": "<5", **columns}), []
-    for seed in seeds:
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                row = measure(Path(folder), seed)
-        except GroundTruthError as error:
-            print(f"{seed:4d} left out: {error}")
-            continue
-        rows.append([row[key] for key in columns])
-        table.row(str(seed), *rows[-1])
-    if not rows:
-        raise GroundTruthError("no session is left: expected at least one")
-    return table, np.array(rows)
-
-
 @dataclass(frozen=True)
-class LaserSessions:
-    """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
+class _Sessions(Study):
+    """Simulated sessions."""
 
     seeds: int = 20  # Seeds first, first + 1, ...
     first: int = 1
-    scanners: Literal["aligned", "true"] = "aligned"
-    """`aligned`: by `groundtruth lasers` from poses measured by hand; `true`: the exact ones."""
+
+    def table_of(
+        self, columns: Mapping[str, str], measure: Callable[[Path, int], dict[str, float]]
+    ) -> tuple[Table, FloatArray]:
+        """Measure a session in a folder of its own for each seed: table, and rows (N, columns)."""
+        table, rows = Table({"seed": "<5", **columns}), []
+        for seed in range(self.first, self.first + self.seeds):
+            try:
+                with tempfile.TemporaryDirectory() as folder:
+                    row = measure(Path(folder), seed)
+            except (GroundTruthError, StudyError) as error:
+                print(f"{seed:4d} left out: {error}")
+                continue
+            rows.append([row[key] for key in columns])
+            table.row(str(seed), *rows[-1])
+        if not rows:
+            raise StudyError("no session is left: expected at least one")
+        return table, np.array(rows)
+
+
+@dataclass(frozen=True)
+class LaserSessions(_Sessions):
+    """Simulate sessions, align scanners, track the robot, and print errors against the truth."""
+
     fault: Literal["none", "crossing", "moved", "rectangle"] = "none"
     """`crossing`: somebody passes right beside the robot; `moved`: a scanner is knocked by 50 mm
     after the empty area was scanned; `rectangle`: the outline does not show the front."""
@@ -97,13 +85,12 @@ class LaserSessions:
     visit_s: float = 60.0
     average: int = 6  # Sets of scans per pose.
 
-    def __call__(self) -> int:
-        seeds = range(self.first, self.first + self.seeds)
-        table, rows = table_of_sessions(_LASER_COLUMNS, seeds, self._measured)
+    def measured(self) -> Figures:
+        table, rows = self.table_of(_LASER_COLUMNS, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
             table.row("std", *np.std(rows, axis=0, ddof=1))
-        return 0
+        return table.figures
 
     def _measured(self, session: Path, seed: int) -> dict[str, float]:
         """Errors of one session."""
@@ -118,10 +105,8 @@ class LaserSessions:
             settings = replace(settings, front_cut_m=0.0)
         write_session(settings, session, seed=seed)
         exact, aligned = session / "scanners.truth.json", session / "aligned.json"
-        if self.scanners == "aligned":
-            run_groundtruth("lasers", session, "-o", aligned)
-        calibration = exact if self.scanners == "true" else aligned
-        scanners, robot, tables, sets = load_session(session, calibration)
+        run_program("groundtruth", "lasers", session, "-o", aligned)
+        scanners, robot, tables, sets = load_session(session, aligned)
         rows = slice(0, 50)
         first = replace(
             sets, times_s=sets.times_s[rows], rows=sets.rows[rows], ages_s=sets.ages_s[rows]
@@ -136,7 +121,7 @@ class LaserSessions:
         return {
             "sets": float(len(sets)),
             **errors_in_room(session, track, self.average),
-            **scanner_errors(read_scanners(calibration), read_scanners(exact)),
+            **scanner_errors(read_scanners(aligned), read_scanners(exact)),
             "disturbed": float(disturbed / len(sets)),
             "set_ms": 1e3 * elapsed / len(sets),
             "speed": float(sets.times_s[-1] - sets.times_s[0]) / elapsed,
@@ -204,47 +189,46 @@ _FUSION_COLUMNS = {
 
 
 @dataclass(frozen=True)
-class FusionStudy:
+class FusionStudy(_Sessions):
     """Simulate sessions, run lasers, laser, sync and fuse, and compare each with the exact truth.
 
     Segments of the clock, the lasers' poses, fused poses where the laser sees the robot, bridged
     ones, and the NEES at one instant of each session.
     """
 
-    seeds: int = 20  # Seeds first, first + 1, ...
-    first: int = 1
     fault: Fault = "none"
     """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
     a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
     beside the robot."""
     visits: int = 3
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
 
         def measured(session: Path, seed: int) -> dict[str, float]:
             write_session(settings, session, seed=seed)
             return errors_of_session(session)
 
-        seeds = range(self.first, self.first + self.seeds)
-        table, rows = table_of_sessions(_FUSION_COLUMNS, seeds, measured)
+        table, rows = self.table_of(_FUSION_COLUMNS, measured)
         table.row("mean", *np.nanmean(rows, axis=0))
         table.row("worst", *np.nanmax(rows, axis=0))
         band = chi2.ppf([0.025, 0.975], 3 * len(rows)) / (3 * len(rows))
         print(f"95 % band of the mean NEES at one instant: {band[0]:.2f} to {band[1]:.2f}")
-        return 0
+        return {**table.figures, "band": band}
 
 
 def errors_of_session(session: Path) -> dict[str, float]:
     """Run the commands on one session and measure their results."""
     at = {name: session / f"{name}.csv" for name in ("odometry", "laser", "camera", "fused")}
     clock = session / "clock.json"
-    run_groundtruth("lasers", session)
-    run_groundtruth("laser", session)
-    run_groundtruth("sync", at["odometry"], at["laser"], "-o", clock)
     streams = ["--laser", at["laser"], "--camera", at["camera"]]
-    run_groundtruth("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"])
-
+    for words in (
+        ("lasers", session),
+        ("laser", session),
+        ("sync", at["odometry"], at["laser"], "-o", clock),
+        ("fuse", at["odometry"], *streams, "--clock", clock, "-o", at["fused"]),
+    ):
+        run_program("groundtruth", *words)
     truth = read_planar_poses(session / "truth.csv")
     laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
     seen = _seen_by(laser, fused.times_s)

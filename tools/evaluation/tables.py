@@ -1,43 +1,44 @@
-"""One way to write what studies find: tables on the terminal or in Markdown, pictures."""
+"""One way to write what studies find: tables in Markdown, pictures."""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 
 class Table:
-    """A table that is printed row by row.
-    `columns` maps headings to formats (`7.2f`, `<22`); a column is as wide as either says.
+    """A table in Markdown that is printed row by row, and whose figures are kept.
+    `columns` maps headings to formats (`7.2f`, `<22`); a column is as wide as either says. The
+    first `keys` columns name a row: `figures` has a level for each, then values by heading.
     """
 
-    def __init__(self, columns: Mapping[str, str]) -> None:
+    def __init__(self, columns: Mapping[str, str], keys: int = 1) -> None:
+        self.figures: dict[str, Any] = {}
+        self._keys, self._headings = keys, list(columns)
         self._formats = list(columns.values())
-        widths = [re.match(r"<?(\d*)", form) for form in self._formats]
-        self._widths = [
-            max(len(name), int(width.group(1) or 0) if width else 0)
-            for name, width in zip(columns, widths)
-        ]
+        stated = [re.sub(r"\D.*", "", form.lstrip("<")) for form in self._formats]
+        self._widths = [max(3, len(name), int(width or 0)) for name, width in zip(columns, stated)]
         self._print(columns)
+        self._print("-" * width for width in self._widths)
 
     def row(self, *values: object) -> None:
-        """Print a row; its values are in the order of the columns."""
-        self._print(format(value, form) for value, form in zip(values, self._formats, strict=True))
+        """Print a row; its values are in the order of the columns, None where one is not known."""
+        pairs = zip(values, self._formats, strict=True)
+        cells = ["-" if value is None else format(value, form) for value, form in pairs]
+        self._print(cells)
+        place = self.figures
+        for cell in cells[: self._keys]:
+            place = place.setdefault(cell.strip(), {})
+        place.update(zip(self._headings[self._keys :], values[self._keys :]))
 
     def _print(self, cells: Iterable[str]) -> None:
         aligned = (
             cell.ljust(width) if form.startswith("<") else cell.rjust(width)
             for cell, width, form in zip(cells, self._widths, self._formats)
         )
-        print("  ".join(aligned).rstrip(), flush=True)
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lines of a table in Markdown."""
-    rule = "|" + "---|" * len(head)
-    return [f"| {' | '.join(head)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
+        print(f"| {' | '.join(aligned)} |", flush=True)
 
 
 def picture(size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int) -> bytes:

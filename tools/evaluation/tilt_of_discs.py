@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,6 +17,8 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.models import disc_in_robot
+from tools.evaluation.figures import Figures, Study, print_figures
+from tools.evaluation.tables import Table
 
 #: An error of the image smaller than this is not believed, pixels along u.
 _LEAST_SIGMA_PX = 0.3
@@ -84,12 +86,7 @@ def tilt_of_discs(
 
 
 def compare_tilts(
-    camera: Camera,
-    rows: Path,
-    tilts: Path,
-    map_path: Path,
-    path_path: Path,
-    raised_m: float = 0.0,
+    camera: Camera, rows: Path, tilts: Path, map_path: Path, path_path: Path, raised_m: float = 0.0
 ) -> TiltComparison:
     """Hold the tilts of a `.tilt` file against those of the discs of a map."""
     discs = read_map(map_path).discs
@@ -131,38 +128,32 @@ def compare_tilts(
     )
 
 
-def report_of(result: TiltComparison) -> list[str]:
-    """The comparison in lines: medians, means, spread, and the frames that differ most."""
-    off = np.degrees(result.by_lines - result.by_discs)
-    lines = [f"{len(off)} frames; pitch and roll in degrees, verticals and discs of the map"]
-    if not len(off):
-        return lines
-    for name, values in (
-        ("verticals", np.degrees(result.by_lines)),
-        ("discs", np.degrees(result.by_discs)),
-        ("difference", off),
-    ):
-        median, mean, spread = np.median(values, axis=0), values.mean(axis=0), values.std(axis=0)
-        lines.append(
-            f"{name:<11} median {median[0]:+.3f} {median[1]:+.3f}  mean {mean[0]:+.3f} "
-            f"{mean[1]:+.3f}  spread {spread[0]:.3f} {spread[1]:.3f}"
-        )
-    far = result.squared > _FAR_SIGMAS**2
-    lines.append(
-        f"difference^2 in both covariances, per axis: mean {result.squared.mean() / 2.0:.2f}, "
-        f"median {np.median(result.squared) / (2.0 * np.log(2.0)):.2f} of the expected; "
-        f"{far.sum()} frames beyond {_FAR_SIGMAS:g} sigma"
+def figures_of(result: TiltComparison) -> dict[str, Any]:
+    """Print medians, means and spreads (degrees), and the frames that differ most; the figures."""
+    names = (
+        f"{axis} {what}" for what in ("median", "mean", "spread") for axis in ("pitch", "roll")
     )
+    table = Table({"tilt of": "<11", **dict.fromkeys(names, "+.3f")})
+    off = np.degrees(result.by_lines - result.by_discs)
+    by_lines, by_discs = np.degrees(result.by_lines), np.degrees(result.by_discs)
+    for name, values in (("verticals", by_lines), ("discs", by_discs), ("difference", off)):
+        table.row(name, *np.median(values, axis=0), *values.mean(axis=0), *values.std(axis=0))
+    # Of the differences in both covariances, per axis, as shares of the expected.
+    squares = {
+        "frames": len(off),
+        "mean square": result.squared.mean() / 2.0,
+        "median square": np.median(result.squared) / (2.0 * np.log(2.0)),
+        f"beyond {_FAR_SIGMAS:g} sigma": np.sum(result.squared > _FAR_SIGMAS**2),
+    }
+    print_figures(squares)
     for k in np.argsort(-result.squared)[:_WORST]:
-        lines.append(
-            f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, "
-            f"{np.sqrt(result.squared[k]):.1f} sigma"
-        )
-    return lines
+        sigmas = np.sqrt(result.squared[k])
+        print(f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, {sigmas:.1f} sigma")
+    return {**squares, **table.figures}
 
 
 @dataclass(frozen=True)
-class TiltOfDiscs:
+class TiltOfDiscs(Study):
     """Compare the tilt that verticals show with the tilt that the discs of a map show."""
 
     rows: Positional[Path]
@@ -173,8 +164,7 @@ class TiltOfDiscs:
     path: Path  # Its `path.csv`.
     raised_m: float = 0.0  # How much higher the camera is than calibrated.
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         camera = read_camera(self.camera)
         files = self.rows, self.tilts, self.map, self.path
-        print("\n".join(report_of(compare_tilts(camera, *files, self.raised_m))))
-        return 0
+        return figures_of(compare_tilts(camera, *files, self.raised_m))

@@ -18,11 +18,7 @@ from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
-from detect.sources.interface import (
-    bounded_content,
-    decode_gray,
-    gray_of_pixels,
-)
+from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
 from detect.sources.poses import step_between, tick_poses, tum_poses
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray

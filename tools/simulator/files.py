@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from redetect.array_types import ByteArray
-from redetect.storage import write_whole
+from redetect.storage import write_bytes
 
 
 def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:
@@ -20,12 +20,6 @@ def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:
     if not done:
         raise ValueError(f"an image of {grey.shape} could not be encoded as {ending}")
     return bytes(content)
-
-
-def write_bytes(path: Path, content: bytes, *, overwrite: bool) -> None:
-    """Write a file whole or not at all."""
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(content)
 
 
 def write_truth(

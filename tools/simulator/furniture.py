@@ -391,10 +391,7 @@ def _low_segments(building: Construction) -> FloatArray:
 
 
 def _crowded(
-    place: FloatArray,
-    seen_from: FloatArray,
-    boxes: FloatArray,
-    walls: FloatArray,
+    place: FloatArray, seen_from: FloatArray, boxes: FloatArray, walls: FloatArray
 ) -> bool:
     """Whether something stands on, next to or between the place and the path.
     `boxes` (N, 2, 2) are opposite corners; `walls` (K, 4).

@@ -14,6 +14,7 @@ from camera.model import PARAMETERS
 from camera.uncertainty import with_covariance
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, write_frames
+from redetect.storage import write_bytes
 from tools.published_camera import PUBLISHED_CAM
 from tools.simulator.building import EXTENT
 from tools.simulator.driving import (
@@ -24,7 +25,7 @@ from tools.simulator.driving import (
     step_record,
     tilted_camera,
 )
-from tools.simulator.files import encoded, rounded, write_bytes, write_truth
+from tools.simulator.files import encoded, rounded, write_truth
 from tools.simulator.furniture import DISC_RADIUS_M, lay_discs
 from tools.simulator.observation import (
     SeenDisc,

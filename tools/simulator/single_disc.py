@@ -82,7 +82,7 @@ _WHITEST = 255
 
 
 class DiscCrop(NamedTuple):
-    """The part of an image round one disc."""
+    """The part of an image round one disc: ``grey[j, i]`` is pixel ``(u0 + i, v0 + j)``."""
 
     grey: NDArray[Any]  # (H, W) grey values: uint8 if they were rounded, else float64.
     u0: int  # Column of the image that is the crop's first.
@@ -108,24 +108,18 @@ def render_disc(
 
     Parameters
     ----------
-    camera : Camera
-        The camera.
     floor_xy : (2,) array
         The disc's centre on the floor in the robot frame, metres.
-    radius_m : float
-        The disc's radius, metres.
     light, dark : float
         Grey values of disc and floor.
     blur_px : float or pair of floats
         Standard deviation of the optics' Gaussian blur in pixels, along u and v. (The optics of an
         interlaced camera blur a single field half as many pixels along v as along u.)
     noise_sigma : float
-        Standard deviation of the Gaussian noise, grey values.
+        Standard deviation of the Gaussian noise, grey values; needs `rng`.
     supersampling : int
         Cells per pixel and axis on which the blur is computed. Without blur and with a full
         aperture every value gives the same exact coverage.
-    rng : numpy Generator, optional
-        Source of the noise; needed where there is noise.
     row_aperture : float
         Height of a pixel's sensitive area in rows, (0, 1]: 1 for the data set's fields if a sensor
         line pair is read out together, 0.5 if each row is one line of the full frame.
@@ -133,11 +127,6 @@ def render_disc(
         The crop holds the image of a circle of this many radii (clipped to the image).
     rounded : bool
         Whether to round to grey values 0..255 (uint8) or to return floats.
-
-    Returns
-    -------
-    DiscCrop
-        Grey values and the crop's offset: ``grey[j, i]`` is pixel ``(u0 + i, v0 + j)``.
 
     Raises
     ------
@@ -204,13 +193,8 @@ def _supersampled_coverage(
     outline: FloatArray, width: int, height: int, supersampling: int
 ) -> FloatArray:
     # Pixel centres are integers, cell corners are the kernel's: half a pixel between them.
-    x, y = ((outline + 0.5) * supersampling).T
-    signed = polygon_coverage(
-        np.ascontiguousarray(x),
-        np.ascontiguousarray(y),
-        width * supersampling,
-        height * supersampling,
-    )
+    x, y = np.ascontiguousarray(((outline + 0.5) * supersampling).T)
+    signed = polygon_coverage(x, y, width * supersampling, height * supersampling)
     return np.asarray(np.abs(signed))
 
 

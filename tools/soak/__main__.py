@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import tyro
-
 from detect.sources.opening import open_run
-from redetect.storage.command_line import exit_code_of
 from tools.benchmark.material import repeated_run
+from tools.evaluation.figures import WRONG, Figures, Study, print_figures, study_main
 from tools.soak.long_run import SoakResult, soak
 from tools.soak.short_runs import ShortRuns, repeat_short_runs
 
 
 @dataclass(frozen=True)
-class Soak:
+class Soak(Study):
     """A long run of `detect all`, or with --short many short ones; demands that nothing grows.
 
     The exit code is 1 where a demand is not met.
@@ -31,7 +29,7 @@ class Soak:
     scratch: Path | None = None
     """Where the run and its results are made, and removed again; on the source's file system."""
 
-    def __call__(self) -> int:
+    def measured(self) -> Figures:
         result: ShortRuns | SoakResult
         with tempfile.TemporaryDirectory(dir=self.scratch, prefix="soak-") as name:
             folder = Path(name)
@@ -40,16 +38,16 @@ class Soak:
             else:
                 run = repeated_run(open_run(self.source), folder / "soak", self.frames, 0)
                 result = soak(run, folder / "results", self.frames, self.jobs)
-        print(result)
+        figures = asdict(result)
+        print_figures(figures)
         for sentence in result.unmet():
             print(sentence, file=sys.stderr)
-        return 1 if result.unmet() else 0
+        return {**figures, WRONG: len(result.unmet())}
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    command = tyro.cli(Soak, prog="python -m tools.soak", args=arguments)
-    return exit_code_of(command)
+    return study_main(Soak, "python -m tools.soak", arguments or sys.argv[1:])
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import psutil  # type: ignore[import-untyped,unused-ignore]
 
+from tools.evaluation.figures import StudyError
+
 #: Throughput is compared between these shares of the run: before and after them, processes start
 #: and files take their places.
 _FIRST, _LAST = (0.01, 0.11), (0.89, 0.99)
@@ -26,10 +28,6 @@ _MIB = 1 << 20
 #: The demands: growth from a tenth of the run to its end, and change of the throughput.
 MOST_GROWTH_MIB = 8.0
 MOST_SLOWER = 0.05
-
-
-class SoakError(ValueError):
-    """A run that did not end well, or too short a one."""
 
 
 class ProcessState(NamedTuple):
@@ -99,23 +97,6 @@ class SoakResult:
             found.append(f"the last tenth was {1.0 - first / last:.1%} slower than the first")
         return found
 
-    def __str__(self) -> str:
-        change = [f"  {b / a - 1.0:+.1%}" for a, b in (self.frames_per_s, self.decodings_per_frame)]
-        rows = (
-            ("frames/s, first and last", self.frames_per_s, ".1f", change[0]),
-            ("decoding / ms", self.decoding_ms, ".3f", ""),
-            ("decodings per frame", self.decodings_per_frame, ".2f", change[1]),
-            ("at 10, 50, 90, 99 %", (), "", ""),
-            ("memory / MiB", self.resident_mib, ".1f", ""),
-            ("largest worker / MiB", self.worker_mib, ".1f", ""),
-            ("descriptors", self.descriptors, "d", ""),
-            ("processes", (self.processes,), "d", ""),
-        )
-        lines = [f"{self.frames} frames, {self.jobs} jobs, {self.duration_s:.0f} s"]
-        for name, values, form, after in rows:
-            lines.append(f"{name:<28}" + "  ".join(format(v, form) for v in values) + after)
-        return "\n".join(lines)
-
 
 def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
     """Work on a run by `detect all`, and watch its processes."""
@@ -137,7 +118,7 @@ def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
             process.kill()
             raise
     if process.returncode != 0:
-        raise SoakError(f"detect ended with {process.returncode}: {said.strip()[-500:]}")
+        raise StudyError(f"detect ended with {process.returncode}: {said.strip()[-500:]}")
     return _result(looks, frames, jobs, time.monotonic() - begin_s)
 
 
@@ -181,7 +162,7 @@ def _decoding_s(image: bytes) -> float:
 def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> SoakResult:
     done = np.array([look.frames for look in looks], float)
     if len(looks) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
-        raise SoakError(f"{frames} frames: too few to be looked at, expected more")
+        raise StudyError(f"{frames} frames: too few to be looked at, expected more")
     columns = _Look(*np.array(looks, float).T)
 
     def per_frame(values: Any, share: tuple[float, float]) -> float:

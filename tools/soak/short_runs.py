@@ -14,7 +14,7 @@ import psutil  # type: ignore[import-untyped,unused-ignore]
 
 from detect.sources.opening import open_run
 from tools.benchmark.material import repeated_run
-from tools.soak.long_run import SoakError
+from tools.evaluation.figures import StudyError
 
 _FRAMES = 8
 _SHARED_MEMORY = Path("/dev/shm")
@@ -50,13 +50,6 @@ class ShortRuns:
             found.append(f"{self.different} runs had other results than the first")
         return found
 
-    def __str__(self) -> str:
-        return (
-            f"{self.runs} runs left behind: {self.processes} processes, {self.shared} pieces of "
-            f"shared memory, {self.temporary} temporary files, {self.hidden} hidden files, "
-            f"{self.caches} files in the cache; {self.different} with other results"
-        )
-
 
 def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> ShortRuns:
     """Carry out `detect all` on a few frames again and again, every second time with workers."""
@@ -76,7 +69,7 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
             words, env=os.environ | added, capture_output=True, text=True, check=False
         )
         if done.returncode != 0:
-            raise SoakError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
+            raise StudyError(f"detect ended with {done.returncode}: {done.stderr.strip()[-500:]}")
         found = {path.name: path.read_bytes() for path in output.iterdir()}
         if number == 0:
             first, cached = found, len(_names(caches))

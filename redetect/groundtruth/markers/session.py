@@ -122,7 +122,7 @@ def write_rig(
 ) -> None:
     """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
     entries = {
-        str(marker): {"width_m": float(width), **_pose_entries(pose)}
+        str(marker): {"width_m": float(width), **pose_entries(pose)}
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
     }
     head = {"dictionary": rig.dictionary}
@@ -139,7 +139,7 @@ def write_network(
 ) -> None:
     """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
     entries = {
-        name: {"calibration": calibration, **_pose_entries(pose)}
+        name: {"calibration": calibration, **pose_entries(pose)}
         for name, calibration, pose in zip(
             network.names, network.calibrations, network.world_from_camera
         )
@@ -156,7 +156,8 @@ def _with_covariance(key: str, entries: dict[str, Any], covariance: FloatArray) 
     return content
 
 
-def _pose_entries(pose: FloatArray) -> dict[str, list[float]]:
+def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
+    """A (4, 4) pose as `parse_pose` reads it."""
     return {
         "translation_m": pose[:3, 3].tolist(),
         "quaternion_xyzw": quaternion_xyzw(pose).tolist(),

@@ -9,7 +9,7 @@ import pytest
 
 from camera import write_camera
 from detect.sources.opening import open_run
-from tools.benchmark.__main__ import main, measure_runs
+from tools.benchmark.__main__ import main, measure_runs, perform
 from tools.benchmark.functions import (
     ALL,
     CIRCLES,
@@ -18,15 +18,14 @@ from tools.benchmark.functions import (
     LINES,
     RESPONSE,
     commands,
-    perform,
 )
 from tools.benchmark.material import (
-    BenchmarkError,
     repeated_run,
     run_pictures,
     scaled_camera,
     scaled_picture,
 )
+from tools.evaluation.figures import StudyError
 
 
 @pytest.fixture
@@ -48,7 +47,7 @@ def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_p
 
 def test_a_pass_that_fails_is_an_error(short_run: Path, tmp_path: Path) -> None:
     (short_run / "images" / "e.0000001.jpg").write_bytes(b"no image")
-    with pytest.raises(BenchmarkError, match=r"ended with 3.*cannot be decoded"):
+    with pytest.raises(StudyError, match=r"ended with 3.*cannot be decoded"):
         perform(commands(short_run, tmp_path)["detect circles --preset published"])
 
 

@@ -15,7 +15,6 @@ from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from lut import build_vertical_table
 from tools.benchmark.material import (
-    BenchmarkError,
     contents_of,
     disc_places,
     floor_with_discs,
@@ -27,6 +26,7 @@ from tools.benchmark.material import (
     scaled_picture,
     wall_with_edges,
 )
+from tools.evaluation.figures import StudyError
 
 
 def test_a_scaled_camera_sees_the_same_directions(published_camera: Camera) -> None:
@@ -78,7 +78,7 @@ def test_a_folder_without_photographs_is_an_error(published_camera: Camera, tmp_
 
 def test_a_broken_photograph_is_an_error(published_camera: Camera, tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"no image")
-    with pytest.raises(BenchmarkError, match=r"a\.jpg: cannot be decoded"):
+    with pytest.raises(ValueError, match=r"a\.jpg: cannot be decoded"):
         photograph_pictures(tmp_path, published_camera, 3)
 
 
@@ -129,7 +129,7 @@ def test_more_discs_are_fewer_discs_and_some(published_camera: Camera) -> None:
 
 
 def test_more_discs_than_have_room_are_an_error(published_camera: Camera) -> None:
-    with pytest.raises(BenchmarkError, match="500 discs"):
+    with pytest.raises(StudyError, match="500 discs"):
         disc_places(published_camera, 500, seed=0)
 
 

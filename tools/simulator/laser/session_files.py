@@ -23,7 +23,7 @@ from redetect.groundtruth.validation.reference_poses import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
-from tools.simulator.files import write_bytes
+from redetect.storage import write_bytes
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of

@@ -190,11 +190,7 @@ def strolling(
 
 
 def crossing(
-    rng: np.random.Generator,
-    robot_poses: Poses,
-    walls: FloatArray,
-    when_s: float,
-    near_m: float,
+    rng: np.random.Generator, robot_poses: Poses, walls: FloatArray, when_s: float, near_m: float
 ) -> Passer | None:
     """Somebody who passes right beside the robot, for `near_m` at the nearest."""
     centre = robot_poses(np.array([when_s]))[0, :2]

@@ -18,11 +18,8 @@ import numpy as np
 from camera.boards.board import Board
 from redetect.array_types import ByteArray, FloatArray
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    inverse,
-    quaternion_xyzw,
-)
+from redetect.groundtruth.markers.session import pose_entries
+from redetect.groundtruth.trajectories.transforms import apply, inverse
 from tools.simulator.driving import planar_transform
 from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
@@ -245,7 +242,7 @@ def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter
         seen.append(SeenFrame(name, prefix, _NETWORK_S + _PAUSE_S * place, ()))
         rows.append({"camera": name, "image": image, "placement": place, "board": view.board})
         truth.append(
-            {"image": image, "board": view.board, "world_from_board": _pose_json(view.pose),
+            {"image": image, "board": view.board, "world_from_board": pose_entries(view.pose),
              "corners": np.round(view.corners, 4).tolist()}
         )  # fmt: skip
     writer.times(folder, plan, seen)
@@ -255,17 +252,10 @@ def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter
             name: {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
             for name, board in (("first", DOUBLE), ("second", DOUBLE), ("world", WORLD))
         },
-        "first_from_second": _pose_json(offset),
-        "world_from_board": _pose_json(_world_view(plan).pose),
+        "first_from_second": pose_entries(offset),
+        "world_from_board": pose_entries(_world_view(plan).pose),
         "images": rows,
     }
     write_json(folder / "boards.json", content, overwrite=writer.overwrite)
     writer.truth(folder / "truth.json", plan, (), extra={"boards": truth})
     return len(views)
-
-
-def _pose_json(pose: FloatArray) -> dict[str, list[float]]:
-    return {
-        "translation_m": pose[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
-    }

@@ -15,7 +15,8 @@ from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import marker_dictionary
 from redetect.array_types import ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.trajectories.transforms import transform
-from tools.simulator.files import encoded, write_bytes, write_truth
+from redetect.storage import write_bytes
+from tools.simulator.files import encoded, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
 from tools.simulator.markers.rendering import (
     SAMPLES,

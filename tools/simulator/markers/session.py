@@ -16,8 +16,9 @@ from redetect.array_types import ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.markers.session import Network, Rig, write_network, write_rig
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse
+from redetect.storage import write_bytes
 from tools.simulator.driving import planar_transform
-from tools.simulator.files import encoded, rounded, write_bytes, write_truth
+from tools.simulator.files import encoded, rounded, write_truth
 from tools.simulator.markers.rendering import (
     Imaging,
     grey_image,

@@ -278,7 +278,7 @@ def photograph_background(
     """A part of a photograph, enlarged or reduced; parameters as in `shapes_background`."""
     import cv2
 
-    photograph = _photograph(files[rng.integers(len(files))])
+    photograph = photograph_of(files[rng.integers(len(files))])
     rows, columns = photograph.shape
     scale = rng.uniform(0.4, 1.0) * min(columns / width, rows / height)
     across, down = max(2, int(scale * width)), max(2, int(scale * height))
@@ -291,10 +291,11 @@ def photograph_background(
 
 
 @lru_cache(maxsize=_CACHED_PHOTOGRAPHS)
-def _photograph(path: Path) -> ByteArray:
+def photograph_of(path: Path) -> ByteArray:
+    """Grey values of a photograph, (H, W)."""
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        raise ValueError(f"{path}: cannot be read as an image")
+        raise ValueError(f"{path}: cannot be decoded: expected an image")
     return np.asarray(image, dtype=np.uint8)
