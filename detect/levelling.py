@@ -22,11 +22,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.model import inverse_2x2
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
 from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
@@ -47,6 +49,25 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     floor_xy, covariance, down = level_discs(
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
     )
+    level = _those(found, down, floor_xy, covariance)
+    return replace(level, levelled_by=(tilt.pitch, tilt.roll))
+
+
+def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
+    """Discs that a leaning camera sees, where the camera as calibrated would see them on the floor.
+
+    What that would see above the horizon is left out.
+    """
+    pixels = leaning.project_floor(found.floor_xy)
+    floor_xy = camera.floor_from_pixel(pixels)
+    jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
+    covariance = jacobian @ found.covariance @ jacobian.swapaxes(1, 2)
+    return _those(found, np.isfinite(floor_xy).all(axis=-1), floor_xy, covariance)
+
+
+def _those(
+    found: CircleDetections, down: Any, floor_xy: FloatArray, covariance: FloatArray
+) -> CircleDetections:
     return replace(
         found,
         pixels=found.pixels[down],
@@ -54,7 +75,6 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
         covariance=covariance[down],
         quality=found.quality[down],
         evidence=found.evidence[down],
-        levelled_by=(tilt.pitch, tilt.roll),
     )
 
 

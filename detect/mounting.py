@@ -10,14 +10,13 @@ that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from camera import Camera, write_camera
 from camera.calibration.model import COUNT
 from camera.model import PARAMETERS
-from camera.model_checks import checked_pose
 from camera.options import Level
 from camera.rotations import left_jacobian
 from camera.uncertainty import covariance_of, with_covariance
@@ -27,7 +26,7 @@ from detect.line_settings import LineSettings
 from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import level_matrix
+from detect.seen import leaning_camera, level_matrix
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar, report_failures
@@ -165,10 +164,8 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     mounting's; the rest stays.
     """
     turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
-    up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
-    pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
-    rows = checked_pose("sensor2World", pose)
-    moved = replace(camera, robot_from_camera=rows, covariance=None)
+    raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
+    moved = leaning_camera(camera, (mounting.pitch_rad, mounting.roll_rad), raised_m)
     covariance = covariance_of(camera)
     if covariance is None:
         return moved

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from camera.model_checks import checked_pose
 from camera.rotations import rotation_of
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
@@ -62,6 +63,17 @@ def level_matrix(levelled_by: ArrayLike) -> FloatArray:
     """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
     tilt = np.asarray(levelled_by, dtype=np.float64)
     return rotation_of(np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1))
+
+
+def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
+    """The camera as it is mounted if it hangs higher and then leans by pitch and roll (rad).
+
+    These turn directions level, about the robot's origin on the floor. The covariance is left out.
+    """
+    turn = level_matrix(lean)
+    centre = camera.centre + np.array([0.0, 0.0, raised_m])
+    pose = np.column_stack([turn @ camera.rotation, turn @ centre])
+    return replace(camera, robot_from_camera=checked_pose("sensor2World", pose), covariance=None)
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:

@@ -14,12 +14,13 @@ import numpy as np
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import RunRows, every_nth, open_rows, picture_name
 from detect.errors import DetectError, FrameError
-from detect.runs.frame import detect_batch, tables_of
+from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import Draw
+from lut import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
 
@@ -88,9 +89,8 @@ def pictures(
         picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
         if plan is not None:
             (found,) = detect_batch([FrameTask(frame)], plan)
-            verticals = tables_of(plan).verticals
-            if found.lines is not None and verticals is not None:
-                picture = draw_tracks(image, verticals, found.lines)
+            if found.lines is not None and plan.camera is not None:
+                picture = draw_tracks(image, cached_vertical_table(plan.camera), found.lines)
             if found.markers is not None:
                 picture = draw_candidates(picture, found.markers)
         yield name, picture

@@ -10,23 +10,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from detect.circles import scene_of
+from detect.circles import scene_of, vote_shape
 from detect.discs.fit import working_space
 from detect.discs.judgement import NO_CANDIDATES
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.discs.placing import place_discs
 from detect.run_tilt import smooth_axis
-from detect.runs.frame import tables_of
 from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import read_image
-from lut import VoteTable
+from lut import cached_vote_table
 
 
 def place_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
     """Place no disc of the first frame."""
-    camera, settings, table = plan.camera, plan.circles, tables_of(plan).discs
-    if camera and settings and isinstance(table, VoteTable):
+    camera, settings = plan.camera, plan.circles
+    if camera and settings and settings.refine:
         image = read_image(tasks[0].frame, camera, plan.working_folder)
+        table = cached_vote_table(camera, vote_shape(settings))
         scene = scene_of(image, camera, table, settings, noise=0.0)
         place_discs(scene, NO_CANDIDATES, working_space()[0])
 

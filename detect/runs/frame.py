@@ -24,6 +24,7 @@ from detect.discs.identity import ids_of_map, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (
+    as_calibrated,
     common_covariance,
     common_tilt_variance,
     level_discs,
@@ -32,18 +33,20 @@ from detect.levelling import (
     with_common,
 )
 from detect.lines import LineDetections, detect_lines
-from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
+from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
     FramePlan,
     FrameRows,
     FrameTask,
     KnownOfFrame,
+    Lean,
     RunSummary,
     json_record,
     rows_of_failure,
     time_row,
 )
+from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
@@ -85,21 +88,26 @@ class FrameDetections:
     error: str | None = None  # why the frame cannot be worked on
 
 
-class Tables(NamedTuple):
-    """The tables by the calibration that a plan needs."""
+class Search(NamedTuple):
+    """What discs are searched with: the camera, as it leans, and its table."""
 
-    verticals: VerticalTable | None
-    discs: VoteTable | DiscTable | None
+    camera: Camera
+    table: VoteTable | DiscTable
 
 
-@lru_cache(maxsize=4)
-def tables_of(plan: FramePlan) -> Tables:
-    """The tables that a plan needs: a process makes them or takes them from the cache once."""
-    camera = plan.camera
-    return Tables(
-        cached_vertical_table(camera) if camera and plan.lines else None,
-        disc_table(camera, plan.circles) if camera and plan.circles else None,
-    )
+@lru_cache(maxsize=16)
+def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Search:
+    """The search for discs of a camera: a process makes it or takes it from the cache once."""
+    leaning = camera if lean is None else leaning_camera(camera, lean)
+    return Search(leaning, disc_table(leaning, circles))
+
+
+def prepare(plan: FramePlan) -> None:
+    """Make the tables that a plan needs, or take them from the cache."""
+    if plan.camera and plan.lines:
+        cached_vertical_table(plan.camera)
+    if plan.camera and plan.circles:
+        search_of(plan.camera, plan.circles, plan.lean)
 
 
 def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetections]:
@@ -109,16 +117,16 @@ def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetec
     other's instructions and tables out of the processor's caches. A frame that cannot be worked on
     costs itself only. As many images are in memory at once as there are tasks.
     """
-    tables = tables_of(plan)
     batch = [FrameDetections() for _ in tasks]
-    paths = [_path(task, found, plan, tables) for task, found in zip(tasks, batch)]
+    verticals = cached_vertical_table(plan.camera) if plan.camera and plan.lines else None
+    paths = [_path(task, found, plan, verticals) for task, found in zip(tasks, batch)]
     for _ in zip_longest(*paths):  # advances each of them to its next `yield` in turn
         pass
     return batch
 
 
 def _path(
-    task: FrameTask, found: FrameDetections, plan: FramePlan, tables: Tables
+    task: FrameTask, found: FrameDetections, plan: FramePlan, verticals: VerticalTable | None
 ) -> Iterator[None]:
     """The path of one image from top to bottom; at each `yield`, the others of a batch catch up."""
     camera, prefix = plan.camera, task.frame.step.prefix
@@ -127,17 +135,22 @@ def _path(
         yield
 
         found.tilt = task.known.tilt
-        if plan.lines and tables.verticals:
-            found.lines = detect_lines(image, tables.verticals, plan.lines)
+        if plan.lines and verticals:
+            found.lines = detect_lines(image, verticals, plan.lines)
             found.tilt = tilt_of_lines(prefix, found.lines)
         yield
 
-        if plan.circles and camera and tables.discs:
+        if plan.circles and camera:
             by_frame = found.tilt if plan.levelling == "frame" else None
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
                 settings = _of_known_tilt(settings)
-            found.seen = found.discs = detect_circles(image, camera, tables.discs, settings)
+            lean = plan.lean or (lean_of_frame(by_frame) if by_frame and settings.refine else None)
+            search = search_of(camera, plan.circles, lean)
+            seen = detect_circles(image, search.camera, search.table, settings)
+            if lean is not None:
+                seen = as_calibrated(seen, search.camera, camera)
+            found.seen = found.discs = seen
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
@@ -186,6 +199,8 @@ _Tilted = tuple[str, int, FrameTilt | None]
 
 #: Standard deviation of where a map's discs are seen, besides their covariances: its path's (m).
 _MAP_SIGMA_M = 0.1
+#: Least lean with which discs are searched, degrees.
+_LEAST_LEAN_DEG = 0.5
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
@@ -297,6 +312,41 @@ def _disc_records(
     ]
 
 
+def lean_of_frame(tilt: FrameTilt) -> Lean | None:
+    """The lean with which discs are searched in a frame by its own tilt: in whole degrees."""
+    pitch, roll = round(math.degrees(tilt.pitch)), round(math.degrees(tilt.roll))
+    return (math.radians(pitch), math.radians(roll)) if pitch or roll else None
+
+
+def lean_of_run(camera: Camera, frames: Iterable[FrameRows]) -> Lean | None:
+    """The lean with which discs are searched in a run, by the rows of some frames.
+
+    None where few of them have a tilt, or where it is so small that it makes no difference.
+    """
+    _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
+    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera))
+    if found is None:
+        return None
+    lean_deg = np.degrees(found.lean).round(1)  # runs of one camera share the table in the cache
+    if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:
+        return None
+    pitch, roll = np.radians(lean_deg).tolist()
+    return pitch, roll
+
+
+def _tilts_of(
+    frames: Iterable[Mapping[str, str]],
+) -> tuple[list[_Tilted], FrameTilts, FrameTilts]:
+    """The tilts in the rows of frames; as numbers those by verticals, and those by outlines."""
+    own: list[_Tilted] = []
+    outlines: list[FrameTilt | None] = []
+    for rows in frames:
+        by_verticals, *by_outlines = map(_tilt_of_row, _lines(rows["tilt"]))
+        own.append(by_verticals)
+        outlines.append(by_outlines[0][2] if by_outlines else None)
+    return own, frame_tilts([tilt for _, _, tilt in own]), frame_tilts(outlines)
+
+
 def level_run(
     camera: Camera,
     settings: CircleSettings,
@@ -309,16 +359,9 @@ def level_run(
     levelled by its own; an unknown one has the standard deviation of the settings. The summary
     is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
     """
-    frames: list[_Tilted] = []
-    outlines: list[FrameTilt | None] = []
-    for rows in read():
-        own, *by_outlines = map(_tilt_of_row, _lines(rows["tilt"]))
-        frames.append(own)
-        outlines.append(by_outlines[0][2] if by_outlines else None)
+    frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)
-    found = summary.tilt = tilt_of_run(
-        frame_tilts([tilt for _, _, tilt in frames]), frame_tilts(outlines), common
-    )
+    found = summary.tilt = tilt_of_run(verticals, outlines, common)
     if found is not None:
         numbers = np.column_stack([found.tilt, found.variance]).tolist()
         tilts: list[FrameTilt | None] = [

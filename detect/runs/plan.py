@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 T_co = TypeVar("T_co", covariant=True)
 
+#: How a camera leans from its calibration: pitch and roll (rad) that turn directions level.
+Lean = tuple[float, float]
+
 #: Discs of a map that are farther from a frame than this are not matched in it, metres.
 _REACH_M = 20.0
 
@@ -157,6 +160,8 @@ class FramePlan:
     #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
     #: done, of the run.
     levelling: Levelling = "frame"
+    #: How the camera leans where discs are searched; set by `detect_run`.
+    lean: Lean | None = None
     working_folder: Path = field(default_factory=Path.cwd)  # where relative paths start from
 
 

@@ -30,7 +30,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.metadata import version
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +39,11 @@ import numpy as np
 
 from detect import __version__
 from detect.errors import DetectError
+from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, Lean, RunSummary
 from detect.runs.workers import Workers, detect_chunks, local_workers
-from detect.sources.interface import RunFrame
+from detect.sources.interface import ImageRun, RunFrame
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
@@ -52,6 +53,8 @@ _JOURNAL_VERSION = 7
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
 _COMPLETE = "complete"
+#: Number of frames in which it is seen how the camera leans, and at most how far apart they are.
+_LEAN_FRAMES, _LEAN_STEP = 32, 20
 
 
 class Journal:
@@ -169,7 +172,8 @@ def detect_run(
 ) -> RunSummary:
     """Process every frame of a run by a plan, and write the results.
 
-    Each image is decoded once. Levelled by the run, the tilt file has the tilts that the discs were
+    Each image is decoded once, but for some that show first how the camera leans: discs are
+    searched as it is mounted. Levelled by the run, the tilt file has the tilts that the discs were
     levelled by, and those of single frames are in another one (`outputs.frames_tilt_place`).
     Workers are by default this process; `on_progress` is called once after every frame.
 
@@ -183,6 +187,7 @@ def detect_run(
         are no workers.
     """
     plan = replace(job.plan, json="json" in job.places)
+    plan = replace(plan, lean=_lean_of(job.run, plan))
     job = replace(job, plan=plan)
     workers = workers or local_workers(1, large=job.run.frames.ships_images)
     summary = RunSummary()
@@ -207,6 +212,24 @@ def detect_run(
             written = level_run(plan.camera, plan.circles, files.rows, summary)
         files.finish(written, summary)
     return summary
+
+
+def _lean_of(run: ImageRun, plan: FramePlan) -> Lean | None:
+    """How the camera leans where discs are searched, by some frames of a run."""
+    camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
+    if not (camera and circles and circles.refine and plan.levelling != "none"):
+        return None
+    if expected < _LEAN_FRAMES:
+        return None
+    from detect.runs.frame import lean_of_run  # loads the compiler
+
+    step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
+    with closing(iter(run.frames)) as frames:
+        tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
+    seen = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
+    here = local_workers(1, large=run.frames.ships_images, shared=True)
+    with closing(detect_chunks(tasks, seen, here)) as chunks:
+        return lean_of_run(camera, [rows for chunk in chunks for _, rows in chunk])
 
 
 def make_folder(folder: Path) -> None:

@@ -336,10 +336,10 @@ def _begin(plan: FramePlan, lock: RLock, show: bool) -> None:
     cv2.setNumThreads(1)
     on_compilation(lambda: _compile_or_wait(lock))
     with suppress(Exception):  # any error recurs, and is reported, with the first task
-        from detect.runs.frame import tables_of  # loads detectors, which only workers need
+        from detect.runs.frame import prepare  # loads detectors, which only workers need
 
         with lock:
-            _in_worker(tables_of, plan)
+            _in_worker(prepare, plan)
 
 
 def _compile_or_wait(lock: RLock) -> None:

@@ -1,0 +1,121 @@
+"""Discs are searched as the camera is mounted, though its calibration has it lean otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import redetect as rd
+from camera import Camera, read_camera, write_camera
+from detect.circles import CircleDetections
+from detect.cli import main
+from detect.levelling import as_calibrated, level_discs
+from detect.runs.frame import lean_of_frame
+from detect.seen import leaning_camera
+from redetect.landmarks import FrameTilt, read_frames
+
+#: A calibration is wrong by so much, degrees.
+LEANS = [(2.3, 0.0), (-2.3, 0.8)]
+
+
+def wrong_by(camera: Camera, lean_deg: tuple[float, float]) -> Camera:
+    """A calibration of a camera that leans by less than that."""
+    pitch, roll = np.radians(lean_deg)
+    return leaning_camera(camera, (float(pitch), float(roll)))
+
+
+def level_rows(circles: Path) -> list[NDArray[np.float64]]:
+    return [
+        np.array([(row.px, row.py) for row in frame.circles]).reshape(-1, 2)
+        for frame in read_frames(circles)
+    ]
+
+
+def found_again(rows: list[NDArray[np.float64]], others: list[NDArray[np.float64]]) -> float:
+    """Share of rows near one of the others, within 15 cm."""
+    near = [
+        bool(len(there)) and bool(np.hypot(*(there - xy).T).min() < 0.15)
+        for here, there in zip(rows, others, strict=True)
+        for xy in here
+    ]
+    return float(np.mean(near))
+
+
+@pytest.mark.parametrize("lean_deg", LEANS)
+def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
+    project_root: Path, tmp_path: Path, lean_deg: tuple[float, float]
+) -> None:
+    run = tmp_path / "e"
+    run.mkdir()
+    for file in (project_root / "images" / "e").iterdir():
+        if file.name != "e.cam":
+            (run / file.name).symlink_to(file)
+    write_camera(
+        wrong_by(read_camera((project_root / "images" / "e") / "e.cam"), lean_deg), run / "e.cam"
+    )
+    assert main(["all", str(project_root / "images" / "e"), "-o", str(tmp_path / "right")]) == 0
+    assert main(["all", str(run), "-o", str(tmp_path / "wrong")]) == 0
+    right, wrong = (level_rows(tmp_path / name / "detected.circles") for name in ("right", "wrong"))
+    assert found_again(right, wrong) > 0.96
+    assert found_again(wrong, right) > 0.96
+    # `detect circles` searches alike, and writes rows as they are seen by the calibration.
+    assert main(["circles", str(run), "-o", str(tmp_path / "seen.circles")]) == 0
+    seen = level_rows(tmp_path / "seen.circles")
+    assert [len(rows) for rows in seen] == [len(rows) for rows in wrong]
+    assert found_again(seen, wrong) < 0.8
+
+
+def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Path) -> None:
+    image = sorted(((project_root / "images" / "e") / "images").iterdir())[11]
+    camera = read_camera((project_root / "images" / "e") / "e.cam")
+    right = rd.detect(image, camera)
+    wrong = rd.detect(image, wrong_by(camera, (2.3, 0.0)))
+    assert len(right.discs) >= 5
+    assert len(wrong.discs) == len(right.discs)
+    for one, other in ((right, wrong), (wrong, right)):
+        u = one.discs.u[:, None] - other.discs.u
+        v = one.discs.v[:, None] - other.discs.v
+        assert np.hypot(u, v).min(axis=1).max() < 0.5
+
+
+def test_a_slight_tilt_of_a_frame_is_no_lean() -> None:
+    slight = FrameTilt("e", np.radians(0.45), np.radians(-0.45), 1e-6, 0.0, 1e-6, 9)
+    assert lean_of_frame(slight) is None
+    assert lean_of_frame(replace(slight, pitch=np.radians(2.3))) == (np.radians(2.0), 0.0)
+
+
+@given(
+    st.tuples(st.floats(-0.06, 0.06), st.floats(-0.06, 0.06)),
+    st.lists(st.tuples(st.floats(-1.5, 1.5), st.floats(-4.0, -1.0)), min_size=1, max_size=5),
+)
+def test_levelling_by_the_lean_undoes_what_the_calibration_does(
+    published_camera: Camera, lean: tuple[float, float], places: list[tuple[float, float]]
+) -> None:
+    leaning = leaning_camera(published_camera, lean)
+    floor_xy = np.array(places)
+    pixels = leaning.project_floor(floor_xy)
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 9e-4]]) * np.ones((len(places), 1, 1))
+    found = CircleDetections(
+        np.rint(np.nan_to_num(pixels)).astype(np.int64), floor_xy, covariance,
+        np.ones(len(places)), np.ones(len(places)),
+    )  # fmt: skip
+    seen = as_calibrated(found, leaning, published_camera)
+    assert len(seen) == np.isfinite(pixels).all(axis=1).sum()
+    np.testing.assert_allclose(
+        published_camera.project_floor(seen.floor_xy),
+        pixels[np.isfinite(pixels).all(axis=1)],
+        atol=1e-6,
+    )
+    level_xy, level_covariance, down = level_discs(
+        published_camera, seen.floor_xy, seen.covariance, np.array(lean), np.zeros((2, 2))
+    )
+    assert down.all()
+    kept = np.isfinite(pixels).all(axis=1)
+    np.testing.assert_allclose(level_xy, floor_xy[kept], atol=1e-6)
+    np.testing.assert_allclose(level_covariance, covariance[kept], rtol=1e-3, atol=1e-9)
