@@ -24,16 +24,14 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
 from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
 from detect.settings import CircleSettings
+from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, read_frames
-
-FloatArray = NDArray[np.float64]
 
 #: Over which length (m) and angle (rad) levelled positions are differenced, either way.
 _STEP = 1e-6
@@ -70,7 +68,7 @@ def level_discs(
     covariance: FloatArray,
     tilt: FloatArray,
     tilt_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
     Positions are those that the calibrated camera sees on a level robot. Pitch and roll (rad) and
@@ -90,11 +88,7 @@ def level_discs(
 
 
 def common_covariance(
-    camera: Camera,
-    floor_xy: FloatArray,
-    unstated_px: float,
-    *,
-    by_verticals: bool | NDArray[np.bool_],
+    camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool | BoolArray
 ) -> FloatArray:
     """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
 

@@ -19,7 +19,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
@@ -33,6 +32,7 @@ from detect.verticals.starts import StartBand, band_response, line_starts, start
 from detect.verticals.tilt import with_error
 from detect.verticals.tracking import NOTHING_BEFORE, Before, follow_edges
 from lut.verticals import VerticalTable
+from redetect.array_types import GreyImage
 
 __all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
 
@@ -62,7 +62,7 @@ def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
 
 
 def detect_lines(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings = DEFAULT
+    image: GreyImage, table: VerticalTable, settings: LineSettings = DEFAULT
 ) -> LineDetections:
     """Find the building's verticals in an image.
 

@@ -20,12 +20,10 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
-
-FloatArray = NDArray[np.float64]
 
 #: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
@@ -300,11 +298,8 @@ def _weighed(share: float, off: float, variance: float) -> float:
 
 @kernel()
 def smooth_axis(
-    deviation: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    spread: float,
-    memory: float,
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    deviation: FloatArray, sigma: FloatArray, spread: float, memory: float
+) -> tuple[float, FloatArray, FloatArray]:
     """True deviations of one angle from the run's constant lean, by all frames.
 
     The state is the deviation x and the lasting error u of the verticals in units of its standard

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
@@ -92,7 +92,7 @@ class DiscTable:
     samples: NDArray[np.uint32]
     pixels: NDArray[np.int32]  # (N, 2) pixel (u, v) of each centre, in scan order
     #: (H, W, 2) floor position (robot X, Y, m) that each pixel sees; NaN above the horizon
-    floor_xy: NDArray[np.float32]
+    floor_xy: Float32Array
 
     @cached_property
     def groups(self) -> CentreGroups:

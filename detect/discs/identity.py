@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, circle_arrays
-
-FloatArray = NDArray[np.float64]
 
 #: Chi-squared of two degrees of freedom exceeds this once in a thousand.
 _GATE = 2.0 * math.log(1000.0)
@@ -45,7 +43,7 @@ def ids_of_rows(seen_xy: FloatArray, rows: Sequence[CircleLandmark]) -> list[tup
 
 def ids_of_map(
     floor_xy: FloatArray, covariance: FloatArray, discs: Sequence[MappedDisc], slack_m: float
-) -> NDArray[np.int64]:
+) -> IntArray:
     """(N,) IDs of the mapped discs that detected ones fall on; -1 where there is none.
 
     `slack_m` is the standard deviation of what neither covariance includes, in every direction.
@@ -61,7 +59,7 @@ def ids_of_map(
 
 def matched(
     xy: FloatArray, covariance: FloatArray, known_xy: FloatArray, known_covariance: FloatArray
-) -> NDArray[np.int64]:
+) -> IntArray:
     """(N,) which of M known places each of N places is; -1 where none is within the gate.
 
     Of places (N, 2), (M, 2) with covariances, each is used once at most, the nearest pairs first.

@@ -21,13 +21,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
 from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Directions in which the rim must lie on the ellipse.
@@ -47,9 +47,6 @@ _ITERATIONS = 7
 _FREEDOM = 4.0
 
 
-FloatArray = NDArray[np.float64]
-
-
 class OutlineTilt(NamedTuple):
     """Pitch and roll by discs' outlines (rad), their covariance (rad^2), and how many discs."""
 
@@ -63,7 +60,7 @@ class OutlineTilt(NamedTuple):
 
 @kernel()
 def _derivative_of_levelling(
-    rotation: NDArray[np.float64], centre: NDArray[np.float64], x: float, y: float
+    rotation: FloatArray, centre: FloatArray, x: float, y: float
 ) -> tuple[float, float, float, float]:
     """d(levelled x, y) / d(x, y) of a point of the calibrated floor, row by row."""
     dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
@@ -81,7 +78,7 @@ def _derivative_of_levelling(
 
 
 @kernel()
-def _contrast(grey: NDArray[np.float64]) -> float:
+def _contrast(grey: FloatArray) -> float:
     """Grey levels within half a radius minus those beyond one and a third."""
     inside = outside = 0.0
     inside_count = outside_count = 0
@@ -99,9 +96,9 @@ def _contrast(grey: NDArray[np.float64]) -> float:
 
 @kernel()
 def fit_outline(
-    point_xy: NDArray[np.float64],
-    px_per_m: NDArray[np.float64],
-    centre: NDArray[np.float64],
+    point_xy: FloatArray,
+    px_per_m: FloatArray,
+    centre: FloatArray,
     x: float,
     y: float,
     radius: float,
@@ -216,7 +213,7 @@ def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
 
 @kernel()
 def _tilts_of_discs(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     numbers: FloatArray,
     centre: FloatArray,
     floor_xy: FloatArray,
@@ -260,11 +257,7 @@ def _tilts_of_discs(
 
 
 def tilt_of_outlines(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    floor_xy: FloatArray,
-    radius_m: float,
-    raised_m: float = 0.0,
+    image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
 ) -> OutlineTilt | None:
     """The tilt that the outlines of the discs in an image show; None if no rim is in view.
 

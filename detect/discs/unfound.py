@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import (
@@ -31,8 +30,8 @@ from detect.discs.radius import FACTOR, find_radius
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
+from redetect.array_types import FloatArray, GreyImage
 
-FloatArray = NDArray[np.float64]
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
 
 #: Radii that are tried at a place are as much smaller and larger.
@@ -107,7 +106,7 @@ class DiscExplanation:
 
 
 def explain_discs(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     camera: Camera,
     settings: CircleSettings,
     at: tuple[float, float] | None = None,
@@ -136,7 +135,7 @@ def explain_discs(
     return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
 
 
-def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings) -> str:
+def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:
     """A sentence on the candidates for discs in images (H, W) without any, and what they fail."""
     settings = replace(settings, refine=True)
     scenes = (_Scene(image, camera, settings) for image in images)
@@ -158,7 +157,7 @@ def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: Circ
 class _Scene:
     """An image, and what is found in it."""
 
-    image: NDArray[np.uint8]
+    image: GreyImage
     camera: Camera
     settings: CircleSettings
 

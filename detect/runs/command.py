@@ -10,9 +10,6 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from detect.drawing.inputs import KINDS, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -24,6 +21,7 @@ from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
+from redetect.array_types import ByteArray
 from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
@@ -142,7 +140,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     return replace(settings, radius_m=round(found.radius_m, 4))
 
 
-def _some_images(run: Run) -> Iterator[NDArray[np.uint8]]:
+def _some_images(run: Run) -> Iterator[ByteArray]:
     """Images that are spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")

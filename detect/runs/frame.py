@@ -16,7 +16,6 @@ from itertools import groupby, islice, zip_longest
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_table
@@ -48,6 +47,7 @@ from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from detect.verticals.detections import carry_ids
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
+from redetect.array_types import FloatArray, GreyImage
 from redetect.landmarks import (
     CircleLandmark,
     FrameTilt,
@@ -65,7 +65,6 @@ from redetect.landmarks import (
 if TYPE_CHECKING:
     from detect.markers.detect import MarkerDetections
 
-FloatArray = NDArray[np.float64]
 
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -75,7 +74,7 @@ COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgE
 class FrameDetections:
     """Detections in one image; None for kinds that were not searched."""
 
-    image: NDArray[np.uint8] | None = None  # (H, W); None where it cannot be read
+    image: GreyImage | None = None  # (H, W); None where it cannot be read
     lines: LineDetections | None = None
     tilt: FrameTilt | None = None  # by the lines, if enough determine it, or known before
     seen: CircleDetections | None = None  # discs, where they would be on a level robot

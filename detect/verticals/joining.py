@@ -29,9 +29,10 @@ from detect.verticals.judgement import (
     Judgement,
 )
 from detect.verticals.refinement import LineFits
-from detect.verticals.response import FloatArray, Strip
+from detect.verticals.response import Strip
 from detect.verticals.tilt import level_matrix, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
 
@@ -43,8 +44,8 @@ class Lines(NamedTuple):
     alpha_rad: FloatArray
     beta_rad: FloatArray
     sigma_rad: FloatArray  # (N,) standard deviations of the bearings
-    members: NDArray[np.int64]  # (M,) tracks, line by line; the strongest of each line first
-    bounds: NDArray[np.int64]  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
+    members: IntArray  # (M,) tracks, line by line; the strongest of each line first
+    bounds: IntArray  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
 
 
 def lines_of_tracks(
@@ -120,7 +121,7 @@ def _wrapped(angle: float) -> float:
 
 @kernel()
 def _bearings(
-    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: JoiningNumbers
+    fits: LineFits, tracks: IntArray, tilt: tuple[float, float], numbers: JoiningNumbers
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
@@ -147,7 +148,7 @@ def _bearings(
 
 @kernel()
 def _leave_out(
-    tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
+    tracks: IntArray, alpha: FloatArray, polarity: FloatArray, fits: LineFits,
     evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
@@ -168,7 +169,7 @@ def _leave_out(
 
 
 @kernel()
-def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
+def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> IntArray:
     """(N,) groups of bearings (N,), counted from 0 at the largest one (leftmost in the image).
 
     Two neighbours belong together if they are closer than the smaller of their distances (N,).
@@ -183,7 +184,7 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
 
 @kernel()
 def join_mixtures(
-    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: NDArray[np.int64]
+    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """(N,) means and standard deviations of mixtures of Gaussians of bearings (rad).
 

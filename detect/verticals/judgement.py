@@ -17,15 +17,10 @@ from numpy.typing import NDArray
 
 from detect.line_settings import JudgementNumbers, LineNumbers
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines
-from detect.verticals.response import FloatArray, Strip
-from detect.verticals.tilt import (
-    TiltEstimate,
-    Verticals,
-    agree_on_tilt,
-    gather,
-    strongest_first,
-)
+from detect.verticals.response import Strip
+from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, gather, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Fates of tracks: a line of its own, joined to another one, or the reason for its rejection.
@@ -74,15 +69,15 @@ class Judgement(NamedTuple):
     #: (T,) places in `FATES`; lines that disagree with the tilt are "not vertical"
     fate: NDArray[np.int8]
     #: (T,) tracks that are no lines, but may have gone on beyond the edge's end or lost it early
-    doubtful: NDArray[np.bool_]
+    doubtful: BoolArray
     #: That most lines agree with; None where too few do. Its covariance is that of least squares.
     tilt: TiltEstimate | None
     verticals: Verticals  # what the lines that may be verticals by themselves say about the tilt
-    edge: NDArray[np.int64]  # (N,) the first of these that is of the same edge, for each
+    edge: IntArray  # (N,) the first of these that is of the same edge, for each
 
 
 def fit_and_judge(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
     numbers: LineNumbers, before: Judgement | None = None,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
@@ -113,7 +108,7 @@ def fit_and_judge(
 def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
 ) -> tuple[
-    FloatArray, NDArray[np.int8], NDArray[np.bool_], NDArray[np.int64], Verticals, NDArray[np.int64]
+    FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray
 ]:  # fmt: skip
     """Evidence and fates of tracks by themselves, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
@@ -176,7 +171,7 @@ def _judge_each(
 
 
 @kernel()
-def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
+def _accepted(fate: NDArray[np.int8]) -> IntArray:
     accepted, count = np.empty(len(fate), np.int64), 0
     for t in range(len(fate)):
         if fate[t] == ACCEPTED:
@@ -187,7 +182,7 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
 
 @kernel()
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: JudgementNumbers,
+    fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: JudgementNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint among the accepted ones."""
@@ -203,7 +198,7 @@ def _reject_soft(
 
 
 @kernel()
-def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> float:
+def _quantile(values: FloatArray, chosen: IntArray, share: float) -> float:
     """Quantile of some values, interpolated linearly."""
     own = np.empty(len(chosen))
     for k in range(len(chosen)):
@@ -217,7 +212,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
 
 @kernel()
 def _weigh(
-    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: JudgementNumbers
+    fits: LineFits, accepted: IntArray, votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with some votes each."""
     count = len(accepted)
@@ -247,7 +242,7 @@ def _weigh(
 
 
 @kernel()
-def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
+def share_edges(lines: Verticals, edge: IntArray) -> None:
     """Let the lines of one edge say together as much about the tilt as one."""
     members = np.zeros(len(edge), np.int64)
     for k in range(len(edge)):
