@@ -11,7 +11,7 @@ import numpy as np
 
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows, every_nth, open_rows
-from detect.errors import DetectError, FrameError
+from detect.errors import DetectError, FrameError, imported_for
 from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
@@ -128,10 +128,6 @@ def _show(recording: Any) -> None:
 def _rerun() -> Any:
     """The package of Rerun, which sends nothing home from here."""
     os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    try:
+    with imported_for("detect view needs the package rerun-sdk", "view"):
         import rerun
-    except ImportError:
-        raise DetectError(
-            "detect view needs the package rerun-sdk: install it by pip install 'redetect[view]'"
-        ) from None
     return rerun

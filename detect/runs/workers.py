@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
-from detect.errors import WorkerError
+from detect.errors import WorkerError, imported_for
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 from detect.terminal import (
     announcements_are_shown,
@@ -214,12 +214,8 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
-    try:
+    with imported_for("a cluster needs the package distributed", "cluster", error=WorkerError):
         from distributed import KilledWorker
-    except ImportError:
-        raise WorkerError(
-            "a cluster needs the package distributed: install it by pip install 'redetect[cluster]'"
-        ) from None
     clients: list[Client] = []
 
     def window() -> int:  # a cluster grows
