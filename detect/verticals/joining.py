@@ -21,13 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import JoiningNumbers
-from detect.verticals.judgement import (
-    ACCEPTED,
-    BESIDE_A_STRONGER_EDGE,
-    JOINED,
-    SAME_EDGE,
-    Judgement,
-)
+from detect.verticals.judgement import Fate, Judgement, accepted_tracks
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
 from detect.verticals.tilt import level_matrix, strongest_first
@@ -63,22 +57,13 @@ def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
     fate: NDArray[np.int8], tilt: tuple[float, float], numbers: JoiningNumbers,
 ) -> Lines:  # fmt: skip
-    count = 0
-    strength, chosen = np.empty(len(fate)), np.empty(len(fate), np.int64)
-    for t in range(len(fate)):
-        if fate[t] == ACCEPTED:
-            strength[count], chosen[count] = evidence[t], t
-            count += 1
-    tried = chosen[strongest_first(strength[:count])]
-    alpha, noise = _bearings(fits, tried, tilt, numbers)
-    _leave_out(tried, alpha, tracks.polarity, fits, evidence, numbers, fate)
-    bearing, reach, count = np.empty(len(tried)), np.empty(len(tried)), 0
-    for t in tried:
-        if fate[t] == ACCEPTED:
-            bearing[count], reach[count] = alpha[t], numbers.join_px * fits.pixel_rad[t]
-            chosen[count] = t
-            count += 1
-    group = chain_neighbours(bearing[:count], reach[:count])
+    chosen = accepted_tracks(fate)
+    chosen = chosen[strongest_first(evidence[chosen])]
+    alpha, noise = _bearings(fits, chosen, tilt, numbers)
+    _leave_out(chosen, alpha, tracks.polarity, fits, evidence, numbers, fate)
+    chosen = chosen[accepted_tracks(fate[chosen])]
+    count = len(chosen)
+    group = chain_neighbours(alpha[chosen], numbers.join_px * fits.pixel_rad[chosen])
     # The strongest of each line stays its first.
     bounds = np.zeros(count + 1, np.int64)
     members, lines, n = np.empty(count, np.int64), 0, 0
@@ -86,13 +71,13 @@ def _join(
         for k in range(count):
             if group[k] == lines:
                 members[n] = chosen[k]
-                fate[members[n]] = JOINED
+                fate[members[n]] = Fate.JOINED
                 n += 1
-        fate[members[bounds[lines]]] = ACCEPTED
+        fate[members[bounds[lines]]] = Fate.ACCEPTED
         lines += 1
         bounds[lines] = n
     bounds = bounds[: lines + 1]
-    deviation, weight = np.empty(count), np.ones(count)
+    bearing, deviation, weight = np.empty(count), np.empty(count), np.ones(count)
     for n in range(count):
         t = members[n]
         bearing[n] = alpha[t]
@@ -156,16 +141,16 @@ def _leave_out(
     for k in range(len(tracks)):
         t = tracks[k]
         for s in tracks[:k]:
-            if fate[s] != ACCEPTED:
+            if fate[s] != Fate.ACCEPTED:
                 continue
             near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
             if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
-                fate[t] = SAME_EDGE
+                fate[t] = Fate.SAME_EDGE
                 break
             faint = evidence[t] < numbers.join_share * evidence[s]
             fainter = contrast[t] < numbers.shoulder_share * contrast[s]
             if (near_px < numbers.join_px and faint) or (near_px < numbers.shoulder_px and fainter):
-                fate[t] = BESIDE_A_STRONGER_EDGE
+                fate[t] = Fate.BESIDE_A_STRONGER_EDGE
 
 
 @kernel()

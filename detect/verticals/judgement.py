@@ -10,6 +10,7 @@ number of standard deviations of its noise, and of some pixels over its length
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -23,39 +24,37 @@ from detect.verticals.tracking import LineTracks
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Fates of tracks: a line of its own, joined to another one, or the reason for its rejection.
-FATES = (
-    "accepted",
-    "joined",
-    "short",
-    "no maximum",
-    "little evidence",
-    "off the track",
-    "not straight",
-    "off the horizon",
-    "uncertain",
-    "soft",
-    "not vertical",
-    "same edge",
-    "beside a stronger edge",
-)
-(
-    ACCEPTED,
-    JOINED,
-    SHORT,
-    NO_MAXIMUM,
-    LITTLE_EVIDENCE,
-    OFF_THE_TRACK,
-    NOT_STRAIGHT,
-    OFF_THE_HORIZON,
-    UNCERTAIN,
-    SOFT,
-    NOT_VERTICAL,
-    SAME_EDGE,
-    BESIDE_A_STRONGER_EDGE,
-) = range(len(FATES))
 
-#: Tracks with at least this part of the least evidence might have more if followed otherwise.
+class Fate(IntEnum):
+    """What became of a track: a line of its own, joined to another one, or why it was rejected."""
+
+    ACCEPTED = 0
+    JOINED = 1
+    SHORT = 2
+    NO_MAXIMUM = 3
+    LITTLE_EVIDENCE = 4
+    OFF_THE_TRACK = 5
+    NOT_STRAIGHT = 6
+    OFF_THE_HORIZON = 7
+    UNCERTAIN = 8
+    SOFT = 9
+    NOT_VERTICAL = 10
+    SAME_EDGE = 11
+    BESIDE_A_STRONGER_EDGE = 12
+
+
+#: The same in words.
+FATES = tuple(fate.name.lower().replace("_", " ") for fate in Fate)
+
+#: Tracks of these fates might be lines if followed otherwise,
+_DOUBTFUL = (
+    Fate.NO_MAXIMUM,
+    Fate.OFF_THE_TRACK,
+    Fate.NOT_STRAIGHT,
+    Fate.UNCERTAIN,
+    Fate.SOFT,
+)
+#: and those with at least this part of the least evidence might have more if followed otherwise.
 _NEARLY = 0.7
 
 
@@ -95,7 +94,7 @@ def fit_and_judge(
         fits = LineFits(*(np.concatenate([old[kept], own]) for old, own in zip(before.fits, new)))
     evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
-    fate[accepted[~agrees]] = NOT_VERTICAL
+    fate[accepted[~agrees]] = Fate.NOT_VERTICAL
     return Judgement(
         fits, evidence, fate, doubtful, tilt if tilt.lines > 0 else None, lines, edge
     )  # fmt: skip
@@ -114,13 +113,11 @@ def _judge(
     count = len(tracks.polarity)
     evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
-    _reject_soft(fits, evidence, _accepted(fate), numbers, fate)
+    _reject_soft(fits, evidence, accepted_tracks(fate), numbers, fate)
     for t in range(count):
-        if fate[t] == LITTLE_EVIDENCE:
-            doubtful[t] = evidence[t] >= _NEARLY * numbers.least_evidence
-        else:
-            doubtful[t] = fate[t] in (NO_MAXIMUM, OFF_THE_TRACK, NOT_STRAIGHT, UNCERTAIN, SOFT)
-    accepted = _accepted(fate)
+        nearly = evidence[t] >= _NEARLY * numbers.least_evidence
+        doubtful[t] = fate[t] in _DOUBTFUL or (fate[t] == Fate.LITTLE_EVIDENCE and nearly)
+    accepted = accepted_tracks(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
     own_evidence, polarity = np.empty(count), np.empty(count)
@@ -153,28 +150,29 @@ def _judge_each(
         gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
         noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
         if end - begin < numbers.least_points:
-            fate[t] = SHORT
+            fate[t] = Fate.SHORT
         elif not evidence[t] >= numbers.least_evidence:
-            fate[t] = LITTLE_EVIDENCE
+            fate[t] = Fate.LITTLE_EVIDENCE
         elif not math.isfinite(fits.line[t, 0]):
-            fate[t] = NO_MAXIMUM
+            fate[t] = Fate.NO_MAXIMUM
         elif not fits.shift_px[t] <= numbers.largest_shift_px:
-            fate[t] = OFF_THE_TRACK
+            fate[t] = Fate.OFF_THE_TRACK
         elif not fits.scatter_px[t] <= numbers.largest_scatter_px:
-            fate[t] = NOT_STRAIGHT
+            fate[t] = Fate.NOT_STRAIGHT
         elif not gap <= numbers.largest_horizon_gap_px:
-            fate[t] = OFF_THE_HORIZON
+            fate[t] = Fate.OFF_THE_HORIZON
         elif not noise_px <= numbers.largest_noise_px:
-            fate[t] = UNCERTAIN
+            fate[t] = Fate.UNCERTAIN
         else:
-            fate[t] = ACCEPTED
+            fate[t] = Fate.ACCEPTED
 
 
 @kernel()
-def _accepted(fate: NDArray[np.int8]) -> IntArray:
+def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
+    """(N,) the tracks that are accepted so far."""
     accepted, count = np.empty(len(fate), np.int64), 0
     for t in range(len(fate)):
-        if fate[t] == ACCEPTED:
+        if fate[t] == Fate.ACCEPTED:
             accepted[count] = t
             count += 1
     return accepted[:count]
@@ -194,7 +192,7 @@ def _reject_soft(
     for t in accepted:
         soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
         if soft and evidence[t] < numbers.soft_evidence:
-            fate[t] = SOFT
+            fate[t] = Fate.SOFT
 
 
 @kernel()
