@@ -30,14 +30,9 @@ from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
 from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
-from redetect.landmarks import (
-    Frame,
-    LandmarkFileError,
-    frames_of_rows,
-    parse_rows,
-)
+from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import demand_free, write_bytes
 
 
 def perform(options: Tune) -> int:
@@ -58,9 +53,7 @@ def perform(options: Tune) -> int:
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
     outputs = {name: output / name for name in ("table.json", "curve.png")}
-    for path in outputs.values():
-        if path.exists() and not options.force:
-            raise OutputExistsError(path)
+    demand_free(outputs.values(), overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -75,6 +75,15 @@ class Candidate(NamedTuple):
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
         }[self.stage]
 
+    def record(self) -> dict[str, Any]:
+        """All of it, and the reason, for JSON; what is not finite is null."""
+        values = self._asdict().items()
+        known = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in values
+        }
+        return {**known, "reason": self.reason()}
+
 
 @dataclass(frozen=True)
 class DiscExplanation:
@@ -85,22 +94,13 @@ class DiscExplanation:
     suggestions: tuple[str, ...]  # what to try, and what that would find
 
     def to_json(self) -> str:
-        """All of it, the candidates numbered from 1; what is not finite is null."""
-        records = [
-            {
-                "number": number,
-                **{
-                    name: None if isinstance(value, float) and not math.isfinite(value) else value
-                    for name, value in row._asdict().items()
-                },
-                "reason": row.reason(),
-            }
-            for number, row in enumerate(self.candidates, start=1)
-        ]
+        """All of it, the candidates numbered from 1."""
         content = {
             "place": self.place,
             "suggestions": list(self.suggestions),
-            "candidates": records,
+            "candidates": [
+                {"number": k, **row.record()} for k, row in enumerate(self.candidates, 1)
+            ],
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
@@ -131,7 +131,7 @@ def explain_discs(
         x, y = camera.floor_from_pixel(at).tolist()
         near = _NEAR * settings.radius_m
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
-    candidates.sort(key=lambda c: (c.stage != "disc", -c.votes))
+    candidates.sort(key=lambda c: (not c.is_disc, -c.votes))
     return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
 
 
