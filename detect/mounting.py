@@ -129,7 +129,7 @@ def mounting_of_run(
     run = tilt_of_run(verticals)
     if run is None:
         return None
-    known = np.isfinite(outline_pitch_rad).all(axis=1) & np.isfinite(verticals.tilt[:, 0])
+    known = np.isfinite(outline_pitch_rad).all(axis=1) & verticals.known
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
     if count >= LEAST_FRAMES:
@@ -153,7 +153,7 @@ def mounting_of_run(
         roll_sigma_rad=roll_sigma,
         raised_m=raised_m,
         raised_sigma_m=sigma_m,
-        frames=int(np.count_nonzero(np.isfinite(verticals.tilt[:, 0]))),
+        frames=int(np.count_nonzero(verticals.known)),
         frames_with_discs=count,
     )
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from redetect.array_types import FloatArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
@@ -61,6 +61,11 @@ class FrameTilts(NamedTuple):
 
     tilt: FloatArray  # (N, 2)
     variance: FloatArray  # (N, 2)
+
+    @property
+    def known(self) -> BoolArray:
+        """(N,) which frames have a tilt."""
+        return np.isfinite(self.tilt[:, 0])
 
 
 def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
@@ -109,9 +114,9 @@ def tilt_of_run(
     error of pitch and roll that all frames share, if the calibration states it: then the lean is
     that of the verticals. Without it, it follows from how far outlines and verticals agree.
     """
-    if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
+    if np.count_nonzero(verticals.known) < LEAST_FRAMES:
         return None
-    if outlines is None or not _are_enough(outlines, verticals):
+    if outlines is None or np.count_nonzero(outlines.known & verticals.known) < LEAST_FRAMES:
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
@@ -143,11 +148,6 @@ def _tilts(series: Sequence[_Series], found: Sequence[_Axis]) -> tuple[FloatArra
     smoothed = [axis.smoothed(one) for axis, one in zip(series, found)]
     tilt = np.stack([one.lean + each[1] for one, each in zip(found, smoothed)], axis=-1)
     return tilt, np.stack([each[2] for each in smoothed], axis=-1)
-
-
-def _are_enough(outlines: FrameTilts, verticals: FrameTilts) -> bool:
-    both = np.isfinite(outlines.tilt[:, 0]) & np.isfinite(verticals.tilt[:, 0])
-    return bool(np.count_nonzero(both) >= LEAST_FRAMES)
 
 
 class _Axis(NamedTuple):
