@@ -13,13 +13,7 @@ from rich.text import Text
 
 from camera import Camera, camera_in, read_camera
 from detect.comparison.compare import compare_with_file
-from detect.comparison.result import (
-    WORST_FRAMES,
-    Comparison,
-    DiscComparison,
-    Kind,
-    number,
-)
+from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, Kind, number
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.seen import Sight

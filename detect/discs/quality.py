@@ -47,25 +47,18 @@ _ROUNDING = 1e-6
 class Limits(NamedTuple):
     """Which centres are found."""
 
-    quality: float
-    """At least, and above 0,"""
-    part_quality: float = 0.0
-    """in the samples that a group shares at least this,"""
-    contrast: float = 0.0
-    """and more than this, grey levels, of either sign."""
-    sign: int = 0
-    """1 for those lighter than what is around them, -1 for darker ones, 0 for both."""
+    quality: float  # at least, and above 0,
+    part_quality: float = 0.0  # in the samples that a group shares at least this,
+    contrast: float = 0.0  # and more than this, grey levels, of either sign
+    sign: int = 0  # 1 for those lighter than what is around them, -1 for darker ones, 0 for both
 
 
 class Centres(NamedTuple):
     """Some centres, in scan order."""
 
-    pixels: IntArray
-    """(N, 2) pixels (u, v)."""
-    quality: FloatArray
-    """(N,)"""
-    contrast: Float32Array
-    """(N,) of the inner outline to the outer, grey levels."""
+    pixels: IntArray  # (N, 2) pixels (u, v)
+    quality: FloatArray  # (N,)
+    contrast: Float32Array  # (N,) of the inner outline to the outer, grey levels
 
 
 def least_part_quality(quality: float, samples: int) -> float:

@@ -9,12 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
-from detect.comparison.result import (
-    DiscComparison,
-    DiscPairs,
-    LineComparison,
-    LinePairs,
-)
+from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
 from detect.drawing.inputs import SeenRows
 from detect.seen import summed_steps
 from redetect.array_types import FloatArray

@@ -26,20 +26,8 @@ from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
 from detect.errors import DetectError, FrameError, imported_for
-from detect.sources.interface import (
-    RunFrame,
-    Source,
-    gray_of_pixels,
-    numbered_prefix,
-    still,
-)
-from detect.sources.poses import (
-    FARTHEST,
-    PoseStream,
-    TimedPose,
-    carried,
-    heading_rad,
-)
+from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
+from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
 from redetect.storage.messages import OneLineError, excerpt, one_line
 

@@ -14,13 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from detect.errors import DetectError, FrameError
-from detect.sources.interface import (
-    Frames,
-    RunFrame,
-    Source,
-    frame_prefix,
-    still,
-)
+from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
 from redetect.landmarks.times import read_times
 from redetect.storage.bounded import leads_out, link_out

@@ -9,19 +9,9 @@ from pathlib import Path
 from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.sources.image_files import (
-    IMAGE_SUFFIXES,
-    WILDCARDS,
-    ImageFiles,
-)
+from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
-from detect.sources.poses import (
-    FirstFrames,
-    FramesAlongPoses,
-    PoseStream,
-    tick_poses,
-    tum_poses,
-)
+from detect.sources.poses import FirstFrames, FramesAlongPoses, PoseStream, tick_poses, tum_poses
 from detect.sources.video import LiveCamera, VideoFile
 
 #: Endings of bags that are one file.
