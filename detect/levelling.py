@@ -117,9 +117,7 @@ def _wrong_by(pixels: float) -> CircleSettings:
     return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
 
 
-@lru_cache(maxsize=4)
-def _tilt_by_parameters(camera: Camera) -> FloatArray:
-    return tilt_by_parameters(camera)
+_tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:

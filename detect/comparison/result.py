@@ -7,17 +7,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
+from detect.seen import Sight
+from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
-
-if TYPE_CHECKING:
-    from detect.seen import Sight
-    from detect.viewing_options import CompareOptions
 
 Kind = Literal["circles", "lines"]
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from io import BytesIO
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
@@ -16,12 +18,6 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import circle_arrays, is_positive_definite
 from redetect.plane import apply, ellipses
 from redetect.reporting.page import Part, figure_file, image_part
-
-if TYPE_CHECKING:
-    from io import BytesIO
-
-    from matplotlib.axes import Axes
-
 
 #: Colours that stay apart in print and for the colour-blind; differences remain without them.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"

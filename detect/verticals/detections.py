@@ -52,9 +52,7 @@ class LineDetections:
         own = self.lines
         numbers = np.column_stack([own.ends, own.alpha_rad, own.beta_rad, own.sigma_rad])
         return tuple(
-            LineLandmark(
-                xtop, ytop, xbottom, ybottom, alpha, beta, quality=0.0, sigma=sigma, ids=(-1,)
-            )
+            LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, 0.0, sigma, (-1,))
             for xtop, ytop, xbottom, ybottom, alpha, beta, sigma in numbers.tolist()
         )
 
