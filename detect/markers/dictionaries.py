@@ -37,8 +37,6 @@ _OPENCV_PREFIX = "DICT_"
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
-#: Size of the cells and the margin of a specimen.
-_CELL_PX, _MARGIN_PX = 5, 20
 
 
 @dataclass(frozen=True, eq=False)
