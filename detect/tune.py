@@ -52,8 +52,8 @@ def perform(options: Tune) -> int:
         frames = [frame for _, frame in selection]
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
-    outputs = {name: output / name for name in ("table.json", "curve.png")}
-    demand_free(outputs.values(), overwrite=options.force)
+    names = "table.json", "curve.png"
+    demand_free([output / name for name in names], overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
@@ -81,16 +81,12 @@ def perform(options: Tune) -> int:
         "settings": asdict(base),
         "varied": varied,
     }
-    document = json.dumps({**head, "trials": records}, indent=1)
+    table = f"{json.dumps({**head, 'trials': records}, indent=1)}\n".encode()
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
-    contents = {
-        "table.json": f"{document}\n".encode(),
-        "curve.png": curve_picture(records, varied, title),
-    }
     output.mkdir(parents=True, exist_ok=True)
-    for name, content in contents.items():
-        write_bytes(outputs[name], content, overwrite=options.force)
-    print(f"{output}: {title}: {', '.join(contents)}")
+    for name, content in zip(names, (table, curve_picture(records, varied, title))):
+        write_bytes(output / name, content, overwrite=options.force)
+    print(f"{output}: {title}: {', '.join(names)}")
     for record in records:
         if record["knee"]:
             values = " ".join(f"--{name.replace('_', '-')} {record[name]}" for name in varied)

@@ -80,18 +80,7 @@ def _derivative_of_levelling(
 @kernel()
 def _contrast(grey: FloatArray) -> float:
     """Grey levels within half a radius minus those beyond one and a third."""
-    inside = outside = 0.0
-    inside_count = outside_count = 0
-    for k in range(grey.shape[0]):
-        for m in range(4):
-            if not math.isnan(grey[k, m]):
-                inside += grey[k, m]
-                inside_count += 1
-        for m in range(grey.shape[1] - 8, grey.shape[1]):
-            if not math.isnan(grey[k, m]):
-                outside += grey[k, m]
-                outside_count += 1
-    return inside / inside_count - outside / outside_count
+    return float(np.nanmean(grey[:, :4]) - np.nanmean(grey[:, -8:]))
 
 
 @kernel()
@@ -187,12 +176,9 @@ def fit_outline(
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
     count = len(tilt)
-    mean, of_mean = np.empty(2), np.empty((2, 2))
-    one, information = np.empty(count), np.empty((count, 2, 2))
+    mean, of_mean, information = np.empty(2), np.empty((2, 2)), np.empty((count, 2, 2))
     for i in range(2):
-        for k in range(count):
-            one[k] = tilt[k, i]
-        mean[i] = median(one)
+        mean[i] = median(tilt[:, i].copy())
     for k in range(count):
         invert_positive(covariance[k], information[k])
     for _ in range(_ITERATIONS):
@@ -227,10 +213,7 @@ def _tilts_of_discs(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         seen = profiles(image, numbers, x, y, radius)
-        long_enough = 0
-        for m in range(DIRECTIONS):
-            long_enough += seen.pixels_per_radius[m] >= LEAST_AXIS_PX
-        if long_enough < DIRECTIONS:
+        if not seen.pixels_per_radius.min() >= LEAST_AXIS_PX:
             continue
         contrast = _contrast(seen.grey)
         if not abs(contrast) >= LEAST_CONTRAST:
