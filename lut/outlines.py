@@ -116,8 +116,7 @@ def ring(radius_m: float, samples: int) -> FloatArray:
 @lru_cache(maxsize=2)
 def floor_positions(camera: Camera) -> FloatArray:
     """(H, W, 2) floor position (robot X, Y, metres) that each pixel sees; NaN above the horizon."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    return camera.floor_from_pixel(np.stack([u, v], axis=-1))
+    return camera.floor_from_pixel(camera.pixel_grid())
 
 
 def demand_above_floor(camera: Camera) -> None:
@@ -248,8 +247,7 @@ def _samples_of(
 def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatArray:
     """(H, W) how far the floor moves per image row, metres."""
     if shape.least_pairs:
-        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-        by_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
+        by_row = camera.floor_jacobian_published(camera.pixel_grid())[..., 1]
         return np.hypot(by_row[..., 0], by_row[..., 1])
     return size_down(floor_xy)
 

@@ -70,8 +70,7 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     deg past the horizon gets a table without verticals.
     """
     height, width = camera.height, camera.width
-    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    normalised = camera.undistort(np.stack([u, v], axis=-1))
+    normalised = camera.undistort(camera.pixel_grid())
     elevation_rad, row = _anchor(camera, normalised)
     on_anchor = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
     bearing = np.arctan2(on_anchor[:, 0], -on_anchor[:, 1])

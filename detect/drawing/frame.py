@@ -111,9 +111,7 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
         for angle in (sigma_rad, -sigma_rad):
             sine, cosine = np.sin(angle), np.cos(angle)
             turned = np.column_stack([cosine * x - sine * y, sine * x + cosine * y, 0.0 * x])
-            seen = turned @ camera.rotation
-            ahead = np.where(seen[:, 2:] > 1e-6, seen[:, 2:], np.nan)
-            bars.append(camera.distort(seen[:, :2] / ahead))
+            bars.append(camera.project(turned @ camera.rotation))
     return np.stack(bars, axis=1)
 
 
@@ -227,8 +225,7 @@ def png_of(picture: ByteArray) -> bytes:
 
 @lru_cache(maxsize=2)
 def _unseen(camera: Camera) -> BoolArray:
-    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
-    return np.isnan(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))[..., 0])
+    return np.isnan(camera.undistort(camera.pixel_grid())[..., 0])
 
 
 def enlargement(canvas: ByteArray) -> int:
