@@ -9,7 +9,7 @@ missing are drawn as well, and rows that fit none have another colour.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import get_args
 
@@ -32,7 +32,7 @@ from detect.verticals.tracking import LineTracks
 from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
-from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
+from redetect.landmarks import CircleLandmark, LineLandmark, MarkerLandmark, circle_arrays
 from redetect.plane import ellipses
 
 _POINTS = 33
@@ -134,10 +134,7 @@ def _draw_discs(
     drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
     drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
     for row, text, colour in drawn:
-        centre = np.array([row.px, row.py])
-        _outline_disc(
-            canvas, view.detected_px, centre, settings, f"{row.quality:.2f}{text}", colour
-        )
+        _outline_disc(canvas, view, row, settings, f"{row.quality:.2f}{text}", colour)
 
 
 def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
@@ -179,20 +176,22 @@ def _count(what: str, match: FrameMatch, compared: bool) -> str:
 
 def _outline_disc(
     canvas: ByteArray,
-    project: Callable[[FloatArray], FloatArray],
-    centre_xy: FloatArray,
+    view: Sight,
+    row: CircleLandmark,
     settings: CircleSettings,
     text: str,
     edge_colour: Colour,
 ) -> None:
-    """Draw a disc's edge and its two outlines, and a word above; `project` takes it to pixels."""
+    """Draw a detected disc's edge and its two outlines, and a word above."""
+    centre_xy = np.array([row.px, row.py])
     for radius, colour in (
         (settings.inner_radius_m, _OUTLINE_COLOUR),
         (settings.radius_m, edge_colour),
         (settings.outer_radius_m, _OUTLINE_COLOUR),
     ):
-        draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
-    top = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+        edge = view.detected_px(circle_on_floor(centre_xy, radius))
+        draw_curve(canvas, edge, colour, closed=True)
+    top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
     draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))
 
 

@@ -166,12 +166,11 @@ def _known_discs(options: DiscIdOptions) -> Known:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
-    known = Known(discs=_frames(options.ids_from))
-    if options.ids_from is not None:
-        known = replace(known, discs_level=read_head(options.ids_from).level)
+    mapped = None
     if options.ids_from_map is not None and options.path is not None:
-        known = replace(known, mapped=MapByImage(options.ids_from_map, options.path))
-    return known
+        mapped = MapByImage(options.ids_from_map, options.path)
+    level = options.ids_from is not None and read_head(options.ids_from).level
+    return Known(discs=_frames(options.ids_from), discs_level=level, mapped=mapped)
 
 
 def _workers(command: DetectorFlags, job: Job) -> Workers:
