@@ -12,6 +12,7 @@ from __future__ import annotations
 import atexit
 import os
 import sys
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -103,7 +104,11 @@ def carry_out(command: Command) -> int:
 def parsed(arguments: Sequence[str]) -> Command:
     """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
-    preset, file = _value_of("--preset", arguments), _value_of("--settings", arguments)
+    deciding = ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in ("--preset", "--settings"):  # the other flags' defaults are theirs
+        deciding.add_argument(flag, nargs="?", default="", const="")
+    given = deciding.parse_known_args(arguments)[0]
+    preset, file = given.preset, given.settings
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MarkerSettings()
@@ -138,13 +143,3 @@ def _with_radius_found(arguments: Sequence[str]) -> list[str]:
                 word = "--find-radius"
         found.append(word)
     return found
-
-
-def _value_of(flag: str, arguments: Sequence[str]) -> str:
-    """The value of a flag that decides the other flags' defaults; empty if it is not there."""
-    for word, following in zip(arguments, [*arguments[1:], ""]):
-        if word == flag:
-            return following
-        if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
-    return ""

@@ -26,7 +26,6 @@ from redetect.storage.bounds import (
 
 Preset = Literal["default", "published"]
 DetectorPreset = Literal["default", "published", "report"]
-LineEnds = Literal["lf", "crlf"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class DetectorFlags(RunFlags):
     #: a result's .log.json, to detect with the same ones again.
     settings: MaybePath = None
     #: How lines end in files of landmarks; the data set's own end with CR and LF.
-    line_ends: LineEnds = "lf"
+    line_ends: Literal["lf", "crlf"] = "lf"
     #: Processes that share the work, 1 for none beside this one; by default one for every 500
     #: frames, at most as many as there are cores. What is written is the same.
     jobs: MaybeInt = None

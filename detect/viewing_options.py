@@ -214,9 +214,6 @@ class Tune(SomeFramesFlags):
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
 
-Format = Literal["csv", "parquet", "mcap"]
-
-
 @dataclass(frozen=True)
 class Export:
     """Write the rows of a file in another format, with named columns and units.
@@ -230,7 +227,7 @@ class Export:
     file: Positional[Path]  #: A .circles, .lines, .markers or .tilt file, or one of STEP rows.
     #: csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
     #: (extra [bags]).
-    to: Format = "csv"
+    to: Literal["csv", "parquet", "mcap"] = "csv"
     #: The file to write; by default the file's name and the format's. The steps go beside it, as
     #: .steps.csv or .steps.parquet; MCAP has all in one.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
