@@ -132,14 +132,7 @@ def parsed(arguments: Sequence[str]) -> Command:
 
 def _with_radius_found(arguments: Sequence[str]) -> list[str]:
     """The command line with `--find-radius` in the place of a radius that is `auto`."""
-    found, rest = [], list(arguments)
-    while rest:
-        word = rest.pop(0)
-        name, _, value = word.partition("=")
-        if name in ("--radius-m", "--circles.radius-m"):
-            if word == name and rest[:1] == ["auto"]:
-                value = rest.pop(0)
-            if value == "auto":
-                word = "--find-radius"
-        found.append(word)
-    return found
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
+    given, rest = parser.parse_known_args(arguments)
+    return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)
