@@ -21,23 +21,29 @@ from tyro import MISSING
 from detect.errors import DetectError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
+from detect.options import (
+    All,
+    Circles,
+    Compare,
+    CompareOptions,
+    Demo,
+    DetectorFlags,
+    DiscIdOptions,
+    Draw,
+    Explain,
+    Export,
+    Lines,
+    Markers,
+    Report,
+    RowFiles,
+    SourceOptions,
+    Tune,
+    View,
+)
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import read_settings
 from detect.terminal import interrupts_noted, show_announcements
-from detect.viewing_options import (
-    Compare,
-    CompareOptions,
-    Demo,
-    Draw,
-    Explain,
-    Export,
-    Report,
-    RowFiles,
-    Tune,
-    View,
-)
 from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
 from redetect.storage.messages import is_quiet
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from detect.comparison.report import comparison_of
-from detect.options import All
+from detect.options import All, Compare, Demo, Report, RowFiles
 from detect.report.page import perform as write_report
 from detect.runs.command import perform as detect_run
-from detect.viewing_options import Compare, Demo, Report, RowFiles
 from redetect.storage import demand_free
 
 #: Images that come with the program: the first of the demo run (`images/README.md`).

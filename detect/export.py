@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from detect.errors import DetectError, imported_for
+from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
-from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts

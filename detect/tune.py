@@ -20,6 +20,7 @@ from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.drawing.inputs import every_nth
 from detect.errors import DetectError
+from detect.options import CompareOptions, Tune
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
@@ -28,7 +29,6 @@ from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file

@@ -12,11 +12,11 @@ import numpy as np
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows, every_nth, open_rows
 from detect.errors import DetectError, FrameError, imported_for
+from detect.options import View
 from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import View
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path

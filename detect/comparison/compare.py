@@ -35,9 +35,9 @@ from detect.comparison.result import (
     quantile,
 )
 from detect.errors import CompareError
+from detect.options import CompareOptions
 from detect.seen import LEAST_GATE_PX, Sight
 from detect.sources.image_files import image_name
-from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Association,

@@ -16,8 +16,8 @@ from detect.comparison.compare import compare_with_file
 from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, Kind, number
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
+from detect.options import Compare
 from detect.seen import Sight
-from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR

@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from detect.options import CompareOptions
 from detect.seen import Sight
-from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 

@@ -25,11 +25,11 @@ from detect.drawing.inputs import SeenRows
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
+from detect.options import CompareOptions
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
-from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
 from redetect.landmarks import CircleLandmark, LineLandmark, MarkerLandmark, circle_arrays

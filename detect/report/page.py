@@ -15,11 +15,11 @@ from detect.comparison.result import Comparison, DiscComparison, Kind, LineCompa
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
+from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.seen import Sight
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import Report, RowFiles
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 

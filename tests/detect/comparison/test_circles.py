@@ -16,8 +16,8 @@ from detect.comparison.compare import compare_frames
 from detect.comparison.report import comparison_of
 from detect.comparison.result import DiscComparison
 from detect.errors import CompareError, DetectError
+from detect.options import Compare, CompareOptions
 from detect.sources.image_files import image_name
-from detect.viewing_options import Compare, CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Step, read_frames, write_frames
 from tests.detect.comparison.formatting import format_text
 

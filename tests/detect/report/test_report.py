@@ -16,9 +16,9 @@ from camera import camera_in
 from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
+from detect.options import CompareOptions
 from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
 from tests.detect.test_cli import assert_refused
 
