@@ -15,7 +15,10 @@ If all edges are blurred, everything is repeated with filters as wide as the blu
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,21 +26,59 @@ import numpy as np
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
-from detect.verticals.detections import LineDetections
-from detect.verticals.joining import lines_of_tracks
-from detect.verticals.judgement import FATES, fit_and_judge
+from detect.verticals.joining import Lines, lines_of_tracks
+from detect.verticals.judgement import FATES, Judgement, fit_and_judge
 from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
-from detect.verticals.tilt import with_error
-from detect.verticals.tracking import NOTHING_BEFORE, Before, follow_edges
+from detect.verticals.tilt import TiltEstimate, with_error
+from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow_edges
 from lut.verticals import VerticalTable
 from redetect.array_types import GreyImage
-
-__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
+from redetect.landmarks import LineLandmark, wrap_angle
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
+#: A reference line is the same as a detected one within this bearing, or two standard deviations.
+_SAME_LINE_RAD = np.radians(0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class LineDetections:
+    """Detections in one image."""
+
+    lines: Lines  # the leftmost is the first, here and elsewhere
+    tracks: LineTracks
+    judged: Judgement  # lines through all tracks, and their fates
+    sharpness: float  # median sharpness of the edges (`detect.verticals.blur.median_sharpness`)
+
+    def __len__(self) -> int:
+        return len(self.lines.alpha_rad)
+
+    @cached_property
+    def members(self) -> tuple[tuple[int, ...], ...]:
+        """The tracks that each line consists of, the strongest first; its ends are that one's."""
+        own = self.lines.members.tolist()
+        return tuple(tuple(own[a:b]) for a, b in pairwise(self.lines.bounds.tolist()))
+
+    @property
+    def tilt(self) -> TiltEstimate | None:
+        """None where too few lines agree."""
+        return self.judged.tilt
+
+    @cached_property
+    def fate(self) -> tuple[str, ...]:
+        """(T,) "accepted", "joined" (to a stronger one), or why the track is no line."""
+        return tuple(FATES[number] for number in self.judged.fate.tolist())
+
+    def landmarks(self) -> tuple[LineLandmark, ...]:
+        """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
+        own = self.lines
+        numbers = np.column_stack([own.ends, own.alpha_rad, own.beta_rad, own.sigma_rad])
+        return tuple(
+            LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, 0.0, sigma, (-1,))
+            for xtop, ytop, xbottom, ybottom, alpha, beta, sigma in numbers.tolist()
+        )
 
 
 class _Prepared(NamedTuple):
@@ -111,3 +152,26 @@ def detect_lines(
         judged = judged._replace(tilt=error)
     lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
     return LineDetections(lines, tracks, judged, sharpness)
+
+
+def carry_ids(
+    rows: Sequence[LineLandmark], reference: Sequence[LineLandmark]
+) -> tuple[LineLandmark, ...]:
+    """Detected lines of a frame with the IDs of the reference rows that are theirs beyond doubt.
+
+    A reference row whose bearing fits exactly one detected line (within half a degree or two
+    standard deviations) gives that line its IDs; a joined line can get several, and one that none
+    fits has -1.
+    """
+    if not rows or not reference:
+        return tuple(rows)
+    alpha = np.array([row.alpha for row in rows])
+    reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))
+    ids: list[list[int]] = [[] for _ in rows]
+    for row in reference:
+        fits = np.flatnonzero(np.abs(wrap_angle(alpha - row.alpha)) <= reach)
+        if len(fits) == 1:
+            ids[fits[0]] += [i for i in row.ids if i >= 0]
+    return tuple(
+        replace(row, ids=tuple(dict.fromkeys(own)) if own else (-1,)) for row, own in zip(rows, ids)
+    )

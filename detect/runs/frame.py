@@ -30,7 +30,7 @@ from detect.levelling import (
     tilt_arrays,
     with_common,
 )
-from detect.lines import LineDetections, detect_lines
+from detect.lines import LineDetections, carry_ids, detect_lines
 from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
@@ -45,7 +45,6 @@ from detect.runs.plan import (
 )
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
-from detect.verticals.detections import carry_ids
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
 from redetect.array_types import FloatArray, GreyImage
 from redetect.landmarks import (
