@@ -15,6 +15,7 @@ import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tyro import MISSING
 
@@ -62,9 +63,6 @@ EXPERT: dict[type, frozenset[str]] = {
     CompareOptions: all_but(CompareOptions, "only_identified"),
 }  # fmt: skip
 
-Detectors = Circles | Lines | Markers | All
-Command = Detectors | Compare | Export | Draw | View | Report | Tune | Explain | Demo
-
 PROGRAM = Program(
     "detect",
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
@@ -100,14 +98,14 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def carry_out(command: Command) -> int:
+def carry_out(command: object) -> int:
     """Carry out a command; returns the exit code."""
     if not is_quiet():
         show_announcements()
     return PROGRAM.carry_out(command)
 
 
-def parsed(arguments: Sequence[str]) -> Command:
+def parsed(arguments: Sequence[str]) -> Any:
     """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
     deciding = ArgumentParser(add_help=False, allow_abbrev=False)
@@ -123,7 +121,7 @@ def parsed(arguments: Sequence[str]) -> Command:
             raise DetectError("--preset and --settings: expected one of them")
         read = read_settings(Path(file))
         circles, lines, markers = read.circles, read.lines, read.markers
-    command: Command = PROGRAM.parsed(
+    return PROGRAM.parsed(
         arguments,
         (
             Circles(run=MISSING, parameters=circles),
@@ -133,7 +131,6 @@ def parsed(arguments: Sequence[str]) -> Command:
             Explain(image=MISSING, parameters=circles),
         ),
     )
-    return command
 
 
 def _with_radius_found(arguments: Sequence[str]) -> list[str]:

@@ -105,10 +105,6 @@ def _name_and_values(word: str) -> tuple[str, str]:
     return name.replace("-", "_"), values
 
 
-#: The value of each parameter that is varied.
-Combination = dict[str, Any]
-
-
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     """The values of a parameter that are to be tried, each once.
 
@@ -129,7 +125,7 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 
 
-def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
+def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises

@@ -80,9 +80,7 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     frames = FirstFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
-    if camera is None:
-        return run
-    return run.calibrated(camera)
+    return run if camera is None else run.calibrated(camera)
 
 
 def _own_odometry(folder: Path) -> Path | None:
