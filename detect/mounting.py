@@ -86,14 +86,12 @@ def perform(options: Level) -> int:
     return 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mounting:
     """How a camera is mounted, compared with its calibration."""
 
-    pitch_rad: float  # rotation vector (pitch, roll, 0) that turns measured directions level
-    roll_rad: float
-    pitch_sigma_rad: float  # standard deviations, that of the lens included
-    roll_sigma_rad: float
+    tilt_rad: FloatArray  # (2,) pitch and roll that turn measured directions level
+    sigma_rad: FloatArray  # (2,) their standard deviations, that of the lens included
     raised_m: float  # higher than calibrated; NaN if there are too few discs
     raised_sigma_m: float
     frames: int  # that have a tilt by verticals
@@ -101,8 +99,7 @@ class Mounting:
 
     def sentences(self) -> list[str]:
         """The result in words."""
-        pitch, roll = math.degrees(self.pitch_rad), math.degrees(self.roll_rad)
-        sigmas = math.degrees(self.pitch_sigma_rad), math.degrees(self.roll_sigma_rad)
+        (pitch, roll), sigmas = np.degrees(self.tilt_rad), np.degrees(self.sigma_rad)
         lines = [
             f"the camera leans {pitch:.2f} +- {sigmas[0]:.2f} degrees (pitch) and {roll:.2f} +- "
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
@@ -145,17 +142,8 @@ def mounting_of_run(
         statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
         raised_m = share * height_m
         sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
-    (pitch, roll), (pitch_sigma, roll_sigma) = run.lean.tolist(), run.lean_sigma.tolist()
-    return Mounting(
-        pitch_rad=pitch,
-        roll_rad=roll,
-        pitch_sigma_rad=pitch_sigma,
-        roll_sigma_rad=roll_sigma,
-        raised_m=raised_m,
-        raised_sigma_m=sigma_m,
-        frames=int(np.count_nonzero(verticals.known)),
-        frames_with_discs=count,
-    )
+    frames = int(np.count_nonzero(verticals.known))
+    return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
@@ -164,7 +152,7 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
     mounting's; the rest stays.
     """
-    turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
+    turn = level_matrix(mounting.tilt_rad)
     up = np.array([0.0, 0.0, 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ (camera.centre + up)])
     rows = checked_pose("sensor2World", pose)
@@ -172,8 +160,8 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     covariance = covariance_of(camera)
     if covariance is None:
         return moved
-    sigmas = np.array([mounting.pitch_sigma_rad, mounting.roll_sigma_rad, mounting.raised_sigma_m])
-    turned = left_jacobian(np.array([mounting.pitch_rad, mounting.roll_rad, 0.0]))[:, :2]
+    sigmas = np.append(mounting.sigma_rad, mounting.raised_sigma_m)
+    turned = left_jacobian(np.append(mounting.tilt_rad, 0.0))[:, :2]
     by_mounting = np.zeros((PARAMETERS, 3))
     by_mounting[_POSITION] = np.column_stack([np.cross(turned.T, moved.centre).T, turn[:, 2]])
     by_mounting[_ROTATION, :2] = turned
