@@ -18,7 +18,6 @@ for 3D Object Recognition and Pose, PAMI 13 (1991).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
+from redetect.landmarks import FrameTilt
 
 #: Directions in which the rim must lie on the ellipse.
 LEAST_DIRECTIONS = 24
@@ -45,17 +45,6 @@ _STEP_RAD = 1e-4
 _ITERATIONS = 7
 #: Degrees of freedom of Student's density of discs' tilts.
 _FREEDOM = 4.0
-
-
-class OutlineTilt(NamedTuple):
-    """Pitch and roll by discs' outlines (rad), their covariance (rad^2), and how many discs."""
-
-    pitch: float
-    roll: float
-    cpp: float
-    cpr: float
-    crr: float
-    discs: int
 
 
 @kernel()
@@ -241,11 +230,11 @@ def _tilts_of_discs(
 
 def tilt_of_outlines(
     image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
-) -> OutlineTilt | None:
+) -> FrameTilt | None:
     """The tilt that the outlines of the discs in an image show; None if no rim is in view.
 
     Discs were seen at `floor_xy` (N, 2), nothing levelled; the camera is higher than calibrated by
-    `raised_m`.
+    `raised_m`. The tilt's prefix is empty.
     """
     height_ratio = 1.0 + raised_m / float(camera.centre[2])
     tilts, covariances = _tilts_of_discs(
@@ -256,4 +245,4 @@ def tilt_of_outlines(
     mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
     (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
     pitch, roll = mean.tolist()
-    return OutlineTilt(pitch, roll, cpp, cpr, crr, len(tilts))
+    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))

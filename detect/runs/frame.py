@@ -145,7 +145,7 @@ def _path(
                 )
             if plan.levelling == "run":
                 tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
-                found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
+                found.outline_tilt = tilt and replace(tilt, prefix=prefix)
         yield
 
         if plan.markers:
