@@ -19,7 +19,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_table
-from detect.discs.identity import ids_of_map, ids_of_rows
+from detect.discs.identity import ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (
@@ -271,11 +271,11 @@ def _disc_rows(
         ids = [by_pixel[u, v] or (-1,) for u, v in discs.pixels.tolist()]
     if known.mapped:
         taken = {number for own in ids for number in own}
-        left = [disc for disc in known.mapped if disc.id not in taken]
+        left = [disc for disc in known.mapped if taken.isdisjoint(disc.ids)]
         without = [k for k, own in enumerate(ids) if own == (-1,)]
-        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, _MAP_SIGMA_M)
-        for k, number in zip(without, found.tolist()):
-            ids[k] = (number,)
+        xy, spread = discs.floor_xy[without], discs.covariance[without]
+        for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
+            ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
 
 
