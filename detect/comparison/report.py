@@ -160,7 +160,7 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     """The frames with most missed and extra rows."""
     rows = tuple(
         (
-            match.frame.name,
+            match.name,
             *(str(len(getattr(match, count))) for count in c.counts),
             number(match.largest_error, 3),
         )

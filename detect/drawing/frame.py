@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
-from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
+from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
 from detect.discs.unfound import Candidate, Stage
 from detect.drawing.inputs import SeenRows
@@ -65,14 +65,14 @@ def draw_rows(
     words = [title] if title else []
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
-        match = match_frame(pair_of("lines", title, rows.reference_lines, rows.lines), options)
+        lines = rows.reference_lines, rows.lines, None
+        match = match_frame("lines", title, lines, options)
         compared = rows.reference_lines is not None
         _draw_lines(canvas, sight.camera, match, compared)
         words.append(_count("verticals", match, compared))
     if sight is not None and rows.circles is not None:
-        frames = rows.reference_circles, rows.circles
-        pair = pair_of("circles", title, *frames, rows.unlisted, sight.of(*frames))
-        match = match_frame(pair, options)
+        discs = rows.reference_circles, rows.circles, rows.unlisted
+        match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
         compared = rows.reference_circles is not None
         _draw_discs(canvas, match, settings, compared)
         words.append(_count("discs", match, compared))
@@ -124,7 +124,7 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 def _draw_discs(
     canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool
 ) -> None:
-    view = match.frame.view
+    view = match.view
     assert view is not None
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
     for edge in view.reference_px(rings):
@@ -171,7 +171,7 @@ def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark]) -> None:
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
     fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
-    return f"{len(match.frame.detected)} {what}{fate}"
+    return f"{len(match.detected)} {what}{fate}"
 
 
 def _outline_disc(

@@ -154,7 +154,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [*_summary_of(result)]
-    quality = [row.quality for match in result.frames for row in match.frame.detected]
+    quality = [row.quality for match in result.frames for row in match.detected]
     if len(set(quality)) > 1:
         levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
         parts.append(figures.rates_figure(figures.rates_over(result, levels)))
@@ -214,7 +214,7 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
         table = worst_frames_table(result, worst)
         parts.append(Part("table", f"{table.caption}: {kind}", table.head, table.rows))
         for rank, match in enumerate(matches, 1):
-            prefix, place = named[picture_name(match.frame.name)], f"number {rank} of {kind}"
+            prefix, place = named[picture_name(match.name)], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
         key = (
