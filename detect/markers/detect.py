@@ -36,7 +36,7 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
-from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
+from detect.markers.pattern_fit import PatternFit, fit_marker
 from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage, IntArray
 from redetect.landmarks import MarkerCorner, MarkerLandmark
@@ -219,7 +219,7 @@ def _marker_at(
     if not likely:
         return NO_PATTERN
     looks = [
-        (fit_marker(picture, refined, templates, template, FIRST_LOOK), template)
+        (fit_marker(picture, refined, templates, template, first_look=True), template)
         for template in likely
     ]
     possible = [(look, template) for look, template in looks if look is not None]

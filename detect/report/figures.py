@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from io import BytesIO
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -29,14 +28,12 @@ _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
 
-def rates_figure(curve: RateCurve) -> Part:
+def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
     """Recall and precision over the least quality."""
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
-        axes.plot(curve.threshold, curve.recall, color=DATA, lw=1.4, label="recall")
-        axes.plot(
-            curve.threshold, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision"
-        )
+        axes.plot(least, recall, color=DATA, lw=1.4, label="recall")
+        axes.plot(least, precision, color=SECOND, lw=1.4, ls="--", label="precision")
         axes.set_ylim(0.0, 1.05)
         _finish(axes, "least quality", "share")
         axes.legend(fontsize=8)
@@ -207,16 +204,8 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     return _part(words, content, _WIDE)
 
 
-class RateCurve(NamedTuple):
-    """Recall and precision (NaN without rows) of the rows of at least each quality."""
-
-    threshold: FloatArray
-    recall: FloatArray
-    precision: FloatArray
-
-
-def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality."""
+def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Recall and precision (NaN without rows) of discs of at least each quality."""
     levels = np.asarray(qualities, np.float64)
     found, beside = np.zeros((2, len(levels)), np.int64)
     for match in comparison.frames:
@@ -224,7 +213,7 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
         beside += (levels[:, None] <= numbers(match.extra, "quality")).sum(axis=1)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), found / (found + beside)
-    return RateCurve(levels, recall, precision)
+    return recall, precision
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

@@ -157,7 +157,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     quality = [row.quality for match in result.frames for row in match.detected]
     if len(set(quality)) > 1:
         levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
-        parts.append(figures.rates_figure(figures.rates_over(result, levels)))
+        parts.append(figures.rates_figure(levels, *figures.rates_over(result, levels)))
     if result.matched:
         parts.append(figures.floor_figure(result.pairs))
         if result.pairs.levelled_apart:
