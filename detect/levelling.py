@@ -132,14 +132,6 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
     return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
 
 
-def with_common(
-    found: CircleDetections, camera: Camera, unstated_px: float, *, by_verticals: bool
-) -> CircleDetections:
-    """The same discs, their covariances with what the calibration contributes."""
-    common = common_covariance(camera, found.floor_xy, unstated_px, by_verticals=by_verticals)
-    return replace(found, covariance=found.covariance + common)
-
-
 def sentence_of(circles: Path, camera: Camera) -> str:
     """How much of the variances of the rows of a file is the calibration's own."""
     shares = []

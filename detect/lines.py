@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
@@ -81,25 +80,13 @@ class LineDetections:
         )
 
 
-class _Prepared(NamedTuple):
-    """What a table and settings decide before the first image."""
-
-    strip: Strip
-    window: LineFilter
-    band: StartBand
-    steps: StepFilters
-    numbers: LineNumbers
-
-
 @lru_cache(maxsize=16)
-def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
-    return _Prepared(
-        strip_of(table),
-        line_filter(settings),
-        start_band(table, settings),
-        step_filters(settings),
-        LineNumbers.of(settings, table.row_aspect),
-    )
+def _prepared(
+    table: VerticalTable, settings: LineSettings
+) -> tuple[Strip, LineFilter, StartBand, StepFilters, LineNumbers]:
+    """What a table and settings decide before the first image."""
+    band, numbers = start_band(table, settings), LineNumbers.of(settings, table.row_aspect)
+    return strip_of(table), line_filter(settings), band, step_filters(settings), numbers
 
 
 def detect_lines(
@@ -132,21 +119,19 @@ def detect_lines(
             f"{table.column.shape}"
         )
     image = np.ascontiguousarray(image)
-    tools = _prepared(table, settings)
-    strip, numbers = tools.strip, tools.numbers
-    response = band_response(image, tools.band, settings.regulariser)
-    starts = line_starts(response, tools.band, settings.threshold)
-    window, tracking = tools.window, numbers.tracking
-    tracks = follow_edges(image, strip, window, starts, tracking, NOTHING_BEFORE)
-    judged = fit_and_judge(image, strip, tracks, tools.steps, numbers)
+    strip, window, band, steps, numbers = _prepared(table, settings)
+    response = band_response(image, band, settings.regulariser)
+    starts = line_starts(response, band, settings.threshold)
+    tracks = follow_edges(image, strip, window, starts, numbers.tracking, NOTHING_BEFORE)
+    judged = fit_and_judge(image, strip, tracks, steps, numbers)
     sharpness = median_sharpness(judged.fits)
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
         tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
         before = Before(tracks, judged.doubtful, tilt)
-        tracks = follow_edges(image, strip, window, starts, tracking, before)
-        judged = fit_and_judge(image, strip, tracks, tools.steps, numbers, judged)
+        tracks = follow_edges(image, strip, window, starts, numbers.tracking, before)
+        judged = fit_and_judge(image, strip, tracks, steps, numbers, judged)
     if judged.tilt is not None:
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
         judged = judged._replace(tilt=error)

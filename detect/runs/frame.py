@@ -28,7 +28,6 @@ from detect.levelling import (
     level_discs,
     levelled,
     tilt_arrays,
-    with_common,
 )
 from detect.lines import LineDetections, carry_ids, detect_lines
 from detect.run_tilt import RunTilt, frame_tilts, tilt_of_run
@@ -139,10 +138,11 @@ def _path(
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
-                by_verticals = by_frame is not None
-                found.discs = with_common(
-                    found.discs, camera, settings.calibration_px, by_verticals=by_verticals
+                discs, by_verticals = found.discs, by_frame is not None
+                covariance = discs.covariance + common_covariance(
+                    camera, discs.floor_xy, settings.calibration_px, by_verticals=by_verticals
                 )
+                found.discs = replace(discs, covariance=covariance)
             if plan.levelling == "run":
                 tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
                 found.outline_tilt = tilt and replace(tilt, prefix=prefix)
