@@ -91,7 +91,9 @@ def _join(
         after = bounds[n + 1] if numbers.joined_equally else first + 1
         for k in range(first, after):
             t, share = members[k], 1.0 / (after - first)
-            beta[n] += share * _inclination(fits.line[t])
+            # The inclination of the plane's normal.
+            a, b = fits.line[t, 0], fits.line[t, 1]
+            beta[n] -= share * math.asin(b / math.sqrt(1.0 + a * a + b * b))
             for end in range(2):
                 right, down = _end_of_line(strip, tracks, fits, t, end)
                 ends[n, 2 * end] += share * right
@@ -189,13 +191,6 @@ def join_mixtures(
             square += weight[k] * (sigma[k] * sigma[k] + own * own)
         mean[n], deviation[n] = _wrapped(alpha[begin] + off), math.sqrt(square / total)
     return mean, deviation
-
-
-@kernel()
-def _inclination(line: FloatArray) -> float:
-    """Inclination of the normal of a line's plane (rad)."""
-    a, b = line
-    return -math.asin(b / math.sqrt(1.0 + a * a + b * b))
 
 
 @kernel()
