@@ -70,12 +70,10 @@ class FrameTilts(NamedTuple):
 
 def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
     """Pitch and roll of frames with their variances, NaN for frames without a tilt."""
-    unknown = FrameTilt("", math.nan, math.nan, math.nan, 0.0, math.nan, 0)
-    known = [tilt or unknown for tilt in tilts]
-    return FrameTilts(
-        np.array([(tilt.pitch, tilt.roll) for tilt in known]).reshape(-1, 2),
-        np.array([(tilt.cpp, tilt.crr) for tilt in known]).reshape(-1, 2),
-    )
+    unknown = (math.nan,) * 4
+    rows = [(t.pitch, t.roll, t.cpp, t.crr) if t else unknown for t in tilts]
+    numbers = np.array(rows).reshape(-1, 4)
+    return FrameTilts(numbers[:, :2], numbers[:, 2:])
 
 
 @dataclass(frozen=True, eq=False)
