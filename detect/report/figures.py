@@ -22,7 +22,7 @@ from redetect.reporting.page import Part, figure_file, image_part
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
 
 
-_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
@@ -58,7 +58,7 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
             f"deviation {residuals.std():.2f}; {len(residuals) - counts.sum()} beyond ±{reach:g}",
             fontsize=9,
         )
-        _finish(axes, f"residual / {_SIGMA}", "density")
+        _finish(axes, f"residual / {SIGMA}", "density")
         axes.legend(fontsize=8)
     words = (
         f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
@@ -137,7 +137,7 @@ def tilt_figure(rows: Sequence[SeenRows]) -> Part:
         ):
             angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
             band = (angle - sigma, angle + sigma)
-            axes.fill_between(at, *band, color=BAND, alpha=0.3, lw=0, label=f"±1 {_SIGMA}")
+            axes.fill_between(at, *band, color=BAND, alpha=0.3, lw=0, label=f"±1 {SIGMA}")
             axes.plot(at, angle, ".-", color=DATA, lw=0.9, ms=3)
             axes.axhline(0.0, color=REFERENCE, lw=0.6)
             _finish(axes, "", name)

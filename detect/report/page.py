@@ -108,7 +108,6 @@ def perform(options: Report) -> int:
 _NAMES = {
     "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
 }  # fmt: skip
-_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
 
@@ -195,7 +194,7 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     for k in (1, 2, 3):
         normal = math.erf(k / math.sqrt(2.0))
         share = np.mean(np.abs(residuals) <= k)
-        rows.append((f"within {k} {_SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
+        rows.append((f"within {k} {figures.SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
     return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
@@ -218,7 +217,7 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
         key = (
-            ("#ffaa00", f"disc's edge; ±1 {_SIGMA} of a vertical"),
+            ("#ffaa00", f"disc's edge; ±1 {figures.SIGMA} of a vertical"),
             ("#3cc83c", "outlines; vertical"),
             ("#ff3cff", "fits no reference row"),
             ("#ff3c3c", "reference row that is missing"),
