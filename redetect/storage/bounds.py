@@ -10,7 +10,7 @@ NaN is always refused; infinity is refused unless it means "no limit".
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from math import inf
 from numbers import Integral
@@ -25,7 +25,7 @@ class Bounds:
     """The numbers that a setting may have: in words, which of them, and whether whole ones only."""
 
     expected: str
-    include: Callable[[float], bool]
+    include: Callable[[float], bool] = field(repr=False)
     whole: bool = False
 
     def hold(self, value: Any) -> bool:
