@@ -253,6 +253,11 @@ class Camera:
         """
         return self.distort(_normalised(points_camera)[0])
 
+    def pixel_grid(self) -> FloatArray:
+        """(H, W, 2) all pixels (u, v)."""
+        v, u = np.mgrid[0 : self.height, 0 : self.width].astype(np.float64)
+        return np.stack([u, v], axis=-1)
+
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
 

@@ -12,31 +12,39 @@ from __future__ import annotations
 import atexit
 import os
 import sys
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from tyro import MISSING
 
 from detect.errors import DetectError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers, SourceOptions
+from detect.options import (
+    All,
+    Circles,
+    Compare,
+    CompareOptions,
+    Demo,
+    DetectorFlags,
+    DiscIdOptions,
+    Draw,
+    Explain,
+    Export,
+    Lines,
+    Markers,
+    Report,
+    RowFiles,
+    SourceOptions,
+    Tune,
+    View,
+)
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import read_settings
 from detect.terminal import interrupts_noted, show_announcements
-from detect.viewing_options import (
-    Compare,
-    CompareOptions,
-    Demo,
-    Draw,
-    Explain,
-    Export,
-    Report,
-    RowFiles,
-    Tune,
-    View,
-)
 from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
 from redetect.storage.messages import is_quiet
 
@@ -54,9 +62,6 @@ EXPERT: dict[type, frozenset[str]] = {
     RowFiles: all_but(RowFiles, "rows", "reference"),
     CompareOptions: all_but(CompareOptions, "only_identified"),
 }  # fmt: skip
-
-Detectors = Circles | Lines | Markers | All
-Command = Detectors | Compare | Export | Draw | View | Report | Tune | Explain | Demo
 
 PROGRAM = Program(
     "detect",
@@ -93,17 +98,21 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def carry_out(command: Command) -> int:
+def carry_out(command: object) -> int:
     """Carry out a command; returns the exit code."""
     if not is_quiet():
         show_announcements()
     return PROGRAM.carry_out(command)
 
 
-def parsed(arguments: Sequence[str]) -> Command:
+def parsed(arguments: Sequence[str]) -> Any:
     """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
-    preset, file = _value_of("--preset", arguments), _value_of("--settings", arguments)
+    deciding = ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in ("--preset", "--settings"):  # the other flags' defaults are theirs
+        deciding.add_argument(flag, nargs="?", default="", const="")
+    given = deciding.parse_known_args(arguments)[0]
+    preset, file = given.preset, given.settings
     circles = CIRCLE_PRESETS.get(preset, CircleSettings())
     lines = LINE_PRESETS.get(preset, LineSettings())
     markers = MarkerSettings()
@@ -112,7 +121,7 @@ def parsed(arguments: Sequence[str]) -> Command:
             raise DetectError("--preset and --settings: expected one of them")
         read = read_settings(Path(file))
         circles, lines, markers = read.circles, read.lines, read.markers
-    command: Command = PROGRAM.parsed(
+    return PROGRAM.parsed(
         arguments,
         (
             Circles(run=MISSING, parameters=circles),
@@ -122,29 +131,11 @@ def parsed(arguments: Sequence[str]) -> Command:
             Explain(image=MISSING, parameters=circles),
         ),
     )
-    return command
 
 
 def _with_radius_found(arguments: Sequence[str]) -> list[str]:
     """The command line with `--find-radius` in the place of a radius that is `auto`."""
-    found, rest = [], list(arguments)
-    while rest:
-        word = rest.pop(0)
-        name, _, value = word.partition("=")
-        if name in ("--radius-m", "--circles.radius-m"):
-            if word == name and rest[:1] == ["auto"]:
-                value = rest.pop(0)
-            if value == "auto":
-                word = "--find-radius"
-        found.append(word)
-    return found
-
-
-def _value_of(flag: str, arguments: Sequence[str]) -> str:
-    """The value of a flag that decides the other flags' defaults; empty if it is not there."""
-    for word, following in zip(arguments, [*arguments[1:], ""]):
-        if word == flag:
-            return following
-        if word.startswith(f"{flag}="):
-            return word.partition("=")[2]
-    return ""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
+    given, rest = parser.parse_known_args(arguments)
+    return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)

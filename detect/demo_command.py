@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from detect.comparison.report import comparison_of
-from detect.options import All
+from detect.options import All, Compare, Demo, Report, RowFiles
 from detect.report.page import perform as write_report
 from detect.runs.command import perform as detect_run
-from detect.viewing_options import Compare, Demo, Report, RowFiles
-from redetect.storage import OutputExistsError
+from redetect.storage import demand_free
 
 #: Images that come with the program: the first of the demo run (`images/README.md`).
 DEMO_RUN = Path(__file__).resolve().parent.parent / "redetect" / "demo"
@@ -19,8 +18,7 @@ def perform(command: Demo) -> int:
     """Carry the command out; returns the exit code."""
     run = command.run or DEMO_RUN
     page = command.output / "demo.html"
-    if page.exists() and not command.force:
-        raise OutputExistsError(page)
+    demand_free([page], overwrite=command.force)
     print(f"{run}: rendered images of a robot's drive")
     code = detect_run(All(run=run, output=command.output, force=command.force))
     if code != 0:

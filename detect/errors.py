@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from redetect.storage.messages import OneLineError
 
 #: Exit code of a command of which some frames could not be worked on; the others were.
@@ -21,6 +24,17 @@ class FrameError(OneLineError, ValueError):
 
 class WorkerError(OneLineError, RuntimeError):
     """Worker processes or machines cannot do the work; the message says what is missing."""
+
+
+@contextmanager
+def imported_for(
+    use: str, extra: str, otherwise: str = "", error: type[Exception] = DetectError
+) -> Iterator[None]:
+    """Import a package of an extra in a block; where it is missing, an error says how to get it."""
+    try:
+        yield
+    except ImportError:
+        raise error(f"{use}: install it by pip install 'redetect[{extra}]'{otherwise}") from None
 
 
 class CompareError(ValueError):

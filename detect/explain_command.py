@@ -10,8 +10,8 @@ from camera import Camera, camera_in, read_camera
 from detect.discs.unfound import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.errors import DetectError
+from detect.options import Explain
 from detect.sources.interface import RunFrame, read_image, still
-from detect.viewing_options import Explain
 from redetect.storage import demand_place, write_bytes
 
 

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from detect.errors import DetectError
+from detect.errors import DetectError, imported_for
+from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
-from detect.viewing_options import Export
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
@@ -39,6 +39,7 @@ _TABLES: dict[str, TableName] = {
     ".tilt": "tilts",
     ".txt": "steps",
 }
+_OR_CSV = ", or write --to csv"
 
 
 def perform(command: Export) -> int:
@@ -152,13 +153,8 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Sequence[Row]) -> None:
 
 def required_pyarrow() -> Any:
     """The package; a DetectError where it is not installed."""
-    try:
+    with imported_for("Parquet is written by the package pyarrow", "parquet", _OR_CSV):
         import pyarrow.parquet  # type: ignore[import-untyped]
-    except ImportError:
-        raise DetectError(
-            "Parquet is written by the package pyarrow: install it by "
-            "pip install 'redetect[parquet]', or write --to csv"
-        ) from None
     return pyarrow
 
 
@@ -188,14 +184,9 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
 
 def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
     """Write the messages of each frame, at its time; returns how many there are."""
-    try:
+    with imported_for("MCAP is written by the package rosbags", "bags", _OR_CSV):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise DetectError(
-            "MCAP is written by the package rosbags: install it by "
-            "pip install 'redetect[bags]', or write --to csv"
-        ) from None
     store = get_typestore(Stores.ROS2_HUMBLE)
     frames = {row[:3]: {table: list[Row]() for table in tables} for row in chain(*tables.values())}
     for table, rows in tables.items():

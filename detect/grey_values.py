@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: With fewer pixels than this that are neither black nor saturated, all count for the noise.
@@ -15,7 +15,7 @@ _DARK, _LIGHT = 2, 253
 _MOST_RESPONSE = 16 * 255
 
 
-def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> float:
+def estimate_noise(image: GreyImage, most_rows: int | None = None) -> float:
     """Standard deviation of an image's noise, grey levels; 0 for less than 3 rows or columns.
 
     The median absolute response, in at most `most_rows` rows, to the second difference in both
@@ -33,7 +33,7 @@ def estimate_noise(image: NDArray[np.uint8], most_rows: int | None = None) -> fl
 
 
 @kernel()
-def _median_response(image: NDArray[np.uint8], rows: NDArray[np.int64]) -> float:
+def _median_response(image: GreyImage, rows: IntArray) -> float:
     """Median of the absolute responses in some rows, by their histogram."""
     width = image.shape[1]
     bend, response = np.empty(width, np.int32), np.empty(width, np.int32)
@@ -78,7 +78,7 @@ _LARGEST_SHARE = 0.05
 _ROWS_APART = 4
 
 
-def steep_gradient(image: NDArray[np.uint8], most_rows: int) -> float:
+def steep_gradient(image: GreyImage, most_rows: int) -> float:
     """Gradient along some rows that a tenth of their pixels exceeds, grey levels per pixel."""
     rows = image[:: max(len(image) // most_rows, 1)].astype(np.int64)
     steps = np.abs(rows[:, 2:] - rows[:, :-2]).ravel()
@@ -86,7 +86,7 @@ def steep_gradient(image: NDArray[np.uint8], most_rows: int) -> float:
     return 0.5 * float(np.searchsorted(below, 0.9 * len(steps)))
 
 
-def blank_margins(image: NDArray[np.uint8]) -> tuple[int, int]:
+def blank_margins(image: GreyImage) -> tuple[int, int]:
     """How many columns at the left and right of an image (H, W) show nothing; 0 for no margin.
 
     Digitized video often begins late in a line: the first columns have one grey value, from which
@@ -97,7 +97,7 @@ def blank_margins(image: NDArray[np.uint8]) -> tuple[int, int]:
     return _blank(rows), _blank(rows[:, ::-1])
 
 
-def _blank(image: NDArray[np.uint8]) -> int:
+def _blank(image: GreyImage) -> int:
     if np.ptp(image[:, 0]) > _MOST_RANGE:
         return 0
     side = image[:, : int(_LARGEST_SHARE * image.shape[1]) + 1]

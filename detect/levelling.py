@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.model import inverse_2x2
@@ -33,9 +32,8 @@ from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_param
 from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
 from detect.settings import CircleSettings
+from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, read_frames
-
-FloatArray = NDArray[np.float64]
 
 #: Over which length (m) and angle (rad) levelled positions are differenced, either way.
 _STEP = 1e-6
@@ -90,7 +88,7 @@ def level_discs(
     covariance: FloatArray,
     tilt: FloatArray,
     tilt_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
     Positions are those that the calibrated camera sees on a level robot. Pitch and roll (rad) and
@@ -110,11 +108,7 @@ def level_discs(
 
 
 def common_covariance(
-    camera: Camera,
-    floor_xy: FloatArray,
-    unstated_px: float,
-    *,
-    by_verticals: bool | NDArray[np.bool_],
+    camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool | BoolArray
 ) -> FloatArray:
     """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
 
@@ -143,9 +137,7 @@ def _wrong_by(pixels: float) -> CircleSettings:
     return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
 
 
-@lru_cache(maxsize=4)
-def _tilt_by_parameters(camera: Camera) -> FloatArray:
-    return tilt_by_parameters(camera)
+_tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:
@@ -158,14 +150,6 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
         return None
     jacobian = _tilt_by_parameters(camera)
     return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
-
-
-def with_common(
-    found: CircleDetections, camera: Camera, unstated_px: float, *, by_verticals: bool
-) -> CircleDetections:
-    """The same discs, their covariances with what the calibration contributes."""
-    common = common_covariance(camera, found.floor_xy, unstated_px, by_verticals=by_verticals)
-    return replace(found, covariance=found.covariance + common)
 
 
 def sentence_of(circles: Path, camera: Camera) -> str:

@@ -23,7 +23,7 @@ from redetect.storage.bounds import (
 BearingConvention = Literal["level", "published"]
 Joining = Literal["evidence", "equal"]
 
-_WIDTH = Bounds("a number above 1, at most 10", 1.0, 10.0, above=True)
+_WIDTH = Bounds("a number above 1, at most 10", lambda x: 1.0 < x <= 10.0)
 
 
 @dataclass(frozen=True)

@@ -15,54 +15,82 @@ If all edges are blurred, everything is repeated with filters as wide as the blu
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
-from detect.verticals.detections import LineDetections
-from detect.verticals.joining import lines_of_tracks
-from detect.verticals.judgement import FATES, fit_and_judge
+from detect.verticals.joining import Lines, lines_of_tracks
+from detect.verticals.judgement import FATES, Judgement, fit_and_judge
 from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
-from detect.verticals.tilt import with_error
-from detect.verticals.tracking import NOTHING_BEFORE, Before, follow_edges
+from detect.verticals.tilt import TiltEstimate, with_error
+from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow_edges
 from lut.verticals import VerticalTable
-
-__all__ = ["ACCEPTED", "JOINED", "LineDetections", "detect_lines"]
+from redetect.array_types import GreyImage
+from redetect.landmarks import LineLandmark, wrap_angle
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
+#: A reference line is the same as a detected one within this bearing, or two standard deviations.
+_SAME_LINE_RAD = np.radians(0.5)
 
 
-class _Prepared(NamedTuple):
-    """What a table and settings decide before the first image."""
+@dataclass(frozen=True, eq=False)
+class LineDetections:
+    """Detections in one image."""
 
-    strip: Strip
-    window: LineFilter
-    band: StartBand
-    steps: StepFilters
-    numbers: LineNumbers
+    lines: Lines  # the leftmost is the first, here and elsewhere
+    tracks: LineTracks
+    judged: Judgement  # lines through all tracks, and their fates
+    sharpness: float  # median sharpness of the edges (`detect.verticals.blur.median_sharpness`)
+
+    def __len__(self) -> int:
+        return len(self.lines.alpha_rad)
+
+    @cached_property
+    def members(self) -> tuple[tuple[int, ...], ...]:
+        """The tracks that each line consists of, the strongest first; its ends are that one's."""
+        own = self.lines.members.tolist()
+        return tuple(tuple(own[a:b]) for a, b in pairwise(self.lines.bounds.tolist()))
+
+    @property
+    def tilt(self) -> TiltEstimate | None:
+        """None where too few lines agree."""
+        return self.judged.tilt
+
+    @cached_property
+    def fate(self) -> tuple[str, ...]:
+        """(T,) "accepted", "joined" (to a stronger one), or why the track is no line."""
+        return tuple(FATES[number] for number in self.judged.fate.tolist())
+
+    def landmarks(self) -> tuple[LineLandmark, ...]:
+        """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
+        own = self.lines
+        numbers = np.column_stack([own.ends, own.alpha_rad, own.beta_rad, own.sigma_rad])
+        return tuple(
+            LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, 0.0, sigma, (-1,))
+            for xtop, ytop, xbottom, ybottom, alpha, beta, sigma in numbers.tolist()
+        )
 
 
 @lru_cache(maxsize=16)
-def _prepared(table: VerticalTable, settings: LineSettings) -> _Prepared:
-    return _Prepared(
-        strip_of(table),
-        line_filter(settings),
-        start_band(table, settings),
-        step_filters(settings),
-        LineNumbers.of(settings, table.row_aspect),
-    )
+def _prepared(
+    table: VerticalTable, settings: LineSettings
+) -> tuple[Strip, LineFilter, StartBand, StepFilters, LineNumbers]:
+    """What a table and settings decide before the first image."""
+    band, numbers = start_band(table, settings), LineNumbers.of(settings, table.row_aspect)
+    return strip_of(table), line_filter(settings), band, step_filters(settings), numbers
 
 
 def detect_lines(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings = DEFAULT
+    image: GreyImage, table: VerticalTable, settings: LineSettings = DEFAULT
 ) -> LineDetections:
     """Find the building's verticals in an image.
 
@@ -91,23 +119,44 @@ def detect_lines(
             f"{table.column.shape}"
         )
     image = np.ascontiguousarray(image)
-    tools = _prepared(table, settings)
-    strip, numbers = tools.strip, tools.numbers
-    response = band_response(image, tools.band, settings.regulariser)
-    starts = line_starts(response, tools.band, settings.threshold)
-    window, tracking = tools.window, numbers.tracking
-    tracks = follow_edges(image, strip, window, starts, tracking, NOTHING_BEFORE)
-    judged = fit_and_judge(image, strip, tracks, tools.steps, numbers)
+    strip, window, band, steps, numbers = _prepared(table, settings)
+    response = band_response(image, band, settings.regulariser)
+    starts = line_starts(response, band, settings.threshold)
+    tracks = follow_edges(image, strip, window, starts, numbers.tracking, NOTHING_BEFORE)
+    judged = fit_and_judge(image, strip, tracks, steps, numbers)
     sharpness = median_sharpness(judged.fits)
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
         tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
         before = Before(tracks, judged.doubtful, tilt)
-        tracks = follow_edges(image, strip, window, starts, tracking, before)
-        judged = fit_and_judge(image, strip, tracks, tools.steps, numbers, judged)
+        tracks = follow_edges(image, strip, window, starts, numbers.tracking, before)
+        judged = fit_and_judge(image, strip, tracks, steps, numbers, judged)
     if judged.tilt is not None:
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
         judged = judged._replace(tilt=error)
     lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
     return LineDetections(lines, tracks, judged, sharpness)
+
+
+def carry_ids(
+    rows: Sequence[LineLandmark], reference: Sequence[LineLandmark]
+) -> tuple[LineLandmark, ...]:
+    """Detected lines of a frame with the IDs of the reference rows that are theirs beyond doubt.
+
+    A reference row whose bearing fits exactly one detected line (within half a degree or two
+    standard deviations) gives that line its IDs; a joined line can get several, and one that none
+    fits has -1.
+    """
+    if not rows or not reference:
+        return tuple(rows)
+    alpha = np.array([row.alpha for row in rows])
+    reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))
+    ids: list[list[int]] = [[] for _ in rows]
+    for row in reference:
+        fits = np.flatnonzero(np.abs(wrap_angle(alpha - row.alpha)) <= reach)
+        if len(fits) == 1:
+            ids[fits[0]] += [i for i in row.ids if i >= 0]
+    return tuple(
+        replace(row, ids=tuple(dict.fromkeys(own)) if own else (-1,)) for row, own in zip(rows, ids)
+    )

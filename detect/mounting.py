@@ -85,14 +85,12 @@ def perform(options: Level) -> int:
     return 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mounting:
     """How a camera is mounted, compared with its calibration."""
 
-    pitch_rad: float  # rotation vector (pitch, roll, 0) that turns measured directions level
-    roll_rad: float
-    pitch_sigma_rad: float  # standard deviations, that of the lens included
-    roll_sigma_rad: float
+    tilt_rad: FloatArray  # (2,) pitch and roll that turn measured directions level
+    sigma_rad: FloatArray  # (2,) their standard deviations, that of the lens included
     raised_m: float  # higher than calibrated; NaN if there are too few discs
     raised_sigma_m: float
     frames: int  # that have a tilt by verticals
@@ -100,8 +98,7 @@ class Mounting:
 
     def sentences(self) -> list[str]:
         """The result in words."""
-        pitch, roll = math.degrees(self.pitch_rad), math.degrees(self.roll_rad)
-        sigmas = math.degrees(self.pitch_sigma_rad), math.degrees(self.roll_sigma_rad)
+        (pitch, roll), sigmas = np.degrees(self.tilt_rad), np.degrees(self.sigma_rad)
         lines = [
             f"the camera leans {pitch:.2f} +- {sigmas[0]:.2f} degrees (pitch) and {roll:.2f} +- "
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
@@ -128,7 +125,7 @@ def mounting_of_run(
     run = tilt_of_run(verticals)
     if run is None:
         return None
-    known = np.isfinite(outline_pitch_rad).all(axis=1) & np.isfinite(verticals.tilt[:, 0])
+    known = np.isfinite(outline_pitch_rad).all(axis=1) & verticals.known
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
     if count >= LEAST_FRAMES:
@@ -144,17 +141,8 @@ def mounting_of_run(
         statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
         raised_m = share * height_m
         sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
-    (pitch, roll), (pitch_sigma, roll_sigma) = run.lean.tolist(), run.lean_sigma.tolist()
-    return Mounting(
-        pitch_rad=pitch,
-        roll_rad=roll,
-        pitch_sigma_rad=pitch_sigma,
-        roll_sigma_rad=roll_sigma,
-        raised_m=raised_m,
-        raised_sigma_m=sigma_m,
-        frames=int(np.count_nonzero(np.isfinite(verticals.tilt[:, 0]))),
-        frames_with_discs=count,
-    )
+    frames = int(np.count_nonzero(verticals.known))
+    return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
@@ -163,14 +151,15 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
     mounting's; the rest stays.
     """
-    turn = level_matrix((mounting.pitch_rad, mounting.roll_rad))
+    turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
-    moved = leaning_camera(camera, (mounting.pitch_rad, mounting.roll_rad), raised_m)
+    pitch, roll = mounting.tilt_rad
+    moved = leaning_camera(camera, (pitch, roll), raised_m)
     covariance = covariance_of(camera)
     if covariance is None:
         return moved
-    sigmas = np.array([mounting.pitch_sigma_rad, mounting.roll_sigma_rad, mounting.raised_sigma_m])
-    turned = left_jacobian(np.array([mounting.pitch_rad, mounting.roll_rad, 0.0]))[:, :2]
+    sigmas = np.append(mounting.sigma_rad, mounting.raised_sigma_m)
+    turned = left_jacobian(np.append(mounting.tilt_rad, 0.0))[:, :2]
     by_mounting = np.zeros((PARAMETERS, 3))
     by_mounting[_POSITION] = np.column_stack([np.cross(turned.T, moved.centre).T, turn[:, 2]])
     by_mounting[_ROTATION, :2] = turned

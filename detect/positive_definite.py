@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
 #: A pivot less than this part of its diagonal entry is rounding.
@@ -17,9 +17,7 @@ _LEAST_PIVOT = 1e-13
 
 
 @kernel()
-def solve_positive(
-    matrix: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]
-) -> bool:
+def solve_positive(matrix: FloatArray, right: FloatArray, solution: FloatArray) -> bool:
     """Solve matrix @ solution = right for a positive definite matrix; False if it is not one."""
     n = matrix.shape[0]
     lower = np.empty_like(matrix)  # Cholesky's factor
@@ -50,7 +48,7 @@ def solve_positive(
 
 
 @kernel()
-def invert_positive(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
+def invert_positive(matrix: FloatArray, inverse: FloatArray) -> bool:
     """Inverse of a positive definite matrix; False if it is not one."""
     n = matrix.shape[0]
     unit, column = np.zeros(n), np.empty(n)

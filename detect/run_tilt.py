@@ -20,12 +20,10 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
-
-FloatArray = NDArray[np.float64]
 
 #: With fewer measured frames the errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
@@ -64,15 +62,18 @@ class FrameTilts(NamedTuple):
     tilt: FloatArray  # (N, 2)
     variance: FloatArray  # (N, 2)
 
+    @property
+    def known(self) -> BoolArray:
+        """(N,) which frames have a tilt."""
+        return np.isfinite(self.tilt[:, 0])
+
 
 def frame_tilts(tilts: Sequence[FrameTilt | None]) -> FrameTilts:
     """Pitch and roll of frames with their variances, NaN for frames without a tilt."""
-    unknown = FrameTilt("", math.nan, math.nan, math.nan, 0.0, math.nan, 0)
-    known = [tilt or unknown for tilt in tilts]
-    return FrameTilts(
-        np.array([(tilt.pitch, tilt.roll) for tilt in known]).reshape(-1, 2),
-        np.array([(tilt.cpp, tilt.crr) for tilt in known]).reshape(-1, 2),
-    )
+    unknown = (math.nan,) * 4
+    rows = [(t.pitch, t.roll, t.cpp, t.crr) if t else unknown for t in tilts]
+    numbers = np.array(rows).reshape(-1, 4)
+    return FrameTilts(numbers[:, :2], numbers[:, 2:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +112,9 @@ def tilt_of_run(
     error of pitch and roll that all frames share, if the calibration states it: then the lean is
     that of the verticals. Without it, it follows from how far outlines and verticals agree.
     """
-    if np.count_nonzero(np.isfinite(verticals.tilt[:, 0])) < LEAST_FRAMES:
+    if np.count_nonzero(verticals.known) < LEAST_FRAMES:
         return None
-    if outlines is None or not _are_enough(outlines, verticals):
+    if outlines is None or np.count_nonzero(outlines.known & verticals.known) < LEAST_FRAMES:
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
@@ -145,11 +146,6 @@ def _tilts(series: Sequence[_Series], found: Sequence[_Axis]) -> tuple[FloatArra
     smoothed = [axis.smoothed(one) for axis, one in zip(series, found)]
     tilt = np.stack([one.lean + each[1] for one, each in zip(found, smoothed)], axis=-1)
     return tilt, np.stack([each[2] for each in smoothed], axis=-1)
-
-
-def _are_enough(outlines: FrameTilts, verticals: FrameTilts) -> bool:
-    both = np.isfinite(outlines.tilt[:, 0]) & np.isfinite(verticals.tilt[:, 0])
-    return bool(np.count_nonzero(both) >= LEAST_FRAMES)
 
 
 class _Axis(NamedTuple):
@@ -300,11 +296,8 @@ def _weighed(share: float, off: float, variance: float) -> float:
 
 @kernel()
 def smooth_axis(
-    deviation: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    spread: float,
-    memory: float,
-) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    deviation: FloatArray, sigma: FloatArray, spread: float, memory: float
+) -> tuple[float, FloatArray, FloatArray]:
     """True deviations of one angle from the run's constant lean, by all frames.
 
     The state is the deviation x and the lasting error u of the verticals in units of its standard

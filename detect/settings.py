@@ -26,8 +26,8 @@ from redetect.storage.bounds import (
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
-_INSIDE = Bounds("less than 1, the disc's edge, and above 0", 0.0, 1.0, above=True, below=True)
-_OUTSIDE = Bounds("more than 1, the disc's edge", 1.0, above=True, below=True)
+_INSIDE = Bounds("less than 1, the disc's edge, and above 0", lambda x: 0.0 < x < 1.0)
+_OUTSIDE = Bounds("more than 1, the disc's edge", lambda x: 1.0 < x < math.inf)
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ REPORT = CircleSettings(
 PRESETS = {"default": CircleSettings(), "published": PUBLISHED, "report": REPORT}
 
 
-_LEAST_WIDTH = Bounds("4 or more", 4.0, below=True)
-_AREA_FACTOR = Bounds("above 1", 1.0, above=True, below=True)
+_LEAST_WIDTH = Bounds("4 or more", lambda x: 4.0 <= x < math.inf)
+_AREA_FACTOR = Bounds("above 1", lambda x: 1.0 < x < math.inf)
 
 
 @dataclass(frozen=True)
@@ -195,6 +195,7 @@ class MarkerSettings:
         if not self.thresholds:
             raise DetectError("thresholds is (): expected at least one number")
         demand_fields(self, DetectError)
-        most_white = Bounds(f"0 to most_white ({self.most_white})", 0.0, self.most_white)
+        white = f"0 to most_white ({self.most_white})"
+        most_white = Bounds(white, lambda x: 0.0 <= x <= self.most_white)
         most_holes = whole(0, self.most_holes)
         demand(self, DetectError, least_holes=most_holes, least_white=most_white)

@@ -20,6 +20,7 @@ from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.drawing.inputs import every_nth
 from detect.errors import DetectError
+from detect.options import CompareOptions, Tune
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
@@ -28,16 +29,10 @@ from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import CompareOptions, Tune
 from redetect.array_types import FloatArray
-from redetect.landmarks import (
-    Frame,
-    LandmarkFileError,
-    frames_of_rows,
-    parse_rows,
-)
+from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import demand_free, write_bytes
 
 
 def perform(options: Tune) -> int:
@@ -57,10 +52,8 @@ def perform(options: Tune) -> int:
         frames = [frame for _, frame in selection]
         return serve(TuningSession(run, frames, base, output, options.force), options.port)
 
-    outputs = {name: output / name for name in ("table.json", "curve.png")}
-    for path in outputs.values():
-        if path.exists() and not options.force:
-            raise OutputExistsError(path)
+    names = "table.json", "curve.png"
+    demand_free([output / name for name in names], overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
@@ -88,16 +81,12 @@ def perform(options: Tune) -> int:
         "settings": asdict(base),
         "varied": varied,
     }
-    document = json.dumps({**head, "trials": records}, indent=1)
+    table = f"{json.dumps({**head, 'trials': records}, indent=1)}\n".encode()
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
-    contents = {
-        "table.json": f"{document}\n".encode(),
-        "curve.png": curve_picture(records, varied, title),
-    }
     output.mkdir(parents=True, exist_ok=True)
-    for name, content in contents.items():
-        write_bytes(outputs[name], content, overwrite=options.force)
-    print(f"{output}: {title}: {', '.join(contents)}")
+    for name, content in zip(names, (table, curve_picture(records, varied, title))):
+        write_bytes(output / name, content, overwrite=options.force)
+    print(f"{output}: {title}: {', '.join(names)}")
     for record in records:
         if record["knee"]:
             values = " ".join(f"--{name.replace('_', '-')} {record[name]}" for name in varied)
@@ -114,10 +103,6 @@ def _name_and_values(word: str) -> tuple[str, str]:
     if not equals:
         raise DetectError(f"{word!r}: expected NAME=VALUES, as evidence=-1:3:0.5")
     return name.replace("-", "_"), values
-
-
-#: The value of each parameter that is varied.
-Combination = dict[str, Any]
 
 
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:
@@ -140,7 +125,7 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
     return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 
 
-def combinations(varied: Mapping[str, str]) -> tuple[Combination, ...]:
+def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises

@@ -102,16 +102,9 @@ class TuningSession:
             )
         ]
         rejected = [
-            {
-                "u": candidate.u,
-                "v": candidate.v,
-                "stage": candidate.stage,
-                "reason": candidate.reason(),
-                "votes": candidate.votes,
-                "outline": self._outline((candidate.x_m, candidate.y_m), settings.radius_m),
-            }
-            for candidate in explained.candidates
-            if candidate.stage != "disc"
+            {**one.record(), "outline": self._outline((one.x_m, one.y_m), settings.radius_m)}
+            for one in explained.candidates
+            if not one.is_disc
         ]
         return {"discs": discs, "rejected": rejected, "suggestions": list(explained.suggestions)}
 

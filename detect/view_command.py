@@ -11,12 +11,12 @@ import numpy as np
 
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import SeenRows, every_nth, open_rows
-from detect.errors import DetectError, FrameError
+from detect.errors import DetectError, FrameError, imported_for
+from detect.options import View
 from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import View
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
@@ -128,10 +128,6 @@ def _show(recording: Any) -> None:
 def _rerun() -> Any:
     """The package of Rerun, which sends nothing home from here."""
     os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    try:
+    with imported_for("detect view needs the package rerun-sdk", "view"):
         import rerun
-    except ImportError:
-        raise DetectError(
-            "detect view needs the package rerun-sdk: install it by pip install 'redetect[view]'"
-        ) from None
     return rerun

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
@@ -92,7 +92,7 @@ class DiscTable:
     samples: NDArray[np.uint32]
     pixels: NDArray[np.int32]  # (N, 2) pixel (u, v) of each centre, in scan order
     #: (H, W, 2) floor position (robot X, Y, m) that each pixel sees; NaN above the horizon
-    floor_xy: NDArray[np.float32]
+    floor_xy: Float32Array
 
     @cached_property
     def groups(self) -> CentreGroups:
@@ -116,8 +116,7 @@ def ring(radius_m: float, samples: int) -> FloatArray:
 @lru_cache(maxsize=2)
 def floor_positions(camera: Camera) -> FloatArray:
     """(H, W, 2) floor position (robot X, Y, metres) that each pixel sees; NaN above the horizon."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    return camera.floor_from_pixel(np.stack([u, v], axis=-1))
+    return camera.floor_from_pixel(camera.pixel_grid())
 
 
 def demand_above_floor(camera: Camera) -> None:
@@ -137,14 +136,23 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
-    down = _size_down(camera, floor_xy, shape)
+    down, paired = size_down(floor_xy), shape.least_pairs > 0
+    if paired:
+        by_row = camera.floor_jacobian_published(camera.pixel_grid())[..., 1]
+        down = np.hypot(by_row[..., 0], by_row[..., 1])
+    numbers = published_camera_numbers(camera) if paired else camera_numbers(camera)
+    unit = ring(1.0, shape.samples)
+    unit = np.concatenate([unit[0::2], unit[1::2]])
+    radii = shape.inner_radius_m, shape.outer_radius_m
+    outlines = _Outlines(*radii, unit, paired, float(shape.apart_px))
     candidate = pixels_within(down, shape.border_px, shape.far_limit_m_per_px)
     step = np.fmax(np.ceil(shape.stride_m / down), 1.0)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
     samples, pixels = [np.zeros((0, shape.samples, 2), np.uint32)], [np.zeros((0, 2), np.int32)]
     for row in np.flatnonzero(candidate.any(axis=1)).tolist():
         across = np.flatnonzero(candidate[row])
-        seen = _sample_pixels(camera, floor_xy[row, across], down[row, across], shape)
+        centres = floor_xy[row, across], down[row, across]
+        seen = _sample_pixels(numbers, camera.width, camera.height, *centres, outlines)
         inside = np.count_nonzero(seen < camera.height * camera.width, axis=1).min(axis=1)
         usable = np.flatnonzero(inside >= enough)
         kept = usable[_strided(across[usable], step[row, across[usable]])]
@@ -202,24 +210,12 @@ class _Outlines(NamedTuple):
     apart_px: float
 
 
-def _sample_pixels(
-    camera: Camera, centre_xy: FloatArray, down: FloatArray, shape: DiscShape
-) -> NDArray[np.uint32]:
-    """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
-    paired = shape.least_pairs > 0
-    unit = np.concatenate([ring(1.0, shape.samples)[0::2], ring(1.0, shape.samples)[1::2]])
-    outlines = _Outlines(
-        shape.inner_radius_m, shape.outer_radius_m, unit, paired, float(shape.apart_px)
-    )
-    numbers = published_camera_numbers(camera) if paired else camera_numbers(camera)
-    return _samples_of(numbers, camera.width, camera.height, centre_xy, down, outlines)
-
-
 @kernel()
-def _samples_of(
+def _sample_pixels(
     numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, down: FloatArray,
     outlines: _Outlines,
 ) -> NDArray[np.uint32]:  # fmt: skip
+    """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
     outside = width * height
     samples = np.empty((len(centre_xy), len(outlines.unit), 2), np.uint32)
     least = 0.0 if outlines.paired else -0.5
@@ -243,15 +239,6 @@ def _samples_of(
                 pixel[:] = outside
             samples[i, k, 0], samples[i, k, 1] = pixel[0], pixel[1]
     return samples
-
-
-def _size_down(camera: Camera, floor_xy: FloatArray, shape: DiscShape) -> FloatArray:
-    """(H, W) how far the floor moves per image row, metres."""
-    if shape.least_pairs:
-        v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-        by_row = camera.floor_jacobian_published(np.stack([u, v], axis=-1))[..., 1]
-        return np.hypot(by_row[..., 0], by_row[..., 1])
-    return size_down(floor_xy)
 
 
 def size_down(floor_xy: FloatArray) -> FloatArray:

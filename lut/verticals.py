@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_direction
+from redetect.array_types import BoolArray, Float32Array, FloatArray
 from redetect.compiled import kernel
 
 #: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
@@ -40,24 +41,24 @@ class VerticalTable:
 
     anchor_elevation_rad: float  # elevation of the anchor: 0 where that is the horizon
     #: (W,) row at which the anchor crosses each column; NaN where not inside the image
-    anchor_row: NDArray[np.float64]
+    anchor_row: FloatArray
     #: (W,) bearing of that point, positive to the left; NaN as above
-    bearing_rad: NDArray[np.float64]
+    bearing_rad: FloatArray
     #: (W,) rows over which the vertical through it is seen without a break, inside the image and
     #: within 45 deg of the image's vertical; first > last where there are none
     first_row: NDArray[np.int32]
     last_row: NDArray[np.int32]
     #: (H, W) column at which the vertical named by the second index crosses each row; NaN outside
     #: those rows. In Fortran order, so that following a vertical reads memory in sequence.
-    column: NDArray[np.float32]
+    column: Float32Array
     #: (H, W) tangent of the elevation at which it does so; NaN as `column`
-    elevation_tan: NDArray[np.float32]
-    robot_from_camera: NDArray[np.float64]  # (3, 3) rotation
+    elevation_tan: Float32Array
+    robot_from_camera: FloatArray  # (3, 3) rotation
     #: height of a row in widths of a column (2 for single fields of interlaced frames)
     row_aspect: float
 
     @property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> BoolArray:
         """(W,) bool, the columns that have a vertical."""
         return self.first_row <= self.last_row
 
@@ -69,8 +70,7 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     deg past the horizon gets a table without verticals.
     """
     height, width = camera.height, camera.width
-    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    normalised = camera.undistort(np.stack([u, v], axis=-1))
+    normalised = camera.undistort(camera.pixel_grid())
     elevation_rad, row = _anchor(camera, normalised)
     on_anchor = camera.directions_robot(np.stack([np.arange(width, dtype=np.float64), row], -1))
     bearing = np.arctan2(on_anchor[:, 0], -on_anchor[:, 1])
@@ -94,7 +94,7 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     )
 
 
-def _anchor(camera: Camera, normalised: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+def _anchor(camera: Camera, normalised: FloatArray) -> tuple[float, FloatArray]:
     """Elevation of the anchor, rad, and the (W,) rows at which it crosses the columns."""
     row = anchor_rows(camera, normalised, 0.0)
     if np.mean(np.isfinite(row)) >= _LEAST_SEEN:
@@ -116,9 +116,7 @@ def _anchor(camera: Camera, normalised: NDArray[np.float64]) -> tuple[float, NDA
     return elevation_rad, anchor_rows(camera, normalised, elevation_rad)
 
 
-def anchor_rows(
-    camera: Camera, normalised: NDArray[np.float64], elevation_rad: float
-) -> NDArray[np.float64]:
+def anchor_rows(camera: Camera, normalised: FloatArray, elevation_rad: float) -> FloatArray:
     """(W,) rows at which a line of constant elevation (0: the horizon) crosses each column.
 
     `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN where the line does not cross
@@ -138,7 +136,7 @@ def anchor_rows(
     return row
 
 
-def _above(camera: Camera, normalised: NDArray[np.float64], sine: float) -> NDArray[np.float64]:
+def _above(camera: Camera, normalised: FloatArray, sine: float) -> FloatArray:
     """How far rays (x, y, 1) end above the cone whose elevation has this sine."""
     toward_up = camera.rotation[2]
     rise = normalised @ toward_up[:2] + toward_up[2]
@@ -150,8 +148,8 @@ def _roots(
     sine: float,
     columns: NDArray[np.intp],
     before: NDArray[np.intp],
-    above: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    above: FloatArray,
+) -> FloatArray:
     """Rows between `before` and the next at which columns see the elevation of this sine."""
     low, high = before.astype(np.float64), before + 1.0
     rises = above[before, columns] <= 0.0
@@ -165,12 +163,12 @@ def _roots(
 
 @kernel()
 def trace_verticals(
-    numbers: NDArray[np.float64],
-    bearing: NDArray[np.float64],
-    anchor_row: NDArray[np.float64],
+    numbers: FloatArray,
+    bearing: FloatArray,
+    anchor_row: FloatArray,
     anchor_elevation: float,
-    column: NDArray[np.float64],
-    elevation: NDArray[np.float64],
+    column: FloatArray,
+    elevation: FloatArray,
 ) -> None:
     """Follow (N,) verticals from the anchor up and down, row by row, through a camera.
 
@@ -198,7 +196,7 @@ def trace_verticals(
 
 @kernel()
 def _crossing(
-    numbers: NDArray[np.float64], bearing: float, row: float, angle: float
+    numbers: FloatArray, bearing: float, row: float, angle: float
 ) -> tuple[float, float, float]:
     """Column and elevation at which a row shows a vertical, and its rows per radian there.
 
@@ -214,7 +212,7 @@ def _crossing(
 
 
 @kernel()
-def _seen(numbers: NDArray[np.float64], bearing: float, elevation: float) -> tuple[float, float]:
+def _seen(numbers: FloatArray, bearing: float, elevation: float) -> tuple[float, float]:
     ahead = math.cos(elevation)
     return project_direction(
         numbers, ahead * math.sin(bearing), -ahead * math.cos(bearing), math.sin(elevation)
@@ -222,8 +220,8 @@ def _seen(numbers: NDArray[np.float64], bearing: float, elevation: float) -> tup
 
 
 def _unbroken(
-    column: NDArray[np.float64], anchor_row: NDArray[np.float64]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    column: FloatArray, anchor_row: FloatArray
+) -> tuple[NDArray[np.int32], NDArray[np.int32], BoolArray]:
     """First and last of the rows round the anchor over which verticals are seen; those rows."""
     height, width = column.shape
     with np.errstate(invalid="ignore"):

@@ -12,17 +12,10 @@ from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
-from lut.outlines import (
-    TableError,
-    demand_above_floor,
-    floor_positions,
-    pixels_within,
-    size_down,
-)
-from redetect.array_types import FloatArray
+from lut.outlines import TableError, demand_above_floor, floor_positions, pixels_within, size_down
+from redetect.array_types import Float32Array, FloatArray, IntArray
 from redetect.storage.bounds import Limit, Positive, demand_fields, whole
 
 #: Width of a cell, radii, and at least ahead, pixels.
@@ -51,16 +44,16 @@ class VoteTable(NamedTuple):
     """Which pixels vote, and the cells in which their votes are counted; lengths in metres."""
 
     #: (H, W, 2) floor position (robot X, Y) that each pixel sees; NaN above the horizon
-    floor_xy: NDArray[np.float32]
+    floor_xy: Float32Array
     paired: bool  # columns of the image are added in pairs
-    image_row: NDArray[np.int64]  # (R,) rows of the image that vote; none without centres
+    image_row: IntArray  # (R,) rows of the image that vote; none without centres
     #: (R, W, 6) of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r)
     #: by rows; all 0 where no floor is seen
-    pixel: NDArray[np.float32]
-    row_of_step: NDArray[np.int64]  # (S,) row of cells at each step ahead
+    pixel: Float32Array
+    row_of_step: IntArray  # (S,) row of cells at each step ahead
     ahead: FloatArray  # (M,) middle of each row of cells
-    first: NDArray[np.int64]  # (M,) columns of cells between which each row is in view
-    last: NDArray[np.int64]
+    first: IntArray  # (M,) columns of cells between which each row is in view
+    last: IntArray
     columns: int
     cell: float  # width of cells,
     step: float  # of steps ahead,

@@ -19,8 +19,8 @@ from redetect.storage import __version__ as __version__
 if TYPE_CHECKING:
     from camera import Camera
     from detect.line_settings import LineSettings
+    from detect.options import CompareOptions
     from detect.settings import CircleSettings
-    from detect.viewing_options import CompareOptions
     from redetect.interface.detection import Detection, Explanation, detect, explain
     from redetect.interface.maps import Localization, RunMap, localize
     from redetect.interface.maps import map_landmarks as map
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "Camera": ("camera", "Camera"),
     "CircleSettings": ("detect.settings", "CircleSettings"),
-    "CompareOptions": ("detect.viewing_options", "CompareOptions"),
+    "CompareOptions": ("detect.options", "CompareOptions"),
     "Detection": ("redetect.interface.detection", "Detection"),
     "Error": ("redetect.storage.messages", "OneLineError"),
     "Explanation": ("redetect.interface.detection", "Explanation"),

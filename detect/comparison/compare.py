@@ -26,7 +26,6 @@ from detect.comparison.result import (
     DiscPairs,
     DistanceBin,
     FrameMatch,
-    FramePair,
     Kind,
     LineComparison,
     LinePairs,
@@ -35,9 +34,9 @@ from detect.comparison.result import (
     quantile,
 )
 from detect.errors import CompareError
+from detect.options import CompareOptions
 from detect.seen import LEAST_GATE_PX, Sight
 from detect.sources.image_files import image_name
-from detect.viewing_options import CompareOptions
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     Association,
@@ -140,7 +139,7 @@ def compare_frames(
         circle_arrays([row for m in matches for row in m.missed]),
         circle_arrays([row for m in matches for row in m.extra]),
     )
-    alike = [_alike_xy(match.paired[0], match.frame.view) for match in matches]
+    alike = [_alike_xy(match.paired[0], match.view) for match in matches]
     alike_xy = np.concatenate([np.zeros((0, 2)), *alike])
     away = first.xy - (np.zeros(2) if sight is None else sight.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
@@ -159,8 +158,8 @@ def compare_frames(
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
-        reference_levelled=sum(wanted[m.frame.name].levelled_by is not None for m in matches),
-        detected_levelled=sum(found[m.frame.name].levelled_by is not None for m in matches),
+        reference_levelled=sum(wanted[m.name].levelled_by is not None for m in matches),
+        detected_levelled=sum(found[m.name].levelled_by is not None for m in matches),
         reference_level=sight is not None and sight.reference_level,
         pairs=pairs,
     )
@@ -253,9 +252,9 @@ def _on_lookalikes(
         return None
     known = {image_name(frame.step.prefix): frame.circles for frame in lookalikes}
     return sum(
-        len(pair_discs(known[m.frame.name], m.extra, options, m.frame.view).first)
+        len(pair_discs(known[m.name], m.extra, options, m.view).first)
         for m in matches
-        if m.frame.name in known
+        if m.name in known
     )
 
 
@@ -295,8 +294,7 @@ def match_runs(
     for name in images:
         frames = reference[name], detected[name]
         view = None if sight is None else sight.of(*frames)
-        pair = pair_of(kind, name, *frames, known.get(name), view)
-        matches.append(match_frame(pair, options))
+        matches.append(match_frame(kind, name, (*frames, known.get(name)), options, view))
     counts: dict[str, Any] = {
         name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
@@ -320,51 +318,46 @@ def match_runs(
     }
 
 
-def pair_of(
+def match_frame(
     kind: Kind,
     name: str,
-    reference: Frame | None,
-    detected: Frame | None,
-    unlisted: Frame | None = None,
+    frames: tuple[Frame | None, Frame | None, Frame | None],
+    options: CompareOptions,
     view: Sight | None = None,
-) -> FramePair:
-    """The discs or the lines of two frames of one image; a frame that is None has no rows."""
+) -> FrameMatch:
+    """Match the discs or the lines of one image one to one.
 
-    def rows_of(frame: Frame | None) -> Sequence[Any]:
-        rows = () if frame is None else getattr(frame, kind)
-        return sorted(rows, key=_line_order) if kind == "lines" else rows
-
-    return FramePair(kind, name, rows_of(reference), rows_of(detected), rows_of(unlisted), view)
-
-
-def match_frame(frame: FramePair, options: CompareOptions) -> FrameMatch:
-    """Match the rows of one frame one to one.
-
-    Detected rows that fit an unlisted disc or line (or a reference row without ID, if these do not
-    count), and no reference row that counts, are set aside.
+    `frames` are those of the reference, of the detected rows and of what is unlisted; one that is
+    None has no rows. Detected rows that fit an unlisted disc or line (or a reference row without
+    ID, if these do not count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
-    if frame.kind == "circles":
-        pair_up = partial(pair_discs, options=options, view=frame.view)
-    counted, uncounted = frame.reference, list(frame.unlisted)
+    if kind == "circles":
+        pair_up = partial(pair_discs, options=options, view=view)
+    counted, detected, uncounted = ([*getattr(frame, kind, ())] for frame in frames)
+    if kind == "lines":
+        for rows in (counted, detected, uncounted):
+            rows.sort(key=_line_order)
     if options.only_identified:
         uncounted += [row for row in counted if not row.identified]
         counted = [row for row in counted if row.identified]
-    pairs = pair_up(counted, frame.detected)
+    pairs = pair_up(counted, detected)
     first, left = ([counted[i] for i in side] for side in (pairs.first, pairs.first_alone))
-    second = [frame.detected[j] for j in pairs.second]
-    alone = [frame.detected[j] for j in pairs.second_alone]
+    second = [detected[j] for j in pairs.second]
+    alone = [detected[j] for j in pairs.second_alone]
     aside = pair_up(uncounted, alone)
-    if frame.kind == "lines":
+    if kind == "lines":
         reach = numbers(second, "sigma") * options.sigmas
         joined = np.asarray((np.abs(_turns(left, second)) <= reach).any(axis=1))
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
         joined = np.zeros(len(left), dtype=np.bool_)
-        apart = circle_arrays(second).xy - _alike_xy(first, frame.view)
+        apart = circle_arrays(second).xy - _alike_xy(first, view)
         errors = np.linalg.norm(apart, axis=1)
     return FrameMatch(
-        frame,
+        name,
+        view,
+        detected,
         matched=list(zip(first, second)),
         joined=[row for row, with_another in zip(left, joined) if with_another],
         missed=[row for row, with_another in zip(left, joined) if not with_another],
@@ -411,7 +404,7 @@ def pair_lines(
 
 def apart_px(match: FrameMatch) -> FloatArray:
     """(M,) distances of matched discs in the image; NaN where one is not seen."""
-    view = match.frame.view
+    view = match.view
     assert view is not None
     first, second = (circle_arrays(rows).xy for rows in match.paired)
     return np.asarray(np.linalg.norm(view.detected_px(second) - view.reference_px(first), axis=1))

@@ -13,17 +13,11 @@ from rich.text import Text
 
 from camera import Camera, camera_in, read_camera
 from detect.comparison.compare import compare_with_file
-from detect.comparison.result import (
-    WORST_FRAMES,
-    Comparison,
-    DiscComparison,
-    Kind,
-    number,
-)
+from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, Kind, number
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
+from detect.options import Compare
 from detect.seen import Sight
-from detect.viewing_options import Compare
 from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
@@ -166,7 +160,7 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     """The frames with most missed and extra rows."""
     rows = tuple(
         (
-            match.frame.name,
+            match.name,
             *(str(len(getattr(match, count))) for count in c.counts),
             number(match.largest_error, 3),
         )

@@ -7,17 +7,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from html import escape
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
+from detect.options import CompareOptions
+from detect.seen import Sight
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
-
-if TYPE_CHECKING:
-    from detect.seen import Sight
-    from detect.viewing_options import CompareOptions
 
 Kind = Literal["circles", "lines"]
 
@@ -25,21 +23,12 @@ Kind = Literal["circles", "lines"]
 WORST_FRAMES = 10
 
 
-class FramePair(NamedTuple):
-    """The rows of one image on both sides, all discs or all lines."""
-
-    kind: Kind
-    name: str
-    reference: Sequence[Any]
-    detected: Sequence[Any]
-    unlisted: Sequence[Any] = ()  # what may be detected but need not be
-    view: Sight | None = None  # how discs come back into the image; None: compared on the floor
-
-
 class FrameMatch(NamedTuple):
-    """Which rows of one frame belong together."""
+    """Which rows of one frame belong together, all discs or all lines."""
 
-    frame: FramePair
+    name: str  # of the image
+    view: Sight | None  # how discs come back into it; None: compared on the floor
+    detected: Sequence[Any]  # all of these rows
     matched: list[tuple[Any, Any]]  # reference and detected row; no row is in two pairs
     joined: list[Any]  # reference rows that a matched line represents, too
     missed: list[Any]
@@ -206,7 +195,7 @@ class Comparison(ABC):
             "pairs": self.matched,
             "worst_frames": [
                 {
-                    "name": match.frame.name,
+                    "name": match.name,
                     **{count: len(getattr(match, count)) for count in self.counts},
                     f"largest_error_{self.unit}": match.largest_error,
                 }
@@ -228,7 +217,7 @@ class Comparison(ABC):
 
         def order(match: FrameMatch) -> tuple[float, float, str]:
             wrong = len(match.missed) + len(match.extra)
-            return -wrong, -(match.largest_error or 0.0), match.frame.name
+            return -wrong, -(match.largest_error or 0.0), match.name
 
         return sorted(self.frames, key=order)[:count]
 

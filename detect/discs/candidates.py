@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 from redetect.compiled import kernel
 
-FloatArray = NDArray[np.float64]
 
-
-def local_maxima(quality: NDArray[np.float64], threshold: float) -> NDArray[np.bool_]:
+def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
     """Pixels of a map of at least `threshold` that none of their 8 neighbours exceeds.
 
     Connected pixels of equal quality are one maximum, at the one nearest to their centroid: a
@@ -51,9 +49,7 @@ def local_maxima(quality: NDArray[np.float64], threshold: float) -> NDArray[np.b
     return maxima
 
 
-def suppress_neighbours(
-    floor_xy: FloatArray, score: FloatArray, separation: float
-) -> NDArray[np.bool_]:
+def suppress_neighbours(floor_xy: FloatArray, score: FloatArray, separation: float) -> BoolArray:
     """Which of some floor positions to keep so that no two are closer than `separation`.
 
     The best by score stay; of equal ones the first.
@@ -77,7 +73,7 @@ def suppress_neighbours(
 
 
 @kernel()
-def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> NDArray[np.int64]:
+def apart(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
     """Those of some positions, in this order, that are not nearer than this to one kept before."""
     kept, count = np.empty(len(order), np.int64), 0
     x, y = np.empty(len(order)), np.empty(len(order))
@@ -94,9 +90,9 @@ def apart(floor_xy: FloatArray, order: NDArray[np.int64], separation: float) -> 
 
 @kernel()
 def alone_published(
-    pixels: NDArray[np.int64], quality: FloatArray, floor_xy: NDArray[np.float32],
+    pixels: IntArray, quality: FloatArray, floor_xy: Float32Array,
     separation: float,
-) -> NDArray[np.bool_]:  # fmt: skip
+) -> BoolArray:  # fmt: skip
     """Which centres have none of a higher quality nearby.
 
     Of centres of the same quality, the first stays that has none nearby that stays.

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.rim import median
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import BoolArray, FloatArray
 
 #: Discs of these log-odds are sure: others are compared with them.
 SURE = 2.5
@@ -17,9 +15,7 @@ _PALE, _PER_FACTOR = 0.5, 4.0
 _LEAST_OTHERS, _DARKEST = 2, 5.0
 
 
-def lost_by_paleness(
-    contrast: FloatArray, floor_grey: FloatArray, sure: NDArray[np.bool_]
-) -> FloatArray:
+def lost_by_paleness(contrast: FloatArray, floor_grey: FloatArray, sure: BoolArray) -> FloatArray:
     """Log-odds that discs of an image lose because they are paler than its sure discs.
 
     What has much less contrast than the sure discs is mostly the reflection of one in a polished
@@ -53,7 +49,7 @@ def lost_by_paleness(
     return lost
 
 
-def lost_by_sign(contrast: FloatArray, sure: NDArray[np.bool_]) -> FloatArray:
+def lost_by_sign(contrast: FloatArray, sure: BoolArray) -> FloatArray:
     """Log-odds that discs of an image lose because either sign is possible, or the other is likely.
 
     With m of n sure discs of a sign, the share of that sign is (m + 1) / (n + 2) by Laplace's rule

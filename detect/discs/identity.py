@@ -8,60 +8,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, circle_arrays
-
-FloatArray = NDArray[np.float64]
 
 #: Chi-squared of two degrees of freedom exceeds this once in a thousand.
 _GATE = 2.0 * math.log(1000.0)
 
 
-class MappedDisc(NamedTuple):
-    """A disc of a map in the robot frame of a frame (m), with its covariance (m^2)."""
-
-    id: int
-    x: float
-    y: float
-    cxx: float
-    cxy: float
-    cyy: float
-
-
-def ids_of_rows(seen_xy: FloatArray, rows: Sequence[CircleLandmark]) -> list[tuple[int, ...]]:
+def ids_of_rows(
+    xy: FloatArray,
+    rows: Sequence[CircleLandmark],
+    covariance: FloatArray | None = None,
+    slack_m: float = 0.0,
+) -> list[tuple[int, ...]]:
     """The IDs of the rows of the same discs in the same frame; () for discs without a row.
 
     Discs (N, 2) are compared without a correction for the tilt if the rows are without one: then
-    both are the same pixels, whatever the tilt.
+    both are the same pixels, whatever the tilt, and the discs' own covariance does not count.
+    `slack_m` is the standard deviation of what no covariance includes, in every direction.
     """
+    own = np.zeros((len(xy), 2, 2)) if covariance is None else covariance
     known = circle_arrays(rows)
-    found = matched(seen_xy, np.zeros((len(seen_xy), 2, 2)), known.xy, known.covariance)
+    found = matched(xy, own, known.xy, known.covariance + slack_m**2 * np.eye(2))
     return [rows[i].ids if i >= 0 else () for i in found.tolist()]
-
-
-def ids_of_map(
-    floor_xy: FloatArray, covariance: FloatArray, discs: Sequence[MappedDisc], slack_m: float
-) -> NDArray[np.int64]:
-    """(N,) IDs of the mapped discs that detected ones fall on; -1 where there is none.
-
-    `slack_m` is the standard deviation of what neither covariance includes, in every direction.
-    """
-    if not discs:
-        return np.full(len(floor_xy), -1)
-    table = np.array([disc[1:] for disc in discs], dtype=np.float64)
-    spread = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2) + slack_m**2 * np.eye(2)
-    found = matched(floor_xy, covariance, table[:, :2], spread)
-    ids = np.array([disc.id for disc in discs] + [-1], dtype=np.int64)
-    return ids[found]
 
 
 def matched(
     xy: FloatArray, covariance: FloatArray, known_xy: FloatArray, known_covariance: FloatArray
-) -> NDArray[np.int64]:
+) -> IntArray:
     """(N,) which of M known places each of N places is; -1 where none is within the gate.
 
     Of places (N, 2), (M, 2) with covariances, each is used once at most, the nearest pairs first.

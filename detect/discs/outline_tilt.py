@@ -18,17 +18,17 @@ for 3D Object Recognition and Pose, PAMI 13 (1991).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
 from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
+from redetect.landmarks import FrameTilt
 
 #: Directions in which the rim must lie on the ellipse.
 LEAST_DIRECTIONS = 24
@@ -47,23 +47,9 @@ _ITERATIONS = 7
 _FREEDOM = 4.0
 
 
-FloatArray = NDArray[np.float64]
-
-
-class OutlineTilt(NamedTuple):
-    """Pitch and roll by discs' outlines (rad), their covariance (rad^2), and how many discs."""
-
-    pitch: float
-    roll: float
-    cpp: float
-    cpr: float
-    crr: float
-    discs: int
-
-
 @kernel()
 def _derivative_of_levelling(
-    rotation: NDArray[np.float64], centre: NDArray[np.float64], x: float, y: float
+    rotation: FloatArray, centre: FloatArray, x: float, y: float
 ) -> tuple[float, float, float, float]:
     """d(levelled x, y) / d(x, y) of a point of the calibrated floor, row by row."""
     dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
@@ -81,27 +67,16 @@ def _derivative_of_levelling(
 
 
 @kernel()
-def _contrast(grey: NDArray[np.float64]) -> float:
+def _contrast(grey: FloatArray) -> float:
     """Grey levels within half a radius minus those beyond one and a third."""
-    inside = outside = 0.0
-    inside_count = outside_count = 0
-    for k in range(grey.shape[0]):
-        for m in range(4):
-            if not math.isnan(grey[k, m]):
-                inside += grey[k, m]
-                inside_count += 1
-        for m in range(grey.shape[1] - 8, grey.shape[1]):
-            if not math.isnan(grey[k, m]):
-                outside += grey[k, m]
-                outside_count += 1
-    return inside / inside_count - outside / outside_count
+    return float(np.nanmean(grey[:, :4]) - np.nanmean(grey[:, -8:]))
 
 
 @kernel()
 def fit_outline(
-    point_xy: NDArray[np.float64],
-    px_per_m: NDArray[np.float64],
-    centre: NDArray[np.float64],
+    point_xy: FloatArray,
+    px_per_m: FloatArray,
+    centre: FloatArray,
     x: float,
     y: float,
     radius: float,
@@ -190,12 +165,9 @@ def fit_outline(
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
     count = len(tilt)
-    mean, of_mean = np.empty(2), np.empty((2, 2))
-    one, information = np.empty(count), np.empty((count, 2, 2))
+    mean, of_mean, information = np.empty(2), np.empty((2, 2)), np.empty((count, 2, 2))
     for i in range(2):
-        for k in range(count):
-            one[k] = tilt[k, i]
-        mean[i] = median(one)
+        mean[i] = median(tilt[:, i].copy())
     for k in range(count):
         invert_positive(covariance[k], information[k])
     for _ in range(_ITERATIONS):
@@ -216,7 +188,7 @@ def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
 
 @kernel()
 def _tilts_of_discs(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     numbers: FloatArray,
     centre: FloatArray,
     floor_xy: FloatArray,
@@ -230,10 +202,7 @@ def _tilts_of_discs(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         seen = profiles(image, numbers, x, y, radius)
-        long_enough = 0
-        for m in range(DIRECTIONS):
-            long_enough += seen.pixels_per_radius[m] >= LEAST_AXIS_PX
-        if long_enough < DIRECTIONS:
+        if not seen.pixels_per_radius.min() >= LEAST_AXIS_PX:
             continue
         contrast = _contrast(seen.grey)
         if not abs(contrast) >= LEAST_CONTRAST:
@@ -260,16 +229,12 @@ def _tilts_of_discs(
 
 
 def tilt_of_outlines(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    floor_xy: FloatArray,
-    radius_m: float,
-    raised_m: float = 0.0,
-) -> OutlineTilt | None:
+    image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
+) -> FrameTilt | None:
     """The tilt that the outlines of the discs in an image show; None if no rim is in view.
 
     Discs were seen at `floor_xy` (N, 2), nothing levelled; the camera is higher than calibrated by
-    `raised_m`.
+    `raised_m`. The tilt's prefix is empty.
     """
     height_ratio = 1.0 + raised_m / float(camera.centre[2])
     tilts, covariances = _tilts_of_discs(
@@ -280,4 +245,4 @@ def tilt_of_outlines(
     mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
     (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
     pitch, roll = mean.tolist()
-    return OutlineTilt(pitch, roll, cpp, cpr, crr, len(tilts))
+    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))

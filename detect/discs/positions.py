@@ -10,12 +10,10 @@ seems to give the position (`detect.circles.tilt_jacobian`).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
+from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Of the central differences of the projection, metres.
 _STEP_M = 1e-5
@@ -43,7 +41,7 @@ def _add_pixels(
 def pixel_positions(
     camera_numbers: FloatArray,
     floor_xy: FloatArray,
-    pixels: NDArray[np.int64],
+    pixels: IntArray,
     floor_variance: float,
     pixel_variance: float,
 ) -> tuple[FloatArray, FloatArray]:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from detect.errors import FrameError
 from lut import GROUP_COLUMNS, GROUP_SAMPLES, CentreGroups, DiscTable
+from redetect.array_types import ByteArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 # Unsigned: an index that is none of those counted from the end.
@@ -46,25 +47,18 @@ _ROUNDING = 1e-6
 class Limits(NamedTuple):
     """Which centres are found."""
 
-    quality: float
-    """At least, and above 0,"""
-    part_quality: float = 0.0
-    """in the samples that a group shares at least this,"""
-    contrast: float = 0.0
-    """and more than this, grey levels, of either sign."""
-    sign: int = 0
-    """1 for those lighter than what is around them, -1 for darker ones, 0 for both."""
+    quality: float  # at least, and above 0,
+    part_quality: float = 0.0  # in the samples that a group shares at least this,
+    contrast: float = 0.0  # and more than this, grey levels, of either sign
+    sign: int = 0  # 1 for those lighter than what is around them, -1 for darker ones, 0 for both
 
 
 class Centres(NamedTuple):
     """Some centres, in scan order."""
 
-    pixels: NDArray[np.int64]
-    """(N, 2) pixels (u, v)."""
-    quality: NDArray[np.float64]
-    """(N,)"""
-    contrast: NDArray[np.float32]
-    """(N,) of the inner outline to the outer, grey levels."""
+    pixels: IntArray  # (N, 2) pixels (u, v)
+    quality: FloatArray  # (N,)
+    contrast: Float32Array  # (N,) of the inner outline to the outer, grey levels
 
 
 def least_part_quality(quality: float, samples: int) -> float:
@@ -73,7 +67,7 @@ def least_part_quality(quality: float, samples: int) -> float:
 
 
 @kernel(forceinline=True)
-def _with_squares(grey: NDArray[np.uint8], first: int, end: int) -> NDArray[np.uint32]:
+def _with_squares(grey: ByteArray, first: int, end: int) -> NDArray[np.uint32]:
     """Of some pixels, x 2^20 + x^2; uninitialised before and after them."""
     both = np.empty(len(grey), np.uint32)
     for i in range(_U64(first), _U64(end)):
@@ -104,7 +98,7 @@ def _columns_left(
 
 @kernel(forceinline=True)
 def _quality_of(
-    grey: NDArray[np.uint8], samples: NDArray[np.uint32], i: int, outside: int
+    grey: ByteArray, samples: NDArray[np.uint32], i: int, outside: int
 ) -> tuple[float, float]:
     """Quality and contrast of a centre."""
     # Whole numbers all, and exact: but sums of floats stay in order, one sample after the other,
@@ -128,9 +122,9 @@ def _quality_of(
 
 @kernel()
 def find_centres(
-    grey: NDArray[np.uint8], outside: int, pixels: NDArray[np.int32],
+    grey: ByteArray, outside: int, pixels: NDArray[np.int32],
     samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float32]]:  # fmt: skip
+) -> tuple[IntArray, FloatArray, Float32Array]:  # fmt: skip
     """The centres within some limits: (M, 2) pixels, (M,) qualities and contrasts.
 
     Parameters
@@ -173,7 +167,7 @@ def find_centres(
     return found_at[:found], quality[:found], contrast[:found]
 
 
-def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Centres:
+def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     """The centres of a table that are within some limits.
 
     Parameters
@@ -203,9 +197,7 @@ def centres_of(image: NDArray[np.uint8], table: DiscTable, limits: Limits) -> Ce
     )
 
 
-def quality_of_centres(
-    image: NDArray[np.uint8], table: DiscTable
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, Float32Array]:
     """Otsu's quality, and the contrast, of the outlines around every centre of a table.
 
     Parameters

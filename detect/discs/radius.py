@@ -14,12 +14,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
+from redetect.array_types import GreyImage
 
 #: Radii that are tried, metres, and the factor from one to the next.
 SMALLEST_M, LARGEST_M = 0.02, 0.5
@@ -37,7 +37,7 @@ class RadiusEstimate(NamedTuple):
 
 
 def find_radius(
-    images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings
+    images: Sequence[GreyImage], camera: Camera, settings: CircleSettings
 ) -> RadiusEstimate | None:
     """Find the radius of the discs in some images, whatever that in the settings is.
 

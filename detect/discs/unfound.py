@@ -12,10 +12,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import (
@@ -31,8 +30,8 @@ from detect.discs.radius import FACTOR, find_radius
 from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
+from redetect.array_types import FloatArray, GreyImage
 
-FloatArray = NDArray[np.float64]
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
 
 #: Radii that are tried at a place are as much smaller and larger.
@@ -76,6 +75,15 @@ class Candidate(NamedTuple):
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
         }[self.stage]
 
+    def record(self) -> dict[str, Any]:
+        """All of it, and the reason, for JSON; what is not finite is null."""
+        values = self._asdict().items()
+        known = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in values
+        }
+        return {**known, "reason": self.reason()}
+
 
 @dataclass(frozen=True)
 class DiscExplanation:
@@ -86,28 +94,19 @@ class DiscExplanation:
     suggestions: tuple[str, ...]  # what to try, and what that would find
 
     def to_json(self) -> str:
-        """All of it, the candidates numbered from 1; what is not finite is null."""
-        records = [
-            {
-                "number": number,
-                **{
-                    name: None if isinstance(value, float) and not math.isfinite(value) else value
-                    for name, value in row._asdict().items()
-                },
-                "reason": row.reason(),
-            }
-            for number, row in enumerate(self.candidates, start=1)
-        ]
+        """All of it, the candidates numbered from 1."""
         content = {
             "place": self.place,
             "suggestions": list(self.suggestions),
-            "candidates": records,
+            "candidates": [
+                {"number": k, **row.record()} for k, row in enumerate(self.candidates, 1)
+            ],
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
 
 def explain_discs(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     camera: Camera,
     settings: CircleSettings,
     at: tuple[float, float] | None = None,
@@ -132,11 +131,11 @@ def explain_discs(
         x, y = camera.floor_from_pixel(at).tolist()
         near = _NEAR * settings.radius_m
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
-    candidates.sort(key=lambda c: (c.stage != "disc", -c.votes))
+    candidates.sort(key=lambda c: (not c.is_disc, -c.votes))
     return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
 
 
-def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: CircleSettings) -> str:
+def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:
     """A sentence on the candidates for discs in images (H, W) without any, and what they fail."""
     settings = replace(settings, refine=True)
     scenes = (_Scene(image, camera, settings) for image in images)
@@ -158,7 +157,7 @@ def why_none(images: Sequence[NDArray[np.uint8]], camera: Camera, settings: Circ
 class _Scene:
     """An image, and what is found in it."""
 
-    image: NDArray[np.uint8]
+    image: GreyImage
     camera: Camera
     settings: CircleSettings
 

@@ -14,12 +14,12 @@ import numpy as np
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import RunRows, every_nth, open_rows, picture_name
 from detect.errors import DetectError, FrameError
+from detect.options import Draw
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures
-from detect.viewing_options import Draw
 from lut import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes

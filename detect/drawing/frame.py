@@ -9,7 +9,7 @@ missing are drawn as well, and rows that fit none have another colour.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import get_args
 
@@ -18,21 +18,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
-from detect.comparison.compare import apart_px, match_frame, numbers, pair_of
+from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
 from detect.discs.unfound import Candidate, Stage
 from detect.drawing.inputs import SeenRows
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
+from detect.options import CompareOptions
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
-from detect.viewing_options import CompareOptions
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
-from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays
+from redetect.landmarks import CircleLandmark, LineLandmark, MarkerLandmark, circle_arrays
 from redetect.plane import ellipses
 
 _POINTS = 33
@@ -65,14 +65,14 @@ def draw_rows(
     words = [title] if title else []
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
-        match = match_frame(pair_of("lines", title, rows.reference_lines, rows.lines), options)
+        lines = rows.reference_lines, rows.lines, None
+        match = match_frame("lines", title, lines, options)
         compared = rows.reference_lines is not None
         _draw_lines(canvas, sight.camera, match, compared)
         words.append(_count("verticals", match, compared))
     if sight is not None and rows.circles is not None:
-        frames = rows.reference_circles, rows.circles
-        pair = pair_of("circles", title, *frames, rows.unlisted, sight.of(*frames))
-        match = match_frame(pair, options)
+        discs = rows.reference_circles, rows.circles, rows.unlisted
+        match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
         compared = rows.reference_circles is not None
         _draw_discs(canvas, match, settings, compared)
         words.append(_count("discs", match, compared))
@@ -111,9 +111,7 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
         for angle in (sigma_rad, -sigma_rad):
             sine, cosine = np.sin(angle), np.cos(angle)
             turned = np.column_stack([cosine * x - sine * y, sine * x + cosine * y, 0.0 * x])
-            seen = turned @ camera.rotation
-            ahead = np.where(seen[:, 2:] > 1e-6, seen[:, 2:], np.nan)
-            bars.append(camera.distort(seen[:, :2] / ahead))
+            bars.append(camera.project(turned @ camera.rotation))
     return np.stack(bars, axis=1)
 
 
@@ -126,7 +124,7 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 def _draw_discs(
     canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool
 ) -> None:
-    view = match.frame.view
+    view = match.view
     assert view is not None
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
     for edge in view.reference_px(rings):
@@ -136,10 +134,7 @@ def _draw_discs(
     drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
     drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
     for row, text, colour in drawn:
-        centre = np.array([row.px, row.py])
-        _outline_disc(
-            canvas, view.detected_px, centre, settings, f"{row.quality:.2f}{text}", colour
-        )
+        _outline_disc(canvas, view, row, settings, f"{row.quality:.2f}{text}", colour)
 
 
 def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
@@ -176,25 +171,27 @@ def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark]) -> None:
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
     fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
-    return f"{len(match.frame.detected)} {what}{fate}"
+    return f"{len(match.detected)} {what}{fate}"
 
 
 def _outline_disc(
     canvas: ByteArray,
-    project: Callable[[FloatArray], FloatArray],
-    centre_xy: FloatArray,
+    view: Sight,
+    row: CircleLandmark,
     settings: CircleSettings,
     text: str,
     edge_colour: Colour,
 ) -> None:
-    """Draw a disc's edge and its two outlines, and a word above; `project` takes it to pixels."""
+    """Draw a detected disc's edge and its two outlines, and a word above."""
+    centre_xy = np.array([row.px, row.py])
     for radius, colour in (
         (settings.inner_radius_m, _OUTLINE_COLOUR),
         (settings.radius_m, edge_colour),
         (settings.outer_radius_m, _OUTLINE_COLOUR),
     ):
-        draw_curve(canvas, project(circle_on_floor(centre_xy, radius)), colour, closed=True)
-    top = project(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+        edge = view.detected_px(circle_on_floor(centre_xy, radius))
+        draw_curve(canvas, edge, colour, closed=True)
+    top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
     draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))
 
 
@@ -227,8 +224,7 @@ def png_of(picture: ByteArray) -> bytes:
 
 @lru_cache(maxsize=2)
 def _unseen(camera: Camera) -> BoolArray:
-    u, v = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
-    return np.isnan(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1))[..., 0])
+    return np.isnan(camera.undistort(camera.pixel_grid())[..., 0])
 
 
 def enlargement(canvas: ByteArray) -> int:

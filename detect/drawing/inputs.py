@@ -11,6 +11,7 @@ from types import MappingProxyType
 
 from camera import Camera
 from detect.errors import DetectError
+from detect.options import RowFiles
 from detect.runs.outputs import LEVEL, LEVELLED
 from detect.runs.plan import FramesByImage
 from detect.seen import Sight
@@ -18,7 +19,6 @@ from detect.settings import CircleSettings
 from detect.settings_files import word_value
 from detect.sources.image_files import image_name
 from detect.sources.interface import Frames, ImageRun, RunFrame
-from detect.viewing_options import RowFiles
 from redetect.landmarks import Frame, FrameTilt, read_tilts
 
 KINDS = ("circles", "lines", "markers", "tilt")

@@ -36,7 +36,7 @@ from detect.markers.geometry import (
     signed_area,
     square_homography,
 )
-from detect.markers.pattern_fit import FIRST_LOOK, PatternFit, fit_marker
+from detect.markers.pattern_fit import PatternFit, fit_marker
 from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage, IntArray
 from redetect.landmarks import MarkerCorner, MarkerLandmark
@@ -92,14 +92,12 @@ class MarkerDetections:
 
     def landmarks(self) -> tuple[MarkerLandmark, ...]:
         """The markers as rows of a file."""
+        spreads = self.covariance.reshape(-1, 4, 4)[..., [0, 1, 3]]
+        corners = np.concatenate([self.corners, spreads], axis=-1).tolist()
         rows = []
-        for k, number in enumerate(self.ids):
-            spreads = self.covariance[k].reshape(4, 4)[:, [0, 1, 3]]
-            a, b, c, d = (
-                MarkerCorner(*row) for row in np.hstack([self.corners[k], spreads]).tolist()
-            )
-            quality = float(self.quality[k])
-            rows.append(MarkerLandmark(self.dictionary, int(number), quality, (a, b, c, d)))
+        for number, quality, own in zip(self.ids.tolist(), self.quality.tolist(), corners):
+            a, b, c, d = (MarkerCorner(*corner) for corner in own)
+            rows.append(MarkerLandmark(self.dictionary, number, quality, (a, b, c, d)))
         return tuple(rows)
 
 
@@ -219,7 +217,7 @@ def _marker_at(
     if not likely:
         return NO_PATTERN
     looks = [
-        (fit_marker(picture, refined, templates, template, FIRST_LOOK), template)
+        (fit_marker(picture, refined, templates, template, first_look=True), template)
         for template in likely
     ]
     possible = [(look, template) for look, template in looks if look is not None]

@@ -23,10 +23,9 @@ from statistics import NormalDist
 import numpy as np
 from cv2 import aruco
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from detect.errors import DetectError
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: ARToolKitPlus' simple code: a number of 9 bits is written four times, each time scrambled.
 _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
@@ -38,8 +37,6 @@ _OPENCV_PREFIX = "DICT_"
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
-#: Size of the cells and the margin of a specimen.
-_CELL_PX, _MARGIN_PX = 5, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +114,10 @@ class Templates:
     """Templates of the expected markers' cells, for each marker turned by 0, 90, 180, 270 deg."""
 
     dictionary: MarkerDictionary
-    cells: NDArray[np.float32]  # (T, G * G) 1 for white; all markers, then all turned once ...
-    blurred: tuple[NDArray[np.float32], ...]  # for each blur, less their mean, of length 1
+    cells: Float32Array  # (T, G * G) 1 for white; all markers, then all turned once ...
+    blurred: tuple[Float32Array, ...]  # for each blur, less their mean, of length 1
     weakness: float  # how likely a pattern occurs by chance, from 0 (hardly ever) to 1
-    decoys: NDArray[np.float32]  # (D, G * G) content of other frames: nothing, a bar, or a half
+    decoys: Float32Array  # (D, G * G) content of other frames: nothing, a bar, or a half
     plain: BoolArray  # (T,) which of the templates are similar to these
     lines: FloatArray  # (L,) where cells end, and the square, in its widths from 0 to 1
     grid: slice  # rows, and columns, of the grid among the cells between the lines
@@ -138,7 +135,7 @@ class Templates:
         result[self.grid, self.grid] = 1.0 - self.cells[template].reshape(side, side)
         return result
 
-    def nearest_blur(self, blur_cells: float) -> NDArray[np.float32]:
+    def nearest_blur(self, blur_cells: float) -> Float32Array:
         """The blurred templates of the blur next to the given one."""
         ratio = np.log(np.array(_BLURS_CELLS) / max(blur_cells, 1e-3))
         return self.blurred[int(np.argmin(np.abs(ratio)))]
@@ -180,9 +177,7 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
     )
 
 
-def _blurred(
-    patterns: NDArray[np.float32], blur_cells: float, around: float
-) -> NDArray[np.float32]:
+def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float32Array:
     """Grey values in the middle of blurred cells, less their mean and of length 1."""
     cdf = [NormalDist(0.0, blur_cells).cdf(end - 0.5) for end in range(-2, 4)]
     shares = (np.diff(cdf) / (cdf[-1] - cdf[0])).astype(np.float32)
@@ -196,9 +191,7 @@ def _blurred(
     return np.asarray(flat / np.maximum(length, 1e-6), np.float32)
 
 
-def _decoys(
-    varied: BoolArray, patterns: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], BoolArray]:
+def _decoys(varied: BoolArray, patterns: Float32Array) -> tuple[Float32Array, BoolArray]:
     """Patterns of frames, bars, panes, and which of the markers' are within two cells of them.
 
     Decoys that are as near a marker's pattern are left out: it could never be found.

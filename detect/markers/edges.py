@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.markers.geometry import Picture, is_convex
 from detect.settings import MarkerSettings
-from redetect.array_types import FloatArray
+from redetect.array_types import ByteArray, FloatArray
 
 #: Causes of rejection, as they are counted.
 NO_EDGE = "edge not found"
@@ -146,7 +145,7 @@ def _edges_near(
     )
 
 
-def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> NDArray[np.uint8] | None:
+def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray | None:
     """(R, S, 4) grey values from some straight places (R, 4, 2) to others; None outside the image.
 
     They are so near to each other that the lens bends nothing between them.

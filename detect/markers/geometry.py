@@ -17,12 +17,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.errors import FrameError
 from detect.grey_values import estimate_noise
-from redetect.array_types import BoolArray, FloatArray, GreyImage
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Rows of the image that its noise is estimated from.
@@ -36,7 +35,7 @@ class Picture:
     grey: GreyImage  # (H, W)
     noise: float
     camera: Camera | None
-    straight: NDArray[np.float32]  # (H, W, 2) straight position of each pixel
+    straight: Float32Array  # (H, W, 2) straight position of each pixel
 
     def straighten(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) straight positions of (N, 2) pixels."""
@@ -75,7 +74,7 @@ def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
 
 
 @functools.lru_cache(maxsize=4)
-def _straight_positions(camera: Camera | None, width: int, height: int) -> NDArray[np.float32]:
+def _straight_positions(camera: Camera | None, width: int, height: int) -> Float32Array:
     u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     pixels = np.stack([u, v], axis=-1)
     straight = pixels if camera is None else _straightened(camera, pixels)

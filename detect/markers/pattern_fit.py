@@ -58,15 +58,9 @@ _LEAST_NOISE = 0.3
 _SPARE_PIXELS = 12
 
 
-class Effort(NamedTuple):
-    """About how many pixels a fit uses at most, and how many steps it takes."""
-
-    pixels: int
-    steps: int
-
-
-#: A first look is enough to see whether it may be that marker.
-FIRST_LOOK, WHOLE_FIT = Effort(450, 5), Effort(3000, 12)
+#: About how many pixels a fit uses at most, and how many steps it takes: a first look is enough to
+#: see whether it may be that marker.
+_FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
 
 
 class PatternFit(NamedTuple):
@@ -88,26 +82,28 @@ def fit_marker(
     start: RefinedQuadrangle,
     templates: Templates,
     template: int,
-    effort: Effort = WHOLE_FIT,
+    *,
+    first_look: bool = False,
 ) -> PatternFit | None:
     """Fit a marker of a known pattern by the Gauss-Newton method, beginning with its edges.
 
     None if there is no such marker nearby.
     """
+    most_pixels, steps = _FIRST_LOOK if first_look else _WHOLE_FIT
     corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
     cell_px = templates.dictionary.cell * float(np.hypot(*(middles[:2] - middles[2:]).T).min())
     pattern = pattern_of(templates.lines, templates.blackness(template))
     near = _SEAM_BLURS * blur_px + _SEAM_PX
     reach = min(near, max(_LEAST_SEAM_PX, cell_px))
-    samples = _samples(picture, corners, pattern.lines, reach, near, effort.pixels)
+    samples = _samples(picture, corners, pattern.lines, reach, near, most_pixels)
     if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
         return None
     noise = max(picture.noise, _LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
     start = start._replace(corners=corners - centre)
-    solution = _solved(samples, pattern, start, noise, reach_px, effort.steps)
+    solution = _solved(samples, pattern, start, noise, reach_px, steps)
     if solution is None:
         return None
     p, left, inverse = solution

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from io import BytesIO
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
-from detect.comparison.result import (
-    DiscComparison,
-    DiscPairs,
-    LineComparison,
-    LinePairs,
-)
+from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
 from detect.drawing.inputs import SeenRows
 from detect.seen import summed_steps
 from redetect.array_types import FloatArray
@@ -22,30 +18,22 @@ from redetect.landmarks import circle_arrays, is_positive_definite
 from redetect.plane import apply, ellipses
 from redetect.reporting.page import Part, figure_file, image_part
 
-if TYPE_CHECKING:
-    from io import BytesIO
-
-    from matplotlib.axes import Axes
-
-
 #: Colours that stay apart in print and for the colour-blind; differences remain without them.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
 
 
-_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
+SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
 
-def rates_figure(curve: RateCurve) -> Part:
+def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
     """Recall and precision over the least quality."""
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
-        axes.plot(curve.threshold, curve.recall, color=DATA, lw=1.4, label="recall")
-        axes.plot(
-            curve.threshold, curve.precision, color=SECOND, lw=1.4, ls="--", label="precision"
-        )
+        axes.plot(least, recall, color=DATA, lw=1.4, label="recall")
+        axes.plot(least, precision, color=SECOND, lw=1.4, ls="--", label="precision")
         axes.set_ylim(0.0, 1.05)
         _finish(axes, "least quality", "share")
         axes.legend(fontsize=8)
@@ -70,7 +58,7 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
             f"deviation {residuals.std():.2f}; {len(residuals) - counts.sum()} beyond ±{reach:g}",
             fontsize=9,
         )
-        _finish(axes, f"residual / {_SIGMA}", "density")
+        _finish(axes, f"residual / {SIGMA}", "density")
         axes.legend(fontsize=8)
     words = (
         f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
@@ -149,7 +137,7 @@ def tilt_figure(rows: Sequence[SeenRows]) -> Part:
         ):
             angle, sigma = np.degrees(value), np.degrees(np.sqrt(variance))
             band = (angle - sigma, angle + sigma)
-            axes.fill_between(at, *band, color=BAND, alpha=0.3, lw=0, label=f"±1 {_SIGMA}")
+            axes.fill_between(at, *band, color=BAND, alpha=0.3, lw=0, label=f"±1 {SIGMA}")
             axes.plot(at, angle, ".-", color=DATA, lw=0.9, ms=3)
             axes.axhline(0.0, color=REFERENCE, lw=0.6)
             _finish(axes, "", name)
@@ -216,16 +204,8 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     return _part(words, content, _WIDE)
 
 
-class RateCurve(NamedTuple):
-    """Recall and precision (NaN without rows) of the rows of at least each quality."""
-
-    threshold: FloatArray
-    recall: FloatArray
-    precision: FloatArray
-
-
-def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
-    """Recall and precision of discs of at least each quality."""
+def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Recall and precision (NaN without rows) of discs of at least each quality."""
     levels = np.asarray(qualities, np.float64)
     found, beside = np.zeros((2, len(levels)), np.int64)
     for match in comparison.frames:
@@ -233,7 +213,7 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> RateCurve:
         beside += (levels[:, None] <= numbers(match.extra, "quality")).sum(axis=1)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), found / (found + beside)
-    return RateCurve(levels, recall, precision)
+    return recall, precision
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:

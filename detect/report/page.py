@@ -15,11 +15,11 @@ from detect.comparison.result import Comparison, DiscComparison, Kind, LineCompa
 from detect.drawing.frame import draw_rows
 from detect.drawing.inputs import RunRows, SeenRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
+from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.seen import Sight
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.viewing_options import Report, RowFiles
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
@@ -108,7 +108,6 @@ def perform(options: Report) -> int:
 _NAMES = {
     "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
 }  # fmt: skip
-_SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 _CURVE_POINTS = 41
 
@@ -154,10 +153,10 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
     parts = [*_summary_of(result)]
-    quality = [row.quality for match in result.frames for row in match.frame.detected]
+    quality = [row.quality for match in result.frames for row in match.detected]
     if len(set(quality)) > 1:
         levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
-        parts.append(figures.rates_figure(figures.rates_over(result, levels)))
+        parts.append(figures.rates_figure(levels, *figures.rates_over(result, levels)))
     if result.matched:
         parts.append(figures.floor_figure(result.pairs))
         if result.pairs.levelled_apart:
@@ -195,7 +194,7 @@ def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
     for k in (1, 2, 3):
         normal = math.erf(k / math.sqrt(2.0))
         share = np.mean(np.abs(residuals) <= k)
-        rows.append((f"within {k} {_SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
+        rows.append((f"within {k} {figures.SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
     return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
@@ -214,11 +213,11 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
         table = worst_frames_table(result, worst)
         parts.append(Part("table", f"{table.caption}: {kind}", table.head, table.rows))
         for rank, match in enumerate(matches, 1):
-            prefix, place = named[picture_name(match.frame.name)], f"number {rank} of {kind}"
+            prefix, place = named[picture_name(match.name)], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
         key = (
-            ("#ffaa00", f"disc's edge; ±1 {_SIGMA} of a vertical"),
+            ("#ffaa00", f"disc's edge; ±1 {figures.SIGMA} of a vertical"),
             ("#3cc83c", "outlines; vertical"),
             ("#ff3cff", "fits no reference row"),
             ("#ff3c3c", "reference row that is missing"),

@@ -10,9 +10,6 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from detect.drawing.inputs import KINDS, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -24,6 +21,7 @@ from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
+from redetect.array_types import ByteArray
 from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
@@ -142,7 +140,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     return replace(settings, radius_m=round(found.radius_m, 4))
 
 
-def _some_images(run: Run) -> Iterator[NDArray[np.uint8]]:
+def _some_images(run: Run) -> Iterator[ByteArray]:
     """Images that are spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")
@@ -168,12 +166,11 @@ def _known_discs(options: DiscIdOptions) -> Known:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
-    known = Known(discs=_frames(options.ids_from))
-    if options.ids_from is not None:
-        known = replace(known, discs_level=read_head(options.ids_from).level)
+    mapped = None
     if options.ids_from_map is not None and options.path is not None:
-        known = replace(known, mapped=MapByImage(options.ids_from_map, options.path))
-    return known
+        mapped = MapByImage(options.ids_from_map, options.path)
+    level = options.ids_from is not None and read_head(options.ids_from).level
+    return Known(discs=_frames(options.ids_from), discs_level=level, mapped=mapped)
 
 
 def _workers(command: DetectorFlags, job: Job) -> Workers:

@@ -16,11 +16,10 @@ from itertools import groupby, islice, zip_longest
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_table
-from detect.discs.identity import ids_of_map, ids_of_rows
+from detect.discs.identity import ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (
@@ -30,9 +29,8 @@ from detect.levelling import (
     level_discs,
     levelled,
     tilt_arrays,
-    with_common,
 )
-from detect.lines import LineDetections, detect_lines
+from detect.lines import LineDetections, carry_ids, detect_lines
 from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import (
@@ -49,8 +47,8 @@ from detect.runs.plan import (
 from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
-from detect.verticals.detections import carry_ids
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
+from redetect.array_types import FloatArray, GreyImage
 from redetect.landmarks import (
     CircleLandmark,
     FrameTilt,
@@ -68,7 +66,6 @@ from redetect.landmarks import (
 if TYPE_CHECKING:
     from detect.markers.detect import MarkerDetections
 
-FloatArray = NDArray[np.float64]
 
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
@@ -78,7 +75,7 @@ COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgE
 class FrameDetections:
     """Detections in one image; None for kinds that were not searched."""
 
-    image: NDArray[np.uint8] | None = None  # (H, W); None where it cannot be read
+    image: GreyImage | None = None  # (H, W); None where it cannot be read
     lines: LineDetections | None = None
     tilt: FrameTilt | None = None  # by the lines, if enough determine it, or known before
     seen: CircleDetections | None = None  # discs, where they would be on a level robot
@@ -154,13 +151,14 @@ def _path(
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
-                by_verticals = by_frame is not None
-                found.discs = with_common(
-                    found.discs, camera, settings.calibration_px, by_verticals=by_verticals
+                discs, by_verticals = found.discs, by_frame is not None
+                covariance = discs.covariance + common_covariance(
+                    camera, discs.floor_xy, settings.calibration_px, by_verticals=by_verticals
                 )
+                found.discs = replace(discs, covariance=covariance)
             if plan.levelling == "run":
                 tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
-                found.outline_tilt = None if tilt is None else FrameTilt(prefix, *tilt)
+                found.outline_tilt = tilt and replace(tilt, prefix=prefix)
         yield
 
         if plan.markers:
@@ -288,11 +286,11 @@ def _disc_rows(
         ids = [by_pixel[u, v] or (-1,) for u, v in discs.pixels.tolist()]
     if known.mapped:
         taken = {number for own in ids for number in own}
-        left = [disc for disc in known.mapped if disc.id not in taken]
+        left = [disc for disc in known.mapped if taken.isdisjoint(disc.ids)]
         without = [k for k, own in enumerate(ids) if own == (-1,)]
-        found = ids_of_map(discs.floor_xy[without], discs.covariance[without], left, _MAP_SIGMA_M)
-        for k, number in zip(without, found.tolist()):
-            ids[k] = (number,)
+        xy, spread = discs.floor_xy[without], discs.covariance[without]
+        for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
+            ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import indent
@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from camera import Camera
-from detect.discs.identity import MappedDisc
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from detect.sources.image_files import image_name
@@ -27,6 +26,7 @@ from redetect.landmarks import (
     FrameTilt,
     LineLandmark,
     Step,
+    circle_landmarks,
     format_no_tilt,
     format_record,
     frames_of_rows,
@@ -62,7 +62,7 @@ class KnownOfFrame(NamedTuple):
     lines: tuple[LineLandmark, ...] = ()
     discs: tuple[CircleLandmark, ...] = ()
     discs_level: bool = False
-    mapped: tuple[MappedDisc, ...] = ()
+    mapped: tuple[CircleLandmark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Known:
     discs: ByPrefix[Frame] | None = None  # the same of discs
     discs_level: bool = False  # whether these are corrected for the tilt
     #: Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
-    mapped: ByPrefix[Sequence[MappedDisc]] | None = None
+    mapped: ByPrefix[tuple[CircleLandmark, ...]] | None = None
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
@@ -85,7 +85,7 @@ class Known:
             lines.lines if lines else (),
             discs.circles if discs else (),
             self.discs_level,
-            tuple(self.mapped.get(prefix) or ()) if self.mapped else (),
+            (self.mapped.get(prefix) or ()) if self.mapped else (),
         )
 
 
@@ -127,7 +127,7 @@ class MapByImage:
         path = read_path(path_path)
         self._poses = dict(zip(map(image_name, path.prefixes), path.poses))
 
-    def get(self, prefix: str) -> Sequence[MappedDisc] | None:
+    def get(self, prefix: str) -> tuple[CircleLandmark, ...] | None:
         """The discs within reach of a frame's pose; None if the path does not have the frame."""
         pose = self._poses.get(image_name(prefix))
         if pose is None:
@@ -136,9 +136,7 @@ class MapByImage:
         xy = (self._discs.xy - pose[:2]) @ robot_from_map.T
         near = np.flatnonzero(np.hypot(*xy.T) <= _REACH_M)
         spread = robot_from_map @ self._discs.covariance[near] @ robot_from_map.T
-        numbers = np.column_stack([xy[near], spread[:, 0], spread[:, 1, 1]]).tolist()
-        ids = self._discs.ids[near].tolist()
-        return [MappedDisc(number, *values) for number, values in zip(ids, numbers)]
+        return circle_landmarks(xy[near], np.zeros(len(near)), spread, self._discs.ids[near])
 
 
 #: Number of failures whose messages a summary keeps.

@@ -26,7 +26,7 @@ import json
 import logging
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.metadata import version
@@ -199,7 +199,9 @@ def detect_run(
 
     with ExitStack() as stack:
         files = stack.enter_context(RunFiles(job))
-        tasks = files.take_over(stack.enter_context(closing(_tasks(job))), count)
+        source = stack.enter_context(closing(iter(job.run.frames)))
+        every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
+        tasks = files.take_over(every, count)
         for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
             files.add(frames)
             for _, rows in frames:
@@ -240,12 +242,6 @@ def make_folder(folder: Path) -> None:
         raise DetectError(
             f"{folder}: is no folder: expected one, or the name of a new one"
         ) from None
-
-
-def _tasks(job: Job) -> Generator[FrameTask, None, None]:
-    with closing(iter(job.run.frames)) as frames:
-        for frame in frames:
-            yield FrameTask(frame, job.known.of(frame.step.prefix))
 
 
 class RunFiles:

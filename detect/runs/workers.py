@@ -24,13 +24,12 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
-from multiprocessing.connection import wait
 from multiprocessing.synchronize import RLock
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
-from detect.errors import WorkerError
+from detect.errors import WorkerError, imported_for
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 from detect.terminal import (
     announcements_are_shown,
@@ -214,12 +213,8 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
-    try:
+    with imported_for("a cluster needs the package distributed", "cluster", error=WorkerError):
         from distributed import KilledWorker
-    except ImportError:
-        raise WorkerError(
-            "a cluster needs the package distributed: install it by pip install 'redetect[cluster]'"
-        ) from None
     clients: list[Client] = []
 
     def window() -> int:  # a cluster grows
@@ -363,7 +358,7 @@ def _in_worker(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
-        wait([parent.sentinel])
+        parent.join()
         os._exit(1)
 
 

@@ -25,21 +25,9 @@ from camera import Camera
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
-from detect.errors import DetectError, FrameError
-from detect.sources.interface import (
-    RunFrame,
-    Source,
-    gray_of_pixels,
-    numbered_prefix,
-    still,
-)
-from detect.sources.poses import (
-    FARTHEST,
-    PoseStream,
-    TimedPose,
-    carried,
-    heading_rad,
-)
+from detect.errors import DetectError, FrameError, imported_for
+from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
+from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
 from redetect.storage.messages import OneLineError, excerpt, one_line
 
@@ -64,14 +52,9 @@ _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)_?[0-9]*")
 @contextmanager
 def opened_bag(path: Path) -> Iterator[AnyReader]:
     """Open a bag."""
-    try:
+    with imported_for(f"{path}: bags are read by the package rosbags", "bags"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise DetectError(
-            f"{path}: bags are read by the package rosbags: install it by "
-            "pip install 'redetect[bags]'"
-        ) from None
     # Bags of older ROS 2 do not contain the definitions of their messages.
     defaults = get_typestore(Stores.LATEST)
     try:

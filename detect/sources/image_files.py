@@ -14,13 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from detect.errors import DetectError, FrameError
-from detect.sources.interface import (
-    Frames,
-    RunFrame,
-    Source,
-    frame_prefix,
-    still,
-)
+from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
 from redetect.landmarks.times import read_times
 from redetect.storage.bounded import leads_out, link_out
@@ -59,7 +53,8 @@ class ImageNames:
             names = sorted(
                 entry.name
                 for entry in entries
-                if _suffix(entry.name) in IMAGE_SUFFIXES
+                # A Path for each name is slow.
+                if os.path.splitext(entry.name)[1].lower() in IMAGE_SUFFIXES  # noqa: PTH122
                 and matches(entry.name)
                 and (pattern.startswith(".") or not entry.name.startswith("."))
             )
@@ -103,10 +98,6 @@ def images_of_folder(folder: Path) -> ImageNames:
     raise DetectError(
         f"{folder}: no images: expected a run folder, or {kinds} in it or in {folder / 'images'}"
     )
-
-
-def _suffix(name: str) -> str:
-    return os.path.splitext(name)[1].lower()  # noqa: PTH122 - a Path for each name is slow
 
 
 def _natural_order(name: str) -> list[tuple[int, str]]:

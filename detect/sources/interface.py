@@ -178,8 +178,15 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
         raise FrameError(f"{name}: is empty: expected an image")
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
-    demand_bounded(content, name, size)
-    image = decoded_image(content)
+    claimed = claimed_size(content)
+    if claimed is not None and claimed[0] * claimed[1] > MOST_PIXELS:
+        raise FrameError(
+            f"{name}: cannot be decoded: claims {claimed[0]}x{claimed[1]} px: "
+            f"expected at most {MOST_PIXELS} pixels"
+        )
+    if claimed is not None and size is not None and size != claimed:
+        raise wrong_size(name, claimed, size)
+    image = None if claimed is None else decoded_image(content)
     if image is None:
         raise FrameError(f"{name}: cannot be decoded: expected an image")
     return gray_of_pixels(image, name)
@@ -224,21 +231,6 @@ def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None
         return read_bounded(path, _BYTES_BESIDE + _BYTES_PER_PIXEL * pixels)
     except OSError as error:
         raise FrameError(f"{name}: cannot be read: {error.strerror}") from None
-
-
-def demand_bounded(content: bytes, name: object, size: tuple[int, int] | None) -> None:
-    """Refuse an image by its header, with a FrameError: no image, too large, or of another size."""
-    claimed = claimed_size(content)
-    if claimed is None:
-        raise FrameError(f"{name}: cannot be decoded: expected an image")
-    width, height = claimed
-    if width * height > MOST_PIXELS:
-        raise FrameError(
-            f"{name}: cannot be decoded: claims {width}x{height} px: "
-            f"expected at most {MOST_PIXELS} pixels"
-        )
-    if size is not None and size != claimed:
-        raise wrong_size(name, claimed, size)
 
 
 def wrong_size(name: object, found: tuple[int, int], expected: tuple[int, int]) -> FrameError:

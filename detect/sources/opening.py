@@ -9,19 +9,9 @@ from pathlib import Path
 from camera import read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.sources.image_files import (
-    IMAGE_SUFFIXES,
-    WILDCARDS,
-    ImageFiles,
-)
+from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
-from detect.sources.poses import (
-    FirstFrames,
-    FramesAlongPoses,
-    PoseStream,
-    tick_poses,
-    tum_poses,
-)
+from detect.sources.poses import FirstFrames, FramesAlongPoses, PoseStream, tick_poses, tum_poses
 from detect.sources.video import LiveCamera, VideoFile
 
 #: Endings of bags that are one file.
@@ -90,9 +80,7 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     frames = FirstFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
-    if camera is None:
-        return run
-    return run.calibrated(camera)
+    return run if camera is None else run.calibrated(camera)
 
 
 def _own_odometry(folder: Path) -> Path | None:

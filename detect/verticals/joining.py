@@ -21,17 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import JoiningNumbers
-from detect.verticals.judgement import (
-    ACCEPTED,
-    BESIDE_A_STRONGER_EDGE,
-    JOINED,
-    SAME_EDGE,
-    Judgement,
-)
+from detect.verticals.judgement import Fate, Judgement, accepted_tracks
 from detect.verticals.refinement import LineFits
-from detect.verticals.response import FloatArray, Strip
+from detect.verticals.response import Strip
 from detect.verticals.tilt import level_matrix, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
 
@@ -43,8 +38,8 @@ class Lines(NamedTuple):
     alpha_rad: FloatArray
     beta_rad: FloatArray
     sigma_rad: FloatArray  # (N,) standard deviations of the bearings
-    members: NDArray[np.int64]  # (M,) tracks, line by line; the strongest of each line first
-    bounds: NDArray[np.int64]  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
+    members: IntArray  # (M,) tracks, line by line; the strongest of each line first
+    bounds: IntArray  # (N + 1,) line n's members are ``bounds[n] : bounds[n + 1]``
 
 
 def lines_of_tracks(
@@ -62,22 +57,13 @@ def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
     fate: NDArray[np.int8], tilt: tuple[float, float], numbers: JoiningNumbers,
 ) -> Lines:  # fmt: skip
-    count = 0
-    strength, chosen = np.empty(len(fate)), np.empty(len(fate), np.int64)
-    for t in range(len(fate)):
-        if fate[t] == ACCEPTED:
-            strength[count], chosen[count] = evidence[t], t
-            count += 1
-    tried = chosen[strongest_first(strength[:count])]
-    alpha, noise = _bearings(fits, tried, tilt, numbers)
-    _leave_out(tried, alpha, tracks.polarity, fits, evidence, numbers, fate)
-    bearing, reach, count = np.empty(len(tried)), np.empty(len(tried)), 0
-    for t in tried:
-        if fate[t] == ACCEPTED:
-            bearing[count], reach[count] = alpha[t], numbers.join_px * fits.pixel_rad[t]
-            chosen[count] = t
-            count += 1
-    group = chain_neighbours(bearing[:count], reach[:count])
+    chosen = accepted_tracks(fate)
+    chosen = chosen[strongest_first(evidence[chosen])]
+    alpha, noise = _bearings(fits, chosen, tilt, numbers)
+    _leave_out(chosen, alpha, tracks.polarity, fits, evidence, numbers, fate)
+    chosen = chosen[accepted_tracks(fate[chosen])]
+    count = len(chosen)
+    group = chain_neighbours(alpha[chosen], numbers.join_px * fits.pixel_rad[chosen])
     # The strongest of each line stays its first.
     bounds = np.zeros(count + 1, np.int64)
     members, lines, n = np.empty(count, np.int64), 0, 0
@@ -85,13 +71,13 @@ def _join(
         for k in range(count):
             if group[k] == lines:
                 members[n] = chosen[k]
-                fate[members[n]] = JOINED
+                fate[members[n]] = Fate.JOINED
                 n += 1
-        fate[members[bounds[lines]]] = ACCEPTED
+        fate[members[bounds[lines]]] = Fate.ACCEPTED
         lines += 1
         bounds[lines] = n
     bounds = bounds[: lines + 1]
-    deviation, weight = np.empty(count), np.ones(count)
+    bearing, deviation, weight = np.empty(count), np.empty(count), np.ones(count)
     for n in range(count):
         t = members[n]
         bearing[n] = alpha[t]
@@ -105,7 +91,9 @@ def _join(
         after = bounds[n + 1] if numbers.joined_equally else first + 1
         for k in range(first, after):
             t, share = members[k], 1.0 / (after - first)
-            beta[n] += share * _inclination(fits.line[t])
+            # The inclination of the plane's normal.
+            a, b = fits.line[t, 0], fits.line[t, 1]
+            beta[n] -= share * math.asin(b / math.sqrt(1.0 + a * a + b * b))
             for end in range(2):
                 right, down = _end_of_line(strip, tracks, fits, t, end)
                 ends[n, 2 * end] += share * right
@@ -120,7 +108,7 @@ def _wrapped(angle: float) -> float:
 
 @kernel()
 def _bearings(
-    fits: LineFits, tracks: NDArray[np.int64], tilt: tuple[float, float], numbers: JoiningNumbers
+    fits: LineFits, tracks: IntArray, tilt: tuple[float, float], numbers: JoiningNumbers
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
@@ -147,7 +135,7 @@ def _bearings(
 
 @kernel()
 def _leave_out(
-    tracks: NDArray[np.int64], alpha: FloatArray, polarity: FloatArray, fits: LineFits,
+    tracks: IntArray, alpha: FloatArray, polarity: FloatArray, fits: LineFits,
     evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
@@ -155,20 +143,20 @@ def _leave_out(
     for k in range(len(tracks)):
         t = tracks[k]
         for s in tracks[:k]:
-            if fate[s] != ACCEPTED:
+            if fate[s] != Fate.ACCEPTED:
                 continue
             near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
             if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
-                fate[t] = SAME_EDGE
+                fate[t] = Fate.SAME_EDGE
                 break
             faint = evidence[t] < numbers.join_share * evidence[s]
             fainter = contrast[t] < numbers.shoulder_share * contrast[s]
             if (near_px < numbers.join_px and faint) or (near_px < numbers.shoulder_px and fainter):
-                fate[t] = BESIDE_A_STRONGER_EDGE
+                fate[t] = Fate.BESIDE_A_STRONGER_EDGE
 
 
 @kernel()
-def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
+def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> IntArray:
     """(N,) groups of bearings (N,), counted from 0 at the largest one (leftmost in the image).
 
     Two neighbours belong together if they are closer than the smaller of their distances (N,).
@@ -183,7 +171,7 @@ def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> NDArray[np.int6
 
 @kernel()
 def join_mixtures(
-    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: NDArray[np.int64]
+    alpha: FloatArray, sigma: FloatArray, weight: FloatArray, bounds: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """(N,) means and standard deviations of mixtures of Gaussians of bearings (rad).
 
@@ -203,13 +191,6 @@ def join_mixtures(
             square += weight[k] * (sigma[k] * sigma[k] + own * own)
         mean[n], deviation[n] = _wrapped(alpha[begin] + off), math.sqrt(square / total)
     return mean, deviation
-
-
-@kernel()
-def _inclination(line: FloatArray) -> float:
-    """Inclination of the normal of a line's plane (rad)."""
-    a, b = line
-    return -math.asin(b / math.sqrt(1.0 + a * a + b * b))
 
 
 @kernel()

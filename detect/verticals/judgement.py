@@ -10,6 +10,7 @@ number of standard deviations of its noise, and of some pixels over its length
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -17,50 +18,43 @@ from numpy.typing import NDArray
 
 from detect.line_settings import JudgementNumbers, LineNumbers
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines
-from detect.verticals.response import FloatArray, Strip
-from detect.verticals.tilt import (
-    TiltEstimate,
-    Verticals,
-    agree_on_tilt,
-    gather,
-    strongest_first,
-)
+from detect.verticals.response import Strip
+from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, gather, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Fates of tracks: a line of its own, joined to another one, or the reason for its rejection.
-FATES = (
-    "accepted",
-    "joined",
-    "short",
-    "no maximum",
-    "little evidence",
-    "off the track",
-    "not straight",
-    "off the horizon",
-    "uncertain",
-    "soft",
-    "not vertical",
-    "same edge",
-    "beside a stronger edge",
-)
-(
-    ACCEPTED,
-    JOINED,
-    SHORT,
-    NO_MAXIMUM,
-    LITTLE_EVIDENCE,
-    OFF_THE_TRACK,
-    NOT_STRAIGHT,
-    OFF_THE_HORIZON,
-    UNCERTAIN,
-    SOFT,
-    NOT_VERTICAL,
-    SAME_EDGE,
-    BESIDE_A_STRONGER_EDGE,
-) = range(len(FATES))
 
-#: Tracks with at least this part of the least evidence might have more if followed otherwise.
+class Fate(IntEnum):
+    """What became of a track: a line of its own, joined to another one, or why it was rejected."""
+
+    ACCEPTED = 0
+    JOINED = 1
+    SHORT = 2
+    NO_MAXIMUM = 3
+    LITTLE_EVIDENCE = 4
+    OFF_THE_TRACK = 5
+    NOT_STRAIGHT = 6
+    OFF_THE_HORIZON = 7
+    UNCERTAIN = 8
+    SOFT = 9
+    NOT_VERTICAL = 10
+    SAME_EDGE = 11
+    BESIDE_A_STRONGER_EDGE = 12
+
+
+#: The same in words.
+FATES = tuple(fate.name.lower().replace("_", " ") for fate in Fate)
+
+#: Tracks of these fates might be lines if followed otherwise,
+_DOUBTFUL = (
+    Fate.NO_MAXIMUM,
+    Fate.OFF_THE_TRACK,
+    Fate.NOT_STRAIGHT,
+    Fate.UNCERTAIN,
+    Fate.SOFT,
+)
+#: and those with at least this part of the least evidence might have more if followed otherwise.
 _NEARLY = 0.7
 
 
@@ -74,15 +68,15 @@ class Judgement(NamedTuple):
     #: (T,) places in `FATES`; lines that disagree with the tilt are "not vertical"
     fate: NDArray[np.int8]
     #: (T,) tracks that are no lines, but may have gone on beyond the edge's end or lost it early
-    doubtful: NDArray[np.bool_]
+    doubtful: BoolArray
     #: That most lines agree with; None where too few do. Its covariance is that of least squares.
     tilt: TiltEstimate | None
     verticals: Verticals  # what the lines that may be verticals by themselves say about the tilt
-    edge: NDArray[np.int64]  # (N,) the first of these that is of the same edge, for each
+    edge: IntArray  # (N,) the first of these that is of the same edge, for each
 
 
 def fit_and_judge(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
     numbers: LineNumbers, before: Judgement | None = None,
 ) -> Judgement:  # fmt: skip
     """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
@@ -100,7 +94,7 @@ def fit_and_judge(
         fits = LineFits(*(np.concatenate([old[kept], own]) for old, own in zip(before.fits, new)))
     evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
-    fate[accepted[~agrees]] = NOT_VERTICAL
+    fate[accepted[~agrees]] = Fate.NOT_VERTICAL
     return Judgement(
         fits, evidence, fate, doubtful, tilt if tilt.lines > 0 else None, lines, edge
     )  # fmt: skip
@@ -113,19 +107,17 @@ def fit_and_judge(
 def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
 ) -> tuple[
-    FloatArray, NDArray[np.int8], NDArray[np.bool_], NDArray[np.int64], Verticals, NDArray[np.int64]
+    FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray
 ]:  # fmt: skip
     """Evidence and fates of tracks by themselves, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
     evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
-    _reject_soft(fits, evidence, _accepted(fate), numbers, fate)
+    _reject_soft(fits, evidence, accepted_tracks(fate), numbers, fate)
     for t in range(count):
-        if fate[t] == LITTLE_EVIDENCE:
-            doubtful[t] = evidence[t] >= _NEARLY * numbers.least_evidence
-        else:
-            doubtful[t] = fate[t] in (NO_MAXIMUM, OFF_THE_TRACK, NOT_STRAIGHT, UNCERTAIN, SOFT)
-    accepted = _accepted(fate)
+        nearly = evidence[t] >= _NEARLY * numbers.least_evidence
+        doubtful[t] = fate[t] in _DOUBTFUL or (fate[t] == Fate.LITTLE_EVIDENCE and nearly)
+    accepted = accepted_tracks(fate)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
     own_evidence, polarity = np.empty(count), np.empty(count)
@@ -158,28 +150,29 @@ def _judge_each(
         gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
         noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
         if end - begin < numbers.least_points:
-            fate[t] = SHORT
+            fate[t] = Fate.SHORT
         elif not evidence[t] >= numbers.least_evidence:
-            fate[t] = LITTLE_EVIDENCE
+            fate[t] = Fate.LITTLE_EVIDENCE
         elif not math.isfinite(fits.line[t, 0]):
-            fate[t] = NO_MAXIMUM
+            fate[t] = Fate.NO_MAXIMUM
         elif not fits.shift_px[t] <= numbers.largest_shift_px:
-            fate[t] = OFF_THE_TRACK
+            fate[t] = Fate.OFF_THE_TRACK
         elif not fits.scatter_px[t] <= numbers.largest_scatter_px:
-            fate[t] = NOT_STRAIGHT
+            fate[t] = Fate.NOT_STRAIGHT
         elif not gap <= numbers.largest_horizon_gap_px:
-            fate[t] = OFF_THE_HORIZON
+            fate[t] = Fate.OFF_THE_HORIZON
         elif not noise_px <= numbers.largest_noise_px:
-            fate[t] = UNCERTAIN
+            fate[t] = Fate.UNCERTAIN
         else:
-            fate[t] = ACCEPTED
+            fate[t] = Fate.ACCEPTED
 
 
 @kernel()
-def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
+def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
+    """(N,) the tracks that are accepted so far."""
     accepted, count = np.empty(len(fate), np.int64), 0
     for t in range(len(fate)):
-        if fate[t] == ACCEPTED:
+        if fate[t] == Fate.ACCEPTED:
             accepted[count] = t
             count += 1
     return accepted[:count]
@@ -187,7 +180,7 @@ def _accepted(fate: NDArray[np.int8]) -> NDArray[np.int64]:
 
 @kernel()
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: NDArray[np.int64], numbers: JudgementNumbers,
+    fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: JudgementNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint among the accepted ones."""
@@ -199,11 +192,11 @@ def _reject_soft(
     for t in accepted:
         soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
         if soft and evidence[t] < numbers.soft_evidence:
-            fate[t] = SOFT
+            fate[t] = Fate.SOFT
 
 
 @kernel()
-def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> float:
+def _quantile(values: FloatArray, chosen: IntArray, share: float) -> float:
     """Quantile of some values, interpolated linearly."""
     own = np.empty(len(chosen))
     for k in range(len(chosen)):
@@ -217,7 +210,7 @@ def _quantile(values: FloatArray, chosen: NDArray[np.int64], share: float) -> fl
 
 @kernel()
 def _weigh(
-    fits: LineFits, accepted: NDArray[np.int64], votes: FloatArray, numbers: JudgementNumbers
+    fits: LineFits, accepted: IntArray, votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with some votes each."""
     count = len(accepted)
@@ -247,7 +240,7 @@ def _weigh(
 
 
 @kernel()
-def share_edges(lines: Verticals, edge: NDArray[np.int64]) -> None:
+def share_edges(lines: Verticals, edge: IntArray) -> None:
     """Let the lines of one edge say together as much about the tilt as one."""
     members = np.zeros(len(edge), np.int64)
     for k in range(len(edge)):

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.response import MIDDLE_GREY, FloatArray, SingleArray, Strip
+from detect.verticals.response import MIDDLE_GREY, Strip
 from detect.verticals.tracking import LineTracks
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
@@ -55,16 +56,16 @@ class StepFilters(NamedTuple):
     """The K steps of the refinement, and tables of their filters."""
 
     #: (K,) the filter at a place in pixels i to i + 1 covers 2 half pixels, from i - half + 1
-    half: NDArray[np.int64]
+    half: IntArray
     #: (K, 2, SUBPIXELS, N) of the first and the second derivative of the step's height, times
     #: sigma^2, at places in the pixel; of N those of the 2 half pixels come first
-    weights: SingleArray
+    weights: Float32Array
     #: (2, SUBPIXELS, M) of the height itself, at the fine and the coarse scale that are compared
-    heights: SingleArray
+    heights: Float32Array
     #: (K,) largest displacement of the middle of a line by a step, pixels; a larger step is not
     #: made, nor any after it. Without steps the lines stay as tracked.
     farthest: FloatArray
-    same: NDArray[np.bool_]  # (K,) whether a step has the filter of the one before it
+    same: BoolArray  # (K,) whether a step has the filter of the one before it
 
 
 def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilters:
@@ -191,7 +192,7 @@ def _fit_points(
 
 @kernel()
 def fit_lines(
-    image: NDArray[np.uint8], strip: Strip, tracks: LineTracks, filters: StepFilters,
+    image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
     least: tuple[int, float], first: int,
 ) -> LineFits:  # fmt: skip
     """Fit lines to tracks from the `first` on, and refine them on the grey values in some steps.
@@ -295,7 +296,7 @@ def _cross_rows(
 
 @kernel(inline="always")
 def _climb(
-    image: NDArray[np.uint8], crossings: Crossings, filters: StepFilters, sign: float,
+    image: GreyImage, crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,
 ) -> NewtonStep:  # fmt: skip
     """All steps of a line together, as far as they lead, and its covariance after the last.
@@ -329,7 +330,7 @@ def _climb(
 
 @kernel(fastmath={"contract", "reassoc"}, forceinline=True)
 def newton_step(
-    image: NDArray[np.uint8], crossings: Crossings, weights: SingleArray, half: int, sign: float
+    image: GreyImage, crossings: Crossings, weights: Float32Array, half: int, sign: float
 ) -> NewtonStep:
     """The step to where a line's rows have the largest response together.
 
@@ -373,7 +374,7 @@ def newton_step(
 
 @kernel(forceinline=True)
 def _contrasts(
-    image: NDArray[np.uint8], crossings: Crossings, heights: SingleArray
+    image: GreyImage, crossings: Crossings, heights: Float32Array
 ) -> tuple[int, float, float]:
     """How many rows are seen, and the sums of their heights at two scales."""
     row, column, half = crossings.row, crossings.column, heights.shape[2] // 2
@@ -390,7 +391,7 @@ def _contrasts(
 # Sums in any order become vectors; inlined, their order is that of the kernel that has them.
 @kernel(fastmath={"contract", "reassoc"}, forceinline=True)
 def _see(
-    image: NDArray[np.uint8], v: int, u: float, weights: SingleArray, half: int
+    image: GreyImage, v: int, u: float, weights: Float32Array, half: int
 ) -> tuple[bool, float, float, float]:
     """What two filters see at a place; its distance from where they are tabulated for.
 

@@ -20,14 +20,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
 from lut.verticals import VerticalTable
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
-SingleArray = NDArray[np.float32]
 
 #: Grey values about 0 keep small variances exact in single precision.
 MIDDLE_GREY = np.float32(128.0)
@@ -44,9 +41,9 @@ class LineFilter(NamedTuple):
 
     reach: int  # r: the window across the line covers r pixels on either side
     #: (2, T) across the line: 2r + 1 weights of sum 1, and the same times h; behind them zeros
-    across: SingleArray
+    across: Float32Array
     half_length: int  # s: the window along the line covers s rows on either side
-    along: SingleArray  # (L,) along the line: 2s + 1 weights of sum 1, and behind them zeros
+    along: Float32Array  # (L,) along the line: 2s + 1 weights of sum 1, and behind them zeros
     regulariser: np.float32  # added to the variance in the window (grey values squared)
 
 
@@ -55,8 +52,8 @@ class Strip(NamedTuple):
 
     #: (W, H) column at which each vertical crosses each row, and the tangent of the elevation
     #: there; NaN where it is not seen
-    column: SingleArray
-    rise: SingleArray
+    column: Float32Array
+    rise: Float32Array
     #: (W,) of their bearings
     sine: FloatArray
     cosine: FloatArray
@@ -76,11 +73,11 @@ class Stripe(NamedTuple):
     #: one on; NaN where it is not seen
     path: FloatArray
     #: (2, (B + L) C) grey values about the middle one and their squares, row by row
-    samples: SingleArray
-    means: SingleArray  # (2, B C + T) averages of these along the path
-    moments: SingleArray  # (3, B C) mean, covariance and mean square in windows across it
+    samples: Float32Array
+    means: Float32Array  # (2, B C + T) averages of these along the path
+    moments: Float32Array  # (3, B C) mean, covariance and mean square in windows across it
     #: (B, C) from the left, those r pixels inside the stripe; the last 2r columns mean nothing
-    response: SingleArray
+    response: Float32Array
     middle: int  # the column of the response that is on the path
 
 
@@ -106,7 +103,7 @@ def line_filter(settings: LineSettings) -> LineFilter:
     )
 
 
-def padded(weights: FloatArray) -> SingleArray:
+def padded(weights: FloatArray) -> Float32Array:
     """With zeros behind them (last axis) up to a number that is summed together."""
     behind = [(0, 0)] * (weights.ndim - 1) + [(0, -weights.shape[-1] % _TOGETHER)]
     return np.pad(weights, behind).astype(np.float32)
@@ -129,9 +126,7 @@ def strip_of(table: VerticalTable) -> Strip:
     )
 
 
-def line_response(
-    image: NDArray[np.uint8], table: VerticalTable, settings: LineSettings
-) -> SingleArray:
+def line_response(image: GreyImage, table: VerticalTable, settings: LineSettings) -> Float32Array:
     """(H, W) responses in an image (H, W) along the verticals of its camera's table.
 
     At (v, c) that of row v of the vertical that crosses the horizon at column c: in [-1, 1],
@@ -142,9 +137,7 @@ def line_response(
 
 
 @kernel()
-def _respond_everywhere(
-    image: NDArray[np.uint8], column: SingleArray, window: LineFilter
-) -> SingleArray:
+def _respond_everywhere(image: GreyImage, column: Float32Array, window: LineFilter) -> Float32Array:
     width, height = column.shape
     stripe = empty_stripe(window)
     response = np.zeros((width, height), np.float32)
@@ -178,7 +171,7 @@ def empty_stripe(window: LineFilter) -> Stripe:
 
 
 @kernel(forceinline=True)
-def respond(image: NDArray[np.uint8], top: int, stripe: Stripe) -> None:
+def respond(image: GreyImage, top: int, stripe: Stripe) -> None:
     """Evaluate the response in a stripe along its path, from row `top` of the image on."""
     path, response, window = stripe.path, stripe.response, stripe.window
     reach = window.reach
@@ -198,7 +191,7 @@ def respond(image: NDArray[np.uint8], top: int, stripe: Stripe) -> None:
 
 
 @kernel(forceinline=True)
-def _leave_out(path: FloatArray, left: int, last: int, response: SingleArray) -> None:
+def _leave_out(path: FloatArray, left: int, last: int, response: Float32Array) -> None:
     """No response where a path is not seen or windows leave the image."""
     columns = response.shape[1]
     for b in range(STRIPE_ROWS):
@@ -211,7 +204,7 @@ def _leave_out(path: FloatArray, left: int, last: int, response: SingleArray) ->
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def _sample(
-    image: NDArray[np.uint8], first_row: int, left: int, path: FloatArray, samples: SingleArray
+    image: GreyImage, first_row: int, left: int, path: FloatArray, samples: Float32Array
 ) -> bool:
     """Grey values and their squares along a path; whether all are inside the image."""
     grey, square = samples[0], samples[1]
@@ -246,7 +239,7 @@ def _sample(
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def correlate(values: SingleArray, weights: SingleArray, stride: int, sums: SingleArray) -> None:
+def correlate(values: Float32Array, weights: Float32Array, stride: int, sums: Float32Array) -> None:
     """Weighted sums of values a stride apart; several at a time, for which one pass suffices."""
     for c in range(len(sums)):
         sums[c] = 0.0
@@ -260,7 +253,7 @@ def correlate(values: SingleArray, weights: SingleArray, stride: int, sums: Sing
 
 
 @kernel(forceinline=True)
-def _normalise(path: FloatArray, along: SingleArray, moments: SingleArray) -> None:
+def _normalise(path: FloatArray, along: Float32Array, moments: Float32Array) -> None:
     """Divide moments by the weights of the rows on which the path is seen."""
     columns = moments.shape[1] // STRIPE_ROWS
     for b in range(STRIPE_ROWS):
@@ -274,7 +267,7 @@ def _normalise(path: FloatArray, along: SingleArray, moments: SingleArray) -> No
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def divide(moments: SingleArray, regulariser: np.float32, response: SingleArray) -> None:
+def divide(moments: Float32Array, regulariser: np.float32, response: Float32Array) -> None:
     """The response by mean, covariance and mean square."""
     mean, cov, mean_square = moments[0], moments[1], moments[2]
     for c in range(len(response)):

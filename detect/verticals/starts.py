@@ -18,17 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import LineSettings
-from detect.verticals.response import (
-    MIDDLE_GREY,
-    FloatArray,
-    SingleArray,
-    correlate,
-    divide,
-    padded,
-    weights_across,
-)
+from detect.verticals.response import MIDDLE_GREY, correlate, divide, padded, weights_across
 from detect.verticals.tilt import strongest_first
 from lut.verticals import VerticalTable
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Starts must be on chains if each line crosses at least this many rows of the band.
@@ -52,15 +45,15 @@ class StartBand(NamedTuple):
     pixel: NDArray[np.int32]
     #: (R, W) weights of this pixel and of the one on its right: of linear interpolation, and 0
     #: beyond the ends of the vertical
-    left: SingleArray
-    right: SingleArray
+    left: Float32Array
+    right: Float32Array
     #: (K, W) one over the sum of the weights that are on the vertical; 0 where there are none
-    scale: SingleArray
+    scale: Float32Array
     #: (K, 2, T) the filter's weights across the vertical, for the strip's columns, which are a
     #: pixel apart on the horizon only
-    across: SingleArray
+    across: Float32Array
     #: (L,) those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
-    along: SingleArray
+    along: Float32Array
     reach: int  # r, pixels
     spacing: int
     #: Whether each line crosses several of these rows, so that starts must be on chains
@@ -71,12 +64,12 @@ class LineStarts(NamedTuple):
     """Chains of maxima of the response, from which tracks start."""
 
     #: (N,) the uppermost maximum of each chain, the chain of the highest response first
-    first: NDArray[np.int64]
-    row: NDArray[np.int64]  # (M,) image row of each maximum
+    first: IntArray
+    row: IntArray  # (M,) image row of each maximum
     #: (M,) top of the parabola through the maximum and its neighbours, columns of the strip
     column: FloatArray
-    value: SingleArray  # (M,) signed response
-    below: NDArray[np.int64]  # (M,) the next maximum of the chain; -1 for none
+    value: Float32Array  # (M,) signed response
+    below: IntArray  # (M,) the next maximum of the chain; -1 for none
 
 
 def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
@@ -121,13 +114,13 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     )
 
 
-def _typical_spacing(x: FloatArray, seen: NDArray[np.bool_]) -> float:
+def _typical_spacing(x: FloatArray, seen: BoolArray) -> float:
     """Median distance of neighbouring verticals in a row, pixels; 1 where there are none."""
     both = seen[1:] & seen[:-1]
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
 
 
-def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float) -> SingleArray:
+def band_response(image: GreyImage, band: StartBand, regulariser: float) -> Float32Array:
     """(K, W) responses on the rows of the band, 0 where tracks may not start."""
     levels, width = band.row.shape
     response = np.zeros((levels, width), np.float32)
@@ -141,7 +134,7 @@ def band_response(image: NDArray[np.uint8], band: StartBand, regulariser: float)
 
 @kernel()
 def _filter_band(
-    pixels: NDArray[np.uint8], band: StartBand, regulariser: np.float32, response: SingleArray
+    pixels: ByteArray, band: StartBand, regulariser: np.float32, response: Float32Array
 ) -> None:
     levels, width = response.shape
     rows, taps = len(band.pixel), band.across.shape[2]
@@ -166,21 +159,21 @@ def _filter_band(
 
 
 @kernel(forceinline=True)
-def _scale(means: SingleArray, scale: SingleArray) -> None:
+def _scale(means: Float32Array, scale: Float32Array) -> None:
     for c in range(len(scale)):
         means[c] *= scale[c]
 
 
 @kernel(forceinline=True)
-def _leave_out(row: NDArray[np.int32], response: SingleArray) -> None:
+def _leave_out(row: NDArray[np.int32], response: Float32Array) -> None:
     for c in range(len(response)):
         response[c] = response[c] if row[c] >= 0 else np.float32(0.0)
 
 
 @kernel()
 def _interpolate(
-    pixels: NDArray[np.uint8], pixel: NDArray[np.int32], left: SingleArray, right: SingleArray,
-    sides: NDArray[np.uint8], between: SingleArray,
+    pixels: ByteArray, pixel: NDArray[np.int32], left: Float32Array, right: Float32Array,
+    sides: ByteArray, between: Float32Array,
 ) -> None:  # fmt: skip
     width = len(pixel)
     on_left, on_right, grey, square = sides[0], sides[1], between[:width], between[width:]
@@ -196,7 +189,7 @@ def _interpolate(
 
 
 @kernel()
-def line_starts(response: SingleArray, band: StartBand, threshold: float) -> LineStarts:
+def line_starts(response: Float32Array, band: StartBand, threshold: float) -> LineStarts:
     """Chains of maxima of the response (K, W) of at least a threshold on the rows of the band.
 
     Where each line crosses several of these, a chain has at least two maxima.

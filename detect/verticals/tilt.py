@@ -34,12 +34,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.line_settings import TiltNumbers
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: How often the tilt is estimated again from the lines that agree with it.
 REFINEMENTS = 6
@@ -97,7 +95,7 @@ class Verticals(NamedTuple):
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: NDArray[np.int64], numbers: TiltNumbers
+    tilt: TiltEstimate, lines: Verticals, edge: IntArray, numbers: TiltNumbers
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless settings leave that out.
 
@@ -112,7 +110,7 @@ def with_error(
 
 
 @kernel()
-def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
+def strongest_first(strength: FloatArray) -> IntArray:
     """Places of some values, the largest first; of equal ones the first."""
     order = np.empty(len(strength), np.int64)
     for i in range(len(strength)):
@@ -125,7 +123,7 @@ def strongest_first(strength: FloatArray) -> NDArray[np.int64]:
 
 
 @kernel()
-def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, NDArray[np.bool_]]:
+def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, BoolArray]:
     """Estimate the tilt from the largest consistent set of lines.
 
     Its covariance is that of least squares; it is of 0 lines where too few agree. Returns as well
@@ -189,7 +187,7 @@ def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float
 @kernel()
 def _refine_tilt(
     lines: Verticals, pitch: float, roll: float, prior: float, covariance: FloatArray,
-    agrees: NDArray[np.bool_],
+    agrees: BoolArray,
 ) -> tuple[float, float]:  # fmt: skip
     """Least squares of a tilt over the lines that agree with it, repeated."""
     normal, variance, tolerance = lines.normal, lines.variance, lines.tolerance
@@ -247,7 +245,7 @@ def level_matrix(pitch: float, roll: float) -> FloatArray:
 @kernel()
 def gather(
     place: FloatArray, reach: FloatArray, strength: FloatArray, kind: FloatArray
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Groups of lines of one kind near the strongest of those that are in no group yet.
 
     Of (N,) places, how near others belong to each, strengths and kinds, returns (N,) the first line
@@ -268,7 +266,7 @@ def gather(
 
 
 @kernel()
-def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
+def merge_lines(lines: Verticals, group: IntArray) -> FloatArray:
     """(G, 4) mean normals of groups of lines, and the variances of their inclinations.
 
     Lines are weighed by how well they are measured beside the middle scatter; the variances are
@@ -293,7 +291,7 @@ def merge_lines(lines: Verticals, group: NDArray[np.int64]) -> FloatArray:
 
 @kernel()
 def _error_of_tilt(
-    lines: Verticals, edge: NDArray[np.int64], tilt: tuple[float, float], prior: float,
+    lines: Verticals, edge: IntArray, tilt: tuple[float, float], prior: float,
     stray_share: float, grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""

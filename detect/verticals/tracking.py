@@ -27,17 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import TrackingNumbers
-from detect.verticals.response import (
-    STRIPE_ROWS,
-    FloatArray,
-    LineFilter,
-    SingleArray,
-    Strip,
-    Stripe,
-    empty_stripe,
-    respond,
-)
+from detect.verticals.response import STRIPE_ROWS, LineFilter, Strip, Stripe, empty_stripe, respond
 from detect.verticals.starts import LineStarts
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Points that the prior counts for: an edge leans no more than verticals of a tilted camera.
@@ -54,18 +46,18 @@ class LineTracks(NamedTuple):
 
     #: (T,) 1 where the image is brighter on the right of the edge, -1 on the left
     polarity: FloatArray
-    bounds: NDArray[np.int64]  # (T + 1,)
+    bounds: IntArray  # (T + 1,)
     row: NDArray[np.int32]  # (P,) image row of each point
     #: (P,) column in the strip: of the horizon, where the vertical through the point crosses it
     column: FloatArray
-    score: SingleArray  # (P,) absolute response at the point
+    score: Float32Array  # (P,) absolute response at the point
 
 
 class Before(NamedTuple):
     """Tracks that were followed before, and how some of them are followed again."""
 
     tracks: LineTracks
-    again: NDArray[np.bool_]  # (T,) which of them are followed again
+    again: BoolArray  # (T,) which of them are followed again
     #: Pitch and roll (rad) along whose verticals these are followed; NaN: leans are to be found
     tilt: tuple[float, float]
 
@@ -104,7 +96,7 @@ class _Edge(NamedTuple):
 
 @kernel()
 def follow_edges(
-    image: NDArray[np.uint8], strip: Strip, window: LineFilter, starts: LineStarts,
+    image: GreyImage, strip: Strip, window: LineFilter, starts: LineStarts,
     numbers: TrackingNumbers, before: Before,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; a start on an edge already followed is left out.
@@ -189,7 +181,7 @@ def follow_edges(
 
 
 @kernel(inline="always")
-def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
+def _mark(marks: BoolArray, row: int, column: float) -> None:
     """Mark the columns round a point as followed, if its row has starts."""
     if 0 <= row < len(marks):
         j = math.floor(column + 0.5)
@@ -199,7 +191,7 @@ def _mark(marks: NDArray[np.bool_], row: int, column: float) -> None:
 
 @kernel(inline="always")
 def _take_chain(
-    strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: SingleArray
+    strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: Float32Array
 ) -> float:
     """Points on the straight lines between the maxima of a chain; returns the chain's lean."""
     row, place, value, rise = (
@@ -227,8 +219,8 @@ def _take_chain(
 
 @kernel(inline="always")
 def _follow(
-    image: NDArray[np.uint8], strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
-    start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: SingleArray,
+    image: GreyImage, strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
+    start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: Float32Array,
 ) -> tuple[int, _Edge]:  # fmt: skip
     """Follow an edge of some polarity from a row on in a direction; the last row as well."""
     # Numba counts references to arrays in tuples wherever they are taken out of these.
@@ -304,7 +296,7 @@ def _follow(
 
 
 @kernel(inline="always")
-def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
+def _pixels_per_column(at: Float32Array, j: int, v: int) -> float:
     """Distance of verticals in a row, on the side on which there are more of them."""
     if 2 * j < len(at):
         return float(at[j + 1, v] - at[j, v])
@@ -312,13 +304,13 @@ def _pixels_per_column(at: SingleArray, j: int, v: int) -> float:
 
 
 @kernel(inline="always")
-def _place_on(path: _Path, rise: SingleArray, v: int) -> float:
+def _place_on(path: _Path, rise: Float32Array, v: int) -> float:
     """Where a path crosses a row, as a column of the strip."""
     return path.place + path.lean * float(rise[path.column, v] - rise[path.column, path.row])
 
 
 @kernel(inline="always")
 def _three(
-    response: SingleArray, b: int, c: int, sign: np.float32
+    response: Float32Array, b: int, c: int, sign: np.float32
 ) -> tuple[np.float32, np.float32, np.float32]:
     return sign * response[b, c - 1], sign * response[b, c], sign * response[b, c + 1]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.util import find_spec
+from math import inf
 from typing import Annotated, ClassVar, Literal
 
 from redetect.groundtruth.errors import GroundTruthError
@@ -23,7 +24,7 @@ from redetect.storage.bounds import (
 
 Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
 
-_ODDS = Bounds("more than 1", 1.0, above=True, below=True)
+_ODDS = Bounds("more than 1", lambda x: 1.0 < x < inf)
 
 
 class _Bounded:

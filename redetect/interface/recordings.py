@@ -13,11 +13,10 @@ from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
-from detect.options import SourceOptions
+from detect.options import Compare, CompareOptions, SourceOptions
 from detect.seen import Sight
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
-from detect.viewing_options import Compare, CompareOptions
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame
 
 PathLike = str | os.PathLike[str]

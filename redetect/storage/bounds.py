@@ -9,9 +9,10 @@ NaN is always refused; infinity is refused unless it means "no limit".
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
+from math import inf
 from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, Optional, get_type_hints
@@ -21,16 +22,10 @@ from redetect.storage.messages import excerpt
 
 @dataclass(frozen=True)
 class Bounds:
-    """The numbers that a setting may have: an interval, in words and by its ends.
-
-    `above` and `below` exclude the ends; `whole` demands whole numbers.
-    """
+    """The numbers that a setting may have: in words, which of them, and whether whole ones only."""
 
     expected: str
-    least: float = -math.inf
-    most: float = math.inf
-    above: bool = False
-    below: bool = False
+    include: Callable[[float], bool] = field(repr=False)
     whole: bool = False
 
     def hold(self, value: Any) -> bool:
@@ -38,37 +33,36 @@ class Bounds:
         if isinstance(value, bool) or (self.whole and not isinstance(value, Integral)):
             return False
         try:
-            high_enough = value > self.least if self.above else value >= self.least
-            low_enough = value < self.most if self.below else value <= self.most
+            return bool(self.include(value))
         except TypeError:
             return False
-        return bool(high_enough and low_enough)
 
 
 def from_to(least: float, most: float) -> Bounds:
     """Numbers of a closed interval."""
-    return Bounds(f"{least:g} to {most:g}", least, most)
+    return Bounds(f"{least:g} to {most:g}", lambda x: least <= x <= most)
 
 
 def inside(least: float, most: float) -> Bounds:
     """Numbers of an open interval."""
-    return Bounds(f"above {least:g}, below {most:g}", least, most, above=True, below=True)
+    return Bounds(f"above {least:g}, below {most:g}", lambda x: least < x < most)
 
 
 def whole(least: int, most: int | None = None) -> Bounds:
     """Whole numbers, both ends included."""
+    last = inf if most is None else most
     words = f"{least} or more" if most is None else f"{least} to {most}"
-    return Bounds(f"a whole number, {words}", least, math.inf if most is None else most, whole=True)
+    return Bounds(f"a whole number, {words}", lambda x: least <= x <= last, whole=True)
 
 
-FINITE = Bounds("a finite number", above=True, below=True)
-ABOVE_0 = Bounds("above 0", 0.0, above=True, below=True)
-NOT_NEGATIVE = Bounds("0 or more", 0.0, below=True)
+FINITE = Bounds("a finite number", lambda x: -inf < x < inf)
+ABOVE_0 = Bounds("above 0", lambda x: 0.0 < x < inf)
+NOT_NEGATIVE = Bounds("0 or more", lambda x: 0.0 <= x < inf)
 #: Infinity means "no limit".
-LIMIT = Bounds("above 0", 0.0, above=True)
-LIMIT_OR_0 = Bounds("0 or more", 0.0)
+LIMIT = Bounds("above 0", lambda x: x > 0.0)
+LIMIT_OR_0 = Bounds("0 or more", lambda x: x >= 0.0)
 SHARE = from_to(0.0, 1.0)
-SHARE_ABOVE_0 = Bounds("above 0, at most 1", 0.0, 1.0, above=True)
+SHARE_ABOVE_0 = Bounds("above 0, at most 1", lambda x: 0.0 < x <= 1.0)
 PROBABILITY = inside(0.0, 1.0)
 
 #: Types of fields for `demand_fields`.

@@ -13,7 +13,8 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -240,32 +241,25 @@ def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
     return code
 
 
-def _parted(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A type without what it is annotated by, and that."""
-    marks: tuple[Any, ...] = getattr(hint, "__metadata__", ())
-    return (hint.__origin__ if marks else hint), marks
-
-
 def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
     """A dataclass whose fields for experts are no flags; itself if it has none."""
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
     changed: list[tuple[str, Any, Any]] = []
     for each in fields(kind):
-        inner, marks = _parted(hints[each.name])
-        nested, default = is_dataclass(inner), cast(Any, each.default_factory)
+        hint, own = hints[each.name], cast(Any, copy(each))
+        marks = getattr(hint, "__metadata__", ())
+        inner = hint.__origin__ if marks else hint
+        nested = is_dataclass(inner)
         if each.name in hidden:
-            hint: Any = Annotated[hints[each.name], Suppress]
+            hint = Annotated[hint, Suppress]
         elif nested and (short := _without(inner, expert)) is not inner:
-            hint = default = short
+            own.default_factory = hint = short
             for mark in marks:
                 hint = Annotated[hint, mark]
         else:
             continue
-        value: Any = {"default_factory": default}
-        if each.default is not MISSING:
-            value = {"default": each.default}
-        changed.append((each.name, hint, field(**value, kw_only=each.kw_only)))
+        changed.append((each.name, hint, own))
     if not changed:
         return kind
     names = {"__doc__": kind.__doc__, "__module__": kind.__module__}

@@ -16,10 +16,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
+from typing import Any, BinaryIO
 
 #: Number of names that are searched for files of killed processes.
 _NUMBERS = 8
@@ -121,7 +118,7 @@ class _NamedFile(io.FileIO):
         super().__init__(handle, "r+b")
         self._result = result
 
-    def write(self, content: ReadableBuffer, /) -> int:
+    def write(self, content: Any, /) -> int:
         with _naming(self._result):
             return super().write(content)
 

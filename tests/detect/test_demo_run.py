@@ -11,11 +11,11 @@ import pytest
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.line_settings import LineSettings
+from detect.options import CompareOptions
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.sources.opening import open_run
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import read_frames
 
 #: What the shipped rows were detected with, apart from what makes one disc one row.

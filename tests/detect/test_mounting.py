@@ -46,8 +46,7 @@ def test_lean_and_height_come_back(raised_m: float) -> None:
     found = mounting_of_run(HEIGHT_M, *drive(lean, raised_m))
 
     assert found is not None
-    assert abs(found.pitch_rad - lean[0]) < found.pitch_sigma_rad
-    assert abs(found.roll_rad - lean[1]) < found.roll_sigma_rad
+    assert np.all(np.abs(found.tilt_rad - lean) < found.sigma_rad)
     assert abs(found.raised_m - raised_m) < 0.01
     assert 0.01 < found.raised_sigma_m < 0.03
     assert found.frames == found.frames_with_discs == 200
@@ -73,7 +72,7 @@ def test_without_verticals_there_is_no_mounting() -> None:
 def test_the_remounted_camera_sees_level(published_camera: Camera) -> None:
     """What the mounting turns level is where the remounted camera puts it."""
     tilt, raised_m = (-0.045, 0.013), -0.04
-    mounting = Mounting(*tilt, 0.0, 0.0, raised_m, 0.0, 30, 30)
+    mounting = Mounting(np.array(tilt), np.zeros(2), raised_m, 0.0, 30, 30)
     rows_xy = np.array([(0.3, -1.4), (-0.7, -2.2), (0.1, -3.3)])
     pixels = image_positions(published_camera, rows_xy)
 
@@ -87,7 +86,7 @@ def test_the_remounted_camera_states_what_its_mounting_may_be_wrong_by(
 ) -> None:
     """As positions scatter if the mounting does; levelled by verticals only its height counts."""
     tilt, raised_m, sigmas = (-0.045, 0.013), -0.04, (2e-3, 3e-3, 0.012)
-    mounting = Mounting(*tilt, *sigmas[:2], raised_m, sigmas[2], 30, 30)
+    mounting = Mounting(np.array(tilt), np.array(sigmas[:2]), raised_m, sigmas[2], 30, 30)
     pixels = image_positions(published_camera, np.array([(0.3, -1.4), (-0.7, -2.2), (0.1, -3.3)]))
     exact = with_covariance(published_camera, np.zeros((PARAMETERS, PARAMETERS)))
     seen = remounted(exact, mounting)
@@ -97,9 +96,9 @@ def test_the_remounted_camera_states_what_its_mounting_may_be_wrong_by(
     scattered = [
         remounted(
             published_camera,
-            replace(mounting, pitch_rad=p + tilt[0], roll_rad=r + tilt[1], raised_m=z + raised_m),
+            replace(mounting, tilt_rad=mounting.tilt_rad + leans, raised_m=raised_m + higher),
         ).floor_from_pixel(pixels)
-        for p, r, z in draws
+        for *leans, higher in draws
     ]
     off = np.array(scattered) - floor_xy
     stated = common_covariance(seen, floor_xy, 0.0, by_verticals=False)
@@ -107,13 +106,13 @@ def test_the_remounted_camera_states_what_its_mounting_may_be_wrong_by(
     np.testing.assert_allclose(normalised, 1.0, atol=0.1)
 
     levelled = common_covariance(seen, floor_xy, 0.0, by_verticals=True)
-    higher = remounted(published_camera, replace(mounting, raised_m=raised_m + sigmas[2]))
-    off = higher.floor_from_pixel(pixels) - floor_xy
+    raised = remounted(published_camera, replace(mounting, raised_m=raised_m + sigmas[2]))
+    off = raised.floor_from_pixel(pixels) - floor_xy
     np.testing.assert_allclose(levelled, off[:, :, None] * off[:, None, :], rtol=0.1, atol=3e-6)
 
 
 def test_without_a_covariance_the_remounted_camera_states_none(published_camera: Camera) -> None:
-    mounting = Mounting(0.01, 0.0, 2e-3, 2e-3, math.nan, math.nan, 30, 3)
+    mounting = Mounting(np.array([0.01, 0.0]), np.full(2, 2e-3), math.nan, math.nan, 30, 3)
     assert remounted(published_camera, mounting).covariance is None
     # A height that could not be estimated is known as well as before.
     before = 0.01 * np.eye(PARAMETERS)
@@ -129,7 +128,7 @@ def test_the_demos_camera_comes_back(
     """A calibration that is 5 cm too low and leans by 2 degrees is put right."""
     run = project_root / "images" / "e"
     true = read_camera(run / "e.cam")
-    wrong = remounted(true, Mounting(0.035, -0.01, 0.0, 0.0, -0.05, 0.0, 30, 30))
+    wrong = remounted(true, Mounting(np.array([0.035, -0.01]), np.zeros(2), -0.05, 0.0, 30, 30))
     write_camera(wrong, tmp_path / "wrong.cam")
     output = tmp_path / "level.cam"
 

@@ -27,7 +27,7 @@ from redetect.storage.bounds import Bounds
 from redetect.storage.messages import excerpt
 
 _QUATERNION_TOLERANCE = 1e-3
-_WIDTH = Bounds("metres above 0", 0.0, above=True)
+_WIDTH = Bounds("metres above 0", lambda x: x > 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from detect.comparison.compare import compare_frames
 from detect.comparison.report import comparison_of
 from detect.comparison.result import DiscComparison
 from detect.errors import CompareError, DetectError
+from detect.options import Compare, CompareOptions
 from detect.sources.image_files import image_name
-from detect.viewing_options import Compare, CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Step, read_frames, write_frames
 from tests.detect.comparison.formatting import format_text
 
@@ -230,7 +230,7 @@ def test_worst_frames_come_first() -> None:
     ]
     found = compare(reference, detected)
     worst = found.worst_frames(3)
-    assert [score.frame.name for score in worst] == ["worst", "bad", "far"]
+    assert [score.name for score in worst] == ["worst", "bad", "far"]
     assert [len(rows) for rows in (worst[0].matched, worst[0].missed, worst[0].extra)] == [0, 2, 1]
     assert worst[0].largest_error is None
     assert worst[2].largest_error == pytest.approx(0.09)

@@ -17,8 +17,8 @@ from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.levelling import levelled
+from detect.options import CompareOptions
 from detect.seen import Sight, image_positions, level_seen
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from detect.cli import main
 from detect.comparison.compare import compare_line_frames
 from detect.comparison.result import LineComparison
-from detect.viewing_options import CompareOptions
+from detect.options import CompareOptions
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.discs.identity import MappedDisc, ids_of_map, ids_of_rows, matched
+from detect.discs.identity import ids_of_rows, matched
 from redetect.landmarks import CircleLandmark
 
 #: Two standard deviations of which 99.9 % of two-dimensional errors are nearer.
@@ -54,22 +54,22 @@ def test_one_disc_gives_its_id_to_one(seed: int) -> None:
                 assert distance[n, m] >= min(mine, theirs)
 
 
-@pytest.mark.parametrize(("off", "expected"), [(GATE - 0.01, 5), (GATE + 0.01, -1)])
-def test_the_gate_counts_all_that_is_stated(off: float, expected: int) -> None:
+@pytest.mark.parametrize(("off", "expected"), [(GATE - 0.01, (5,)), (GATE + 0.01, ())])
+def test_the_gate_counts_all_that_is_stated(off: float, expected: tuple[int, ...]) -> None:
     """Row, map and slack: 3 and 4 cm, and 12 cm, are 13 cm together."""
-    disc = MappedDisc(5, 0.0, -2.0, 0.04**2, 0.0, 0.04**2)
+    disc = CircleLandmark(0.0, -2.0, 0.0, 0.04**2, 0.0, 0.04**2, (5,))
     floor_xy = np.array([[0.13 * off, -2.0]])
 
-    ids = ids_of_map(floor_xy, np.array([0.03**2 * np.eye(2)]), [disc], 0.12)
+    ids = ids_of_rows(floor_xy, [disc], np.array([0.03**2 * np.eye(2)]), 0.12)
 
-    assert ids.tolist() == [expected]
+    assert ids == [expected]
 
 
 def test_nothing_is_known_of_nothing() -> None:
     one = np.array([[0.0, -2.0]])
     assert ids_of_rows(one, []) == [()]
     assert ids_of_rows(one[:0], [row(0.0, -2.0, 1)]) == []
-    assert ids_of_map(one, np.eye(2)[None], [], 0.1).tolist() == [-1]
+    assert ids_of_rows(one, [], np.eye(2)[None], 0.1) == [()]
 
 
 def test_a_row_of_several_ids_keeps_them() -> None:

@@ -14,12 +14,12 @@ from camera import Camera
 from detect.discs.outline_tilt import (
     DISC_SIGMA_RAD,
     FLOOR_SIGMA_RAD,
-    OutlineTilt,
     fit_outline,
     mean_of_tilts,
     tilt_of_outlines,
 )
 from detect.seen import image_positions, level_matrix, level_seen
+from redetect.landmarks import FrameTilt
 from tests.detect.line_scene import tilted
 from tests.detect.painted_floor import PaintedFloor
 
@@ -29,7 +29,7 @@ DISCS = np.array([(0.4, -1.3), (-0.6, -1.6), (0.1, -2.1), (0.9, -2.6), (-0.8, -2
 
 def seen_from(
     camera: Camera, tilt: tuple[float, float], paint: Callable[[PaintedFloor], None]
-) -> OutlineTilt | None:
+) -> FrameTilt | None:
     """The tilt found in an image that a robot tilted so takes of the discs."""
     # The robot turns about its origin on the floor, and the camera with it.
     turned = tilted(camera, *tilt)
@@ -42,7 +42,7 @@ def seen_from(
     return tilt_of_outlines(floor.image(), camera, rows_xy, 0.10)
 
 
-def off(found: OutlineTilt | None, tilt: tuple[float, float]) -> FloatArray:
+def off(found: FrameTilt | None, tilt: tuple[float, float]) -> FloatArray:
     assert found is not None
     return np.degrees(np.array([found.pitch, found.roll]) - tilt)
 
@@ -52,7 +52,7 @@ def test_tilt_comes_back(published_camera: Camera, tilt: tuple[float, float]) ->
     found = seen_from(published_camera, tilt, lambda floor: None)
 
     assert found is not None
-    assert found.discs == len(DISCS)
+    assert found.lines == len(DISCS)
     assert np.abs(off(found, tilt)).max() < 0.3
 
 

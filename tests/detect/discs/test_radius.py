@@ -60,7 +60,7 @@ def test_auto_stands_for_finding_it(words: list[str]) -> None:
     assert isinstance(flags, Circles | All)
     assert flags.find_radius
     assert flags.jobs == 1
-    assert not parsed([command, "run"]).find_radius  # type: ignore[union-attr]
+    assert not parsed([command, "run"]).find_radius
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from camera import camera_in
 from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
+from detect.options import CompareOptions
 from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
-from detect.viewing_options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
 from tests.detect.test_cli import assert_refused
 
@@ -65,9 +65,9 @@ def test_rates_of_a_case_made_by_hand() -> None:
         ([disc(0.0, -3.0)], [disc(0.0, -3.02, 0.95)]),
         ([], [disc(0.5, -1.5, 0.6)]),
     ]
-    curve = rates_over(compared(discs), [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
-    np.testing.assert_allclose(curve.recall, [2 / 3, 1 / 3, 1 / 3, 1 / 3, 1 / 3, 0.0])
-    np.testing.assert_allclose(curve.precision, [2 / 5, 1 / 4, 1 / 3, 1 / 2, 1.0, np.nan])
+    recall, precision = rates_over(compared(discs), [0.4, 0.55, 0.65, 0.75, 0.9, 0.99])
+    np.testing.assert_allclose(recall, [2 / 3, 1 / 3, 1 / 3, 1 / 3, 1 / 3, 0.0])
+    np.testing.assert_allclose(precision, [2 / 5, 1 / 4, 1 / 3, 1 / 2, 1.0, np.nan])
 
 
 def test_rows_set_aside_are_not_kept() -> None:
@@ -75,14 +75,14 @@ def test_rows_set_aside_are_not_kept() -> None:
     discs: Discs = [([disc(0.0, -1.0)], [disc(0.0, -1.0, 0.5), disc(1.0, -2.0, 0.8)])]
     unlisted = (Frame(Step("e.0", *[0.0] * 9), (disc(1.0, -2.0),)),)
     result = compare_frames(frames(discs, 0), frames(discs, 1), GATE, unlisted=unlisted)
-    curve = rates_over(result, [0.4, 0.7])
-    np.testing.assert_allclose(curve.precision, [1.0, np.nan])
+    _, precision = rates_over(result, [0.4, 0.7])
+    np.testing.assert_allclose(precision, [1.0, np.nan])
 
 
 def test_without_rows_there_are_no_rates() -> None:
-    curve = rates_over(compared([([], [])]), [0.5])
-    assert np.isnan(curve.recall).all()
-    assert np.isnan(curve.precision).all()
+    recall, precision = rates_over(compared([([], [])]), [0.5])
+    assert np.isnan(recall).all()
+    assert np.isnan(precision).all()
 
 
 # -- residuals --------------------------------------------------------------------------------

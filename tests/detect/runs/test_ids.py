@@ -97,8 +97,8 @@ def test_a_maps_discs_are_seen_from_the_frames_pose(tmp_path: Path) -> None:
     seen = MapByImage(tmp_path / "map.csv", tmp_path / "path.csv")
 
     (disc,) = seen.get("k.0007.png") or ()  # the other is too far away
-    assert disc.id == 4
-    assert (disc.x, disc.y) == pytest.approx((2.0, 0.0))
+    assert disc.ids == (4,)
+    assert (disc.px, disc.py) == pytest.approx((2.0, 0.0))
     assert (disc.cxx, disc.cxy, disc.cyy) == pytest.approx((1e-4, 0.0, 4e-4))
     assert seen.get("k.0008") is None
 

@@ -12,10 +12,10 @@ import pytest
 from camera import write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
+from detect.lines import carry_ids
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.sources.opening import open_run
-from detect.verticals.detections import carry_ids
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.demo_frames import demo_frames
 from tests.detect.line_scene import pinhole

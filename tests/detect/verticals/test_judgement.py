@@ -5,20 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detect.verticals import judgement
-from detect.verticals.judgement import FATES
+from detect.verticals.judgement import FATES, Fate
 from detect.verticals.refinement import SUBPIXELS, gaussian_steps
 
 
-def test_numbers_of_fates_are_places_of_their_names() -> None:
-    numbers = {
-        name: value
-        for name, value in vars(judgement).items()
-        if name.isupper() and name[0] != "_" and isinstance(value, int)
-    }
-    assert sorted(numbers.values()) == list(range(len(FATES)))
-    for name, number in numbers.items():
-        assert FATES[number] == name.lower().replace("_", " ")
+def test_fates_are_called_what_they_are_in_words() -> None:
+    assert len(FATES) == len(Fate)
+    assert FATES[Fate.ACCEPTED] == "accepted"
+    assert FATES[Fate.BESIDE_A_STRONGER_EDGE] == "beside a stronger edge"
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8, 3.0])

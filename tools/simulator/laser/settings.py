@@ -112,7 +112,7 @@ class LaserSettings:
             ptpd_hz=ABOVE_0, empty_s=ABOVE_0, stand_s=ABOVE_0, references=NOT_NEGATIVE,
             passers=NOT_NEGATIVE, between_s=NOT_NEGATIVE, drawing_sigma_m=NOT_NEGATIVE,
             mount_sigma_m=NOT_NEGATIVE, mount_sigma_deg=NOT_NEGATIVE,
-            max_range_m=Bounds("above 0, at most 65", 0.0, 65.0, above=True),
+            max_range_m=Bounds("above 0, at most 65", lambda x: 0.0 < x <= 65.0),
         )  # fmt: skip
         # A clock that is set back gives two readings the same stamp.
         demand(self.faults, GroundTruthError, clock_jump_s=NOT_NEGATIVE)
