@@ -13,7 +13,7 @@ from pathlib import Path
 from detect.drawing.inputs import KINDS, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
-from detect.runs.outputs import frames_tilt_place
+from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run, make_folder
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
@@ -198,6 +198,8 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     for kind, what in (("circles", "discs"), ("markers", "markers")):
         if kind in places:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
+    if summary.lean is not None:
+        print(lean_sentence(summary.lean))
     camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:
         print(

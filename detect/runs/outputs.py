@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 from camera import Camera
 from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
-from detect.runs.plan import FramePlan, Job, RunSummary
+from detect.runs.plan import FramePlan, Job, Lean, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
 from redetect.landmarks import format_head
@@ -118,9 +119,19 @@ def _circles_text(job: Job) -> list[str]:
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([level] if levelled else []),
+        *([f"  {lean_sentence(plan.lean)}"] if plan.lean else []),
         *_calibration_text(plan.camera, plan.circles),
         *_made_with(plan, plan.circles),
     ]
+
+
+def lean_sentence(lean: Lean) -> str:
+    """With which lean of the camera discs were searched."""
+    pitch, roll = map(math.degrees, lean)
+    return (
+        f"discs are searched as the camera leans from its calibration: pitch {pitch:.1f}, "
+        f"roll {roll:.1f} degrees"
+    )
 
 
 def _calibration_text(camera: Camera | None, circles: CircleSettings) -> list[str]:
@@ -200,6 +211,7 @@ def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, obje
         "settings": {
             kind: dataclasses.asdict(values) for kind, values in settings.items() if values
         },
+        **({"lean_rad": plan.lean} if plan.lean else {}),
         "failures": failures,
         "frames": summary.frames,
         "failed": summary.failed,

@@ -219,6 +219,7 @@ class RunSummary:
     failed: int = 0
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0  # the odometry does not have them
+    lean: Lean | None = None  # of the camera, with which discs were searched
     tilt: RunTilt | None = None  # that discs were levelled by, if by the run's
 
     def add(self, rows: FrameRows) -> None:

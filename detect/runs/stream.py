@@ -186,11 +186,11 @@ def detect_run(
         If there can be no table for the camera, an output exists and must not be replaced, or there
         are no workers.
     """
-    plan = replace(job.plan, json="json" in job.places)
-    plan = replace(plan, lean=_lean_of(job.run, plan))
-    job = replace(job, plan=plan)
     workers = workers or local_workers(1, large=job.run.frames.ships_images)
-    summary = RunSummary()
+    plan = replace(job.plan, json="json" in job.places)
+    plan = replace(plan, lean=_lean_of(job.run, plan, workers))
+    job = replace(job, plan=plan)
+    summary = RunSummary(lean=plan.lean)
 
     def count(rows: FrameRows) -> None:
         summary.add(rows)
@@ -216,7 +216,7 @@ def detect_run(
     return summary
 
 
-def _lean_of(run: ImageRun, plan: FramePlan) -> Lean | None:
+def _lean_of(run: ImageRun, plan: FramePlan, workers: Workers) -> Lean | None:
     """How the camera leans where discs are searched, by some frames of a run."""
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
@@ -229,8 +229,7 @@ def _lean_of(run: ImageRun, plan: FramePlan) -> Lean | None:
     with closing(iter(run.frames)) as frames:
         tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
     seen = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
-    here = local_workers(1, large=run.frames.ships_images, shared=True)
-    with closing(detect_chunks(tasks, seen, here)) as chunks:
+    with closing(detect_chunks(tasks, seen, workers)) as chunks:
         return lean_of_run(camera, [rows for chunk in chunks for _, rows in chunk])
 
 

@@ -180,9 +180,7 @@ def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[Floa
 def render_scene(
     stage: Stage, kind: str, share: float, rng: np.random.Generator
 ) -> tuple[ByteArray, list[FloatArray]]:
-    """An image of a floor with discs of one family of disturbances, or look-alikes.
-    Returns `image` (H, W).
-    """
+    """(H, W) image of a floor with discs of one family of disturbances, or look-alikes."""
     grey = stage.floors[str(rng.choice(FLOORS))].copy()
     places = _places(stage, share if kind == BORDER else 0.0, rng)
     for place in places:
