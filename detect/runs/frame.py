@@ -8,6 +8,7 @@ compiler, and starts without them.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -142,11 +143,11 @@ def _path(
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
                 settings = _of_known_tilt(settings)
-            lean = plan.lean or (lean_of_frame(by_frame) if by_frame and settings.refine else None)
-            search = search_of(camera, plan.circles, lean)
-            seen = detect_circles(image, search.camera, search.table, settings)
-            if lean is not None:
-                seen = as_calibrated(seen, search.camera, camera)
+            seen = _discs(image, camera, settings, plan.lean)
+            if plan.lean is None and by_frame is not None and settings.refine:
+                lean = lean_of_frame(by_frame)
+                leaning = seen if lean is None else _discs(image, camera, settings, lean)
+                seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
             found.seen = found.discs = seen
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
@@ -167,6 +168,15 @@ def _path(
             found.markers = detect_markers(image, plan.markers, camera)
     except COSTS_THE_FRAME as error:
         found.error = reason_of(error, task)
+
+
+def _discs(
+    image: GreyImage, camera: Camera, settings: CircleSettings, lean: Lean | None
+) -> CircleDetections:
+    """The discs as the calibrated camera sees them, searched as it leans."""
+    search = search_of(camera, settings, lean)
+    found = detect_circles(image, search.camera, search.table, settings)
+    return found if lean is None else as_calibrated(found, search.camera, camera)
 
 
 @lru_cache(maxsize=4)
@@ -197,8 +207,9 @@ _Tilted = tuple[str, int, FrameTilt | None]
 
 #: Standard deviation of where a map's discs are seen, besides their covariances: its path's (m).
 _MAP_SIGMA_M = 0.1
-#: Least lean with which discs are searched, degrees.
-_LEAST_LEAN_DEG = 0.5
+#: Least lean with which discs are searched, degrees, and how much more evidence it has to give: all
+#: verticals may lean, and a slight lean is no hindrance.
+_LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
@@ -308,6 +319,17 @@ def _disc_records(
         }
         for pixel, evidence, row in zip(found.pixels.tolist(), found.evidence.tolist(), rows)
     ]
+
+
+def pays(leaning: float, evidence: float) -> bool:
+    """Whether there is clearly more evidence of discs where they are searched as a camera leans."""
+    return leaning > _MORE_EVIDENCE * evidence
+
+
+def evidence_of(frames: Iterable[FrameRows]) -> float:
+    """Of all discs in the rows of frames, which have them in JSON, too."""
+    discs = [disc for rows in frames for disc in json.loads(rows.rows["json"]).get("discs", ())]
+    return sum(disc["evidence"] or 0.0 for disc in discs)
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:

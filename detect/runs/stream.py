@@ -223,14 +223,22 @@ def _lean_of(run: ImageRun, plan: FramePlan, workers: Workers) -> Lean | None:
         return None
     if expected < _LEAN_FRAMES:
         return None
-    from detect.runs.frame import lean_of_run  # loads the compiler
+    from detect.runs.frame import evidence_of, lean_of_run, pays  # loads the compiler
 
     step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
     with closing(iter(run.frames)) as frames:
         tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
-    seen = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
-    with closing(detect_chunks(tasks, seen, workers)) as chunks:
-        return lean_of_run(camera, [rows for chunk in chunks for _, rows in chunk])
+
+    def rows_by(plan: FramePlan) -> list[FrameRows]:
+        with closing(detect_chunks(tasks, plan, workers)) as chunks:
+            return [rows for chunk in chunks for _, rows in chunk]
+
+    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
+    rows = rows_by(level)
+    lean = lean_of_run(camera, rows)
+    if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
+        return None
+    return lean
 
 
 def make_folder(folder: Path) -> None:

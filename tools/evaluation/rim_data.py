@@ -27,7 +27,6 @@ from detect.discs.judgement import FEATURES, GLANCED_AT, JUDGED, glance, pairs_o
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.grey_values import estimate_noise
-from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
@@ -182,14 +181,13 @@ def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatA
 
 def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks]:
     """Glances and looks at all sources of a folder of data; of the real frames, every n-th."""
-    run = data / "dlr"
-    camera = read_camera(run / "e" / "e.cam")
-    mounting = json.loads((run / "mounting.json").read_text())
-    mounted = with_pose(camera, np.array(mounting["robot_from_camera"]))
-    cameras = camera, leaning_camera(camera, tuple(mounting["rotation_rad"][:2]))
+    camera = read_camera(data / "dlr" / "e" / "e.cam")
     kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
     photographs = sorted((data / "york").glob("dev/*/images/*"))
-    frames = [(run / "e" / "images" / f"{n}.jpg", a, b) for n, a, b in _mapped(run, mounted)]
+    frames = [
+        (data / "dlr" / "e" / "images" / f"{name}.jpg", mapped, shipped)
+        for name, mapped, shipped in _mapped(data / "dlr", camera)
+    ]
     frames = [frame for frame in frames[::every] if frame[0].is_file()]
     parts: list[tuple[Any, ...]] = [
         *((_scenes, camera, kinds, _SCENES_PER_STAGE) for _ in range(scenes // _SCENES_PER_STAGE)),
@@ -198,7 +196,7 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
             for _ in range(scenes // _SCENES_PER_STAGE)
         ),
         *((_building, folder) for folder in sorted((data / "rendered").glob("r*"))),
-        *((_real, cameras, frames[k : k + _AT_ONCE]) for k in range(0, len(frames), _AT_ONCE)),
+        *((_real, camera, frames[k : k + _AT_ONCE]) for k in range(0, len(frames), _AT_ONCE)),
     ]
     with ProcessPoolExecutor() as pool:
         done = [pool.submit(_gather, [seed, n], *part) for n, part in enumerate(parts)]
@@ -262,18 +260,17 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
 
 
 def _real(
-    gathering: _Gathering, rng: np.random.Generator, _: int, cameras: tuple[Camera, Camera],
+    gathering: _Gathering, rng: np.random.Generator, _: int, camera: Camera,
     frames: list[tuple[Path, FloatArray, FloatArray]],
 ) -> None:  # fmt: skip
-    """Look at frames of the run, by either camera in turn; at some with their discs disturbed."""
-    camera = cameras[0]
+    """Look at frames of the recorded run, and at some of them with their discs disturbed."""
     for number, (path, mapped, rows_xy) in enumerate(frames):
         image = _read(path)
         is_mapped = [_nearest(uv, mapped) < 1.0 for uv in camera.project_floor(rows_xy)]
         shipped = rows_xy[np.array(is_mapped, np.bool_)]
         light = np.array([_is_light(image, camera, xy) for xy in shipped], np.bool_)
         of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
-        gathering.add(image, cameras[number % 2], Truth(of_light, of_dark, mapped), _REAL, "real")
+        gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
         if number % 6 == 0:
             _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
     gathering.looks = [
@@ -371,8 +368,9 @@ def _add_disturbed(
         gathering.add(other, camera, Truth(others=place), _DISTURBED, source)
 
 
-def _mapped(run: Path, mounted: Camera) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Names of frames, places of mapped discs in the image with slack, and shipped rows (m)."""
+    true = np.array(json.loads((run / "mounting.json").read_text())["robot_from_camera"])
     rows = list(csv.DictReader((run / "levelled_map.csv").open()))
     discs = np.array([(float(d["x_m"]), float(d["y_m"])) for d in rows])
     shipped = {
@@ -381,6 +379,7 @@ def _mapped(run: Path, mounted: Camera) -> Iterator[tuple[str, FloatArray, Float
         ).reshape(-1, 2)
         for frame in read_frames(run / "map.circles")
     }
+    seen = with_pose(camera, true)
     for pose in csv.DictReader((run / "levelled_path.csv").open()):
         if not pose["prefix"][-4:].isdigit():
             continue
@@ -388,7 +387,7 @@ def _mapped(run: Path, mounted: Camera) -> Iterator[tuple[str, FloatArray, Float
         cos, sin = np.cos(turn), np.sin(turn)
         places = (discs - [x, y]) @ [[cos, -sin], [sin, cos]]
         near = places[np.hypot(*places.T) < 9.5]
-        yield pose["prefix"], _images(mounted, near, 4.0), shipped[pose["prefix"]]
+        yield pose["prefix"], _images(seen, near, 4.0), shipped[pose["prefix"]]
 
 
 def _is_light(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> bool:
