@@ -25,6 +25,7 @@ from detect.errors import EXIT_FRAMES_FAILED
 from redetect.storage.messages import is_quiet
 
 _received = threading.Event()
+_waiting = threading.Event()
 
 
 @contextmanager
@@ -62,13 +63,13 @@ def interrupts_deferred() -> Iterator[None]:
     """Let interrupts wait until the end of a block, which is short, and raise them there.
 
     Processes started meanwhile inherit a blocked interrupt. That alone would not do: an interrupt
-    that this thread blocks is taken by another one, and raised in this one all the same.
+    that this thread blocks is taken by another one, and raised in this one all the same. A block
+    that may take long calls `raise_if_interrupt_waits` now and then.
     """
-    deferred = threading.Event()
     before = signal.getsignal(signal.SIGINT)
     handled = threading.current_thread() is threading.main_thread() and callable(before)
     if handled:
-        signal.signal(signal.SIGINT, lambda *_: deferred.set())
+        signal.signal(signal.SIGINT, lambda *_: _waiting.set())
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -76,7 +77,9 @@ def interrupts_deferred() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         if handled:
             signal.signal(signal.SIGINT, before)
-    if deferred.is_set():
+        waiting = _waiting.is_set()
+        _waiting.clear()
+    if waiting:
         _received.set()
         raise KeyboardInterrupt
 
@@ -84,6 +87,12 @@ def interrupts_deferred() -> Iterator[None]:
 def raise_if_interrupted() -> None:
     """Raise an interrupt that was lost, if there was one."""
     if _received.is_set():
+        raise KeyboardInterrupt
+
+
+def raise_if_interrupt_waits() -> None:
+    """Raise an interrupt that is deferred, if there is one."""
+    if _waiting.is_set() or signal.SIGINT in signal.sigpending():
         raise KeyboardInterrupt
 
 

@@ -48,6 +48,7 @@ from detect.runs.plan import (
 from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
+from detect.terminal import interrupts_deferred
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
 from redetect.array_types import FloatArray, GreyImage
 from redetect.landmarks import (
@@ -118,8 +119,9 @@ def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetec
     batch = [FrameDetections() for _ in tasks]
     verticals = cached_vertical_table(plan.camera) if plan.camera and plan.lines else None
     paths = [_path(task, found, plan, verticals) for task, found in zip(tasks, batch)]
-    for _ in zip_longest(*paths):  # advances each of them to its next `yield` in turn
-        pass
+    with interrupts_deferred():  # one that reaches Numba while it hands over tuples is a crash
+        for _ in zip_longest(*paths):  # advances each of them to its next `yield` in turn
+            pass
     return batch
 
 
@@ -210,6 +212,8 @@ _MAP_SIGMA_M = 0.1
 #: Least lean with which discs are searched, degrees, and how much more evidence it has to give: all
 #: verticals may lean, and a slight lean is no hindrance.
 _LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
+#: Steps of the lean of a single frame, degrees.
+_FRAME_LEAN_DEG = 2.0
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 #: Largest number of pixels that are decoded at once.
@@ -333,9 +337,15 @@ def evidence_of(frames: Iterable[FrameRows]) -> float:
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:
-    """The lean with which discs are searched in a frame by its own tilt: in whole degrees."""
-    pitch, roll = round(math.degrees(tilt.pitch)), round(math.degrees(tilt.roll))
-    return (math.radians(pitch), math.radians(roll)) if pitch or roll else None
+    """The lean with which discs are searched in a frame by its own tilt, in coarse steps.
+
+    So the tilts of many frames need few tables.
+    """
+    pitch, roll = (
+        math.radians(_FRAME_LEAN_DEG * round(math.degrees(angle) / _FRAME_LEAN_DEG))
+        for angle in (tilt.pitch, tilt.roll)
+    )
+    return (pitch, roll) if pitch or roll else None
 
 
 def lean_of_run(camera: Camera, frames: Iterable[FrameRows]) -> Lean | None:

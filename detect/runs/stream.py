@@ -42,7 +42,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, Lean, RunSummary
-from detect.runs.workers import Workers, detect_chunks, local_workers
+from detect.runs.workers import Crew, Workers, detect_chunks, local_workers
 from detect.sources.interface import ImageRun, RunFrame
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
@@ -187,10 +187,7 @@ def detect_run(
         are no workers.
     """
     workers = workers or local_workers(1, large=job.run.frames.ships_images)
-    plan = replace(job.plan, json="json" in job.places)
-    plan = replace(plan, lean=_lean_of(job.run, plan, workers))
-    job = replace(job, plan=plan)
-    summary = RunSummary(lean=plan.lean)
+    summary = RunSummary()
 
     def count(rows: FrameRows) -> None:
         summary.add(rows)
@@ -198,14 +195,19 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
+        crew = stack.enter_context(Crew(workers))
+        plan = replace(job.plan, json="json" in job.places)
+        plan = replace(plan, lean=_lean_of(job.run, plan, crew))
+        job, summary.lean = replace(job, plan=plan), plan.lean
         files = stack.enter_context(RunFiles(job))
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
         tasks = files.take_over(every, count)
-        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, workers))):
+        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, crew))):
             files.add(frames)
             for _, rows in frames:
                 count(rows)
+        crew.end()
         summary.images_without_step = job.run.frames.left_out
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
@@ -216,7 +218,7 @@ def detect_run(
     return summary
 
 
-def _lean_of(run: ImageRun, plan: FramePlan, workers: Workers) -> Lean | None:
+def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
     """How the camera leans where discs are searched, by some frames of a run."""
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
@@ -230,7 +232,7 @@ def _lean_of(run: ImageRun, plan: FramePlan, workers: Workers) -> Lean | None:
         tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
-        with closing(detect_chunks(tasks, plan, workers)) as chunks:
+        with closing(detect_chunks(tasks, plan, crew)) as chunks:
             return [rows for chunk in chunks for _, rows in chunk]
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)

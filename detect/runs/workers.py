@@ -12,6 +12,7 @@ like an image that cannot be read.
 
 from __future__ import annotations
 
+import concurrent.futures
 import multiprocessing
 import os
 import re
@@ -35,6 +36,7 @@ from detect.terminal import (
     announcements_are_shown,
     interrupts_deferred,
     on_compilation,
+    raise_if_interrupt_waits,
     say_compiling,
     show_announcements,
 )
@@ -60,23 +62,24 @@ class Workers:
 
 
 def detect_chunks(
-    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
+    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers | Crew
 ) -> Generator[list[tuple[FrameTask, FrameRows]], None, None]:
     """Frames with their rows, in the order of the tasks, as many at a time as a worker gives back.
 
-    Close the generator if not all of them are consumed: that ends the workers. Raises WorkerError
-    if workers die with any frame, disappear, or do not have this program, and `lut.TableError` if
-    there can be no table for the camera.
+    Close the generator if not all of them are consumed: that ends the workers, but those of a crew.
+    Raises WorkerError if workers die with any frame, disappear, or do not have this program, and
+    `lut.TableError` if there can be no table for the camera.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
     # A chunk without a future is suspect: to be processed while nothing else is under way.
     under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
     with ExitStack() as started:
-        crew = _Crew(workers, plan, started)
+        crew = workers if isinstance(workers, Crew) else started.enter_context(Crew(workers))
+        crew.plan = plan
         while True:
             if all(future is not None for _, future in under_way):
-                more = max(0, workers.window() - len(under_way))
+                more = max(0, crew.window() - len(under_way))
                 under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
             if not under_way:
                 return
@@ -101,20 +104,37 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
     return rows_of_frames(chunk, plan)
 
 
-class _Crew:
-    """The workers of a run: replaced when one of them has died."""
+class Crew:
+    """The workers of a run, started when they are needed, and replaced when one of them has died.
 
-    def __init__(self, workers: Workers, plan: FramePlan, started: ExitStack) -> None:
+    A context manager, which ends them.
+    """
+
+    plan: FramePlan  # what they do with frames
+
+    def __init__(self, workers: Workers) -> None:
         self.died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
-        self._workers, self._plan, self._started = workers, plan, started
+        self.chunk, self.window = workers.chunk, workers.window
+        self._workers, self._started = workers, ExitStack()
         self._executor: Executor | None = None
         self._deadly = 0
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the workers."""
+        self._executor = None
+        self._started.close()
 
     def submit(self, chunk: Chunk) -> Future[list[FrameRows]]:
         try:
             if self._executor is None:
-                self._executor = self._started.enter_context(self._workers.start(self._plan))
-            return self._executor.submit(work_on_chunk, self._plan, chunk)
+                self._executor = self._started.enter_context(self._workers.start(self.plan))
+            return self._executor.submit(work_on_chunk, self.plan, chunk)
         except self.died as error:  # they died before they were given anything
             failed: Future[list[FrameRows]] = Future()
             failed.set_exception(error)
@@ -152,8 +172,7 @@ class _Crew:
     def dismiss(self, error: BaseException) -> None:
         """End the rest of broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
-            self._executor = None
-            self._started.close()
+            self.end()
 
     def lost(self, future: Future[list[FrameRows]] | None) -> bool:
         """Whether a chunk was lost with its worker."""
@@ -175,8 +194,8 @@ _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
-#: Time that processes have to end by themselves.
-_GRACE_S = 1.0
+#: Time that processes have to end by themselves, and in which an interrupt is noticed.
+_GRACE_S, _PATIENCE_S = 1.0, 0.2
 
 
 def default_jobs(frames: int) -> int:
@@ -251,6 +270,7 @@ class _InProcess(Executor):
         self._forget()
 
     def _before_compilation(self) -> None:
+        raise_if_interrupt_waits()
         say_compiling()
         if not self._shared:
             return
@@ -272,8 +292,9 @@ class _InProcess(Executor):
             ]
             for more in others[1:]:
                 more.submit(place_none, discs, self._chunk)
-            for future in done:
-                future.exception()  # what fails there fails here again, and is reported
+            # What fails there fails here again, and is reported.
+            while concurrent.futures.wait(done, _PATIENCE_S).not_done:
+                raise_if_interrupt_waits()
             raise _CompiledElsewhereError
 
 

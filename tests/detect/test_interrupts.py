@@ -18,6 +18,7 @@ from detect.terminal import (
     interrupts_deferred,
     interrupts_noted,
     progress_bar,
+    raise_if_interrupt_waits,
     raise_if_interrupted,
 )
 
@@ -166,3 +167,16 @@ def test_an_error_of_the_program_is_no_interrupt(
     monkeypatch.setattr(cli, "carry_out", slip)
     with pytest.raises(SystemError, match="a slip"):
         main(["compare", str(tmp_path)])
+
+
+def test_an_interrupt_that_waits_can_be_asked_for() -> None:
+    def wait_with_it() -> None:
+        with interrupts_deferred():
+            raise_if_interrupt_waits()  # none yet
+            signal.raise_signal(signal.SIGINT)
+            with pytest.raises(KeyboardInterrupt):
+                raise_if_interrupt_waits()
+
+    with pytest.raises(KeyboardInterrupt):
+        wait_with_it()
+    raise_if_interrupt_waits()  # that one was raised

@@ -85,7 +85,7 @@ def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Pa
 
 
 def test_a_slight_tilt_of_a_frame_is_no_lean() -> None:
-    slight = FrameTilt("e", np.radians(0.45), np.radians(-0.45), 1e-6, 0.0, 1e-6, 9)
+    slight = FrameTilt("e", np.radians(0.9), np.radians(-0.9), 1e-6, 0.0, 1e-6, 9)
     assert lean_of_frame(slight) is None
     assert lean_of_frame(replace(slight, pitch=np.radians(2.3))) == (np.radians(2.0), 0.0)
 
