@@ -169,7 +169,7 @@ def test_an_error_of_the_program_is_no_interrupt(
         main(["compare", str(tmp_path)])
 
 
-def test_an_interrupt_that_waits_can_be_asked_for() -> None:
+def test_an_interrupt_that_waits_can_be_asked_for(caught: None) -> None:
     def wait_with_it() -> None:
         with interrupts_deferred():
             raise_if_interrupt_waits()  # none yet
