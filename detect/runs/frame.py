@@ -145,11 +145,13 @@ def _path(
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
                 settings = _of_known_tilt(settings)
-            seen = _discs(image, camera, settings, plan.lean)
+            seen = _discs(image, camera, settings, search_of(camera, plan.circles, plan.lean))
             if plan.lean is None and by_frame is not None and settings.refine:
                 lean = lean_of_frame(by_frame)
-                leaning = seen if lean is None else _discs(image, camera, settings, lean)
-                seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
+                if lean is not None:
+                    search = search_of(camera, plan.circles, lean)
+                    leaning = _discs(image, camera, settings, search)
+                    seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
             found.seen = found.discs = seen
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
@@ -173,12 +175,11 @@ def _path(
 
 
 def _discs(
-    image: GreyImage, camera: Camera, settings: CircleSettings, lean: Lean | None
+    image: GreyImage, camera: Camera, settings: CircleSettings, search: Search
 ) -> CircleDetections:
     """The discs as the calibrated camera sees them, searched as it leans."""
-    search = search_of(camera, settings, lean)
     found = detect_circles(image, search.camera, search.table, settings)
-    return found if lean is None else as_calibrated(found, search.camera, camera)
+    return found if search.camera == camera else as_calibrated(found, search.camera, camera)
 
 
 @lru_cache(maxsize=4)
