@@ -10,7 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
+from camera.calibration.model import COUNT
 from camera.rotations import cross_matrices
+from camera.uncertainty import covariance_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
 
@@ -22,14 +24,16 @@ def rows_through_mounting(
 
     Takes `floor_xy` (n, 2) as the rows have it, and robot_from_camera as mounted (3, 4). Returns
     `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and `by_mounting`
-    (n, 2, 4): derivatives by a rotation vector in the robot frame, applied to the mounting from the
-    left, and by the height.
+    (n, 2, 6): derivatives by a rotation vector in the robot frame, applied to the mounting from the
+    left, and by the camera's place.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
     ray = (np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre) @ turn.T
     slope, by_ray = _on_floor(ray, centre[2])
-    by_mounting = np.concatenate([-by_ray @ cross_matrices(ray), -slope[:, :, None]], axis=2)
+    across = np.broadcast_to(np.eye(2), (len(ray), 2, 2))
+    turning = -by_ray @ cross_matrices(ray)
+    by_mounting = np.concatenate([turning, across, -slope[:, :, None]], axis=2)
     return centre[:2] - centre[2] * slope, by_mounting
 
 
@@ -55,7 +59,7 @@ def rows_as_recorded(
     the camera.
 
     Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
-    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 4), the latter by the numbers that
+    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter by the numbers that
     `rows_through_mounting` names.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
@@ -63,19 +67,32 @@ def rows_as_recorded(
     height = float(camera.centre[2])
     slope, by_ray = _on_floor(from_centre @ unturn.T, height)
     by_robot = by_ray @ unturn
-    by_mounting = np.concatenate([by_robot @ cross_matrices(from_centre), -by_robot[:, :, 2:]], 2)
+    by_mounting = np.concatenate([by_robot @ cross_matrices(from_centre), -by_robot], axis=2)
     return camera.centre[:2] - height * slope, by_robot[:, :, :2], by_mounting
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
-    """Rotation vector in the robot frame (rad) and height (m), true less calibrated.
+    """Rotation vector in the robot frame (rad) and place (m), true less calibrated.
 
-    Takes `mounting` (3, 4); returns (4,).
+    Takes `mounting` (3, 4); returns (6,).
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
-    return np.append(
-        Rotation.from_matrix(turn).as_rotvec(), mounting[2, 3] - float(camera.centre[2])
-    )
+    return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), mounting[:, 3] - camera.centre])
+
+
+def mounted_camera(camera: Camera, mounting: FloatArray, covariance: FloatArray) -> Camera:
+    """The camera as mounted, with the covariance of that if it states one.
+
+    Takes `mounting` (3, 4), and the `covariance` (6, 6) of its change.
+    """
+    mounted = with_pose(camera, mounting)
+    stated = covariance_of(camera)
+    if stated is None:
+        return mounted
+    stated[COUNT:] = stated[:, COUNT:] = 0.0
+    # A calibration has the place before the rotation.
+    stated[COUNT:, COUNT:] = np.roll(covariance, 3, axis=(0, 1))
+    return with_covariance(mounted, stated)
 
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:

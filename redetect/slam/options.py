@@ -56,11 +56,14 @@ class Map(RunsFlags):
     Example: slam map images/e --circles --lines -o /tmp/e-map
     """
 
-    # Estimate the camera's mounting (rotation and height) as well, by discs alone.
+    # Estimate the camera's mounting (rotation, place, height) as well, by discs alone.
     calibrate: bool = False
-    # With --calibrate, where rows are compared with discs: `corrected`, on the floor as the camera
-    # as mounted sees it; `recorded`, as the rows were written, where their covariances belong.
-    row_errors: Literal["corrected", "recorded"] = "corrected"
+    # With --calibrate, whether its place over the floor is unknown, or only rotation and height.
+    place: bool = True
+    # With --calibrate, where rows are compared with discs: `recorded`, as they were written, where
+    # their covariances belong; `corrected`, on the floor as the camera as mounted sees it, which
+    # finds the camera too low.
+    row_errors: Literal["corrected", "recorded"] = "recorded"
     # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
     # (extra [slam]), of discs and plain least squares alone.
     solver: Literal["separable", "gtsam"] = "separable"

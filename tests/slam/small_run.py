@@ -25,11 +25,21 @@ class SmallRun:
 
 
 def small_run(
-    seed: int, noise: float = 1.0, steps: int = 60, discs: int = 14, turn_sigma_rad: float = 0.006
+    seed: int,
+    noise: float = 1.0,
+    steps: int = 60,
+    discs: int = 14,
+    turn_sigma_rad: float = 0.006,
+    weave_rad: float = 0.0,
 ) -> SmallRun:
-    """Two laps; `noise` is a factor on the errors' standard deviations, not on the covariances."""
+    """Two laps; `noise` is a factor on the errors' standard deviations, not on the covariances.
+
+    Turns differ by up to `weave_rad`: on a circle the camera's place cannot be told from its
+    heading.
+    """
     rng = np.random.default_rng(seed)
     true_steps = np.tile([0.01, -0.4, 4 * np.pi / steps], (steps, 1))
+    true_steps[:, 2] += weave_rad * np.sin(2.0 * np.pi * np.arange(steps) / 9.0)
     poses = chain_steps(true_steps)
     assert np.allclose(between(poses[:-1], poses[1:]), true_steps)
     centre = poses[:, :2].mean(axis=0)

@@ -9,19 +9,28 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from camera.model import PARAMETERS
 from camera.rotations import rotation_of
+from camera.uncertainty import covariance_of, with_covariance
 from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
+from redetect.plane import chain_steps
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
-from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.graph_terms import PLACE_PRIOR_M, Weighting
 from redetect.slam.mapping.initial_lines import place_lines
 from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
-from redetect.slam.models import move
-from redetect.slam.mounting import rows_through_mounting
-from redetect.slam.recording import LineRows, Recording, read_recording, recording_of_frames
+from redetect.slam.models import disc_in_robot, move
+from redetect.slam.mounting import mounted_camera, rows_through_mounting
+from redetect.slam.recording import (
+    CircleRows,
+    LineRows,
+    Recording,
+    read_recording,
+    recording_of_frames,
+)
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 
@@ -142,19 +151,28 @@ def test_a_loss_withstands_wrong_identifiers(loss: str) -> None:
     assert off[loss] < off["none"] / 2
 
 
+def _written_when_mounted(
+    recording: Recording, calibrated: Camera, mounting: FloatArray
+) -> Recording:
+    """The rows that a camera writes that is mounted otherwise than its file says."""
+    mounted = _mounted(calibrated, mounting)
+    backward = np.column_stack([calibrated.rotation, calibrated.centre])
+    written, _ = rows_through_mounting(mounted, recording.circles.xy, backward)
+    return replace(recording, circles=replace(recording.circles, xy=written))
+
+
 @pytest.mark.parametrize("row_errors", ["corrected", "recorded"])
 def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_errors: str) -> None:
-    true = np.array([-0.03, 0.012, 0.005, -0.03])
+    true = np.array([-0.03, 0.012, 0.005, 0.02, 0.07, -0.03])
     turn = rotation_of(true[:3])
-    # The rows that this camera would write, mounted otherwise than the file says.
-    run = small_run(7, noise=0.0, steps=90)
-    circles = run.recording.circles
-    place = published_camera.centre + np.array([0.0, 0.0, true[3]])
-    matrix = np.column_stack([turn @ published_camera.rotation, place])
-    mounted = _mounted(published_camera, matrix)
-    backward = np.column_stack([published_camera.rotation, published_camera.centre])
-    written, _ = rows_through_mounting(mounted, circles.xy, backward)
-    spoilt = replace(_only_discs(run), circles=replace(circles, xy=written))
+    mounting = np.column_stack(
+        [turn @ published_camera.rotation, published_camera.centre + true[3:]]
+    )
+    run = small_run(7, noise=0.0, steps=90, weave_rad=0.2)
+    spoilt = _written_when_mounted(_only_discs(run), published_camera, mounting)
+    # So certain that what is believed of the camera's place does not matter.
+    certain = replace(spoilt.circles, covariance=1e-6 * spoilt.circles.covariance)
+    spoilt = replace(spoilt, circles=certain, step_covariance=1e-6 * spoilt.step_covariance)
     plain = map_run(spoilt, published_camera)
     mapped = map_run(
         spoilt,
@@ -166,7 +184,58 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
     assert mapped.mounting.gain == pytest.approx(plain.table.chi_squared, rel=1e-3)
     assert plain.table.chi_squared > 10.0
     np.testing.assert_allclose(mapped.estimate.poses, run.poses, atol=2e-4)
-    assert mapped.table.expected == plain.table.expected - 4
+    assert mapped.table.expected == plain.table.expected - 6
+
+
+def test_errors_of_a_mounting_are_as_its_covariance_says(published_camera: Camera) -> None:
+    true = np.array([-0.03, 0.012, 0.005, 0.02, 0.07, -0.03])
+    squared = []
+    for seed in range(30):
+        run = _only_discs(small_run(seed, steps=90, weave_rad=0.2))
+        turn = rotation_of(true[:3]) @ published_camera.rotation
+        mounting = np.column_stack([turn, published_camera.centre + true[3:]])
+        # Errors are those of the rows as they are written.
+        exact = _only_discs(small_run(seed, noise=0.0, steps=90, weave_rad=0.2))
+        written = _written_when_mounted(exact, published_camera, mounting)
+        rows = replace(run.circles, xy=written.circles.xy + run.circles.xy - exact.circles.xy)
+        run = replace(run, circles=rows)
+        mapped = map_run(run, published_camera, Weighting(calibrate=True))
+        assert mapped.mounting is not None
+        off = mapped.mounting.change - true
+        squared.append(off @ np.linalg.solve(mapped.mounting.covariance, off) / len(off))
+    assert 0.7 < np.mean(squared) < 1.35
+
+
+def test_a_straight_drive_leaves_the_cameras_place_as_calibrated(published_camera: Camera) -> None:
+    run = small_run(3, noise=0.0, steps=40)
+    steps = np.tile([0.0, -0.1, 0.0], (40, 1))
+    poses = chain_steps(steps)
+    discs = np.array([(x, -y) for x in (-1.0, 0.4, 1.2) for y in np.linspace(1.5, 6.0, 7)])
+    rows = []
+    for k in range(40):
+        seen = disc_in_robot(poses[k + 1], discs)
+        ahead = (seen[:, 1] < -1.2) & (np.hypot(*seen.T) < 3.5)
+        rows += [(k, seen[i], 1e-4 * np.eye(2), int(i)) for i in np.flatnonzero(ahead)]
+    straight = replace(_only_discs(run), steps=steps, circles=CircleRows.of(rows))
+    mapped = map_run(straight, published_camera, Weighting(calibrate=True))
+    assert mapped.mounting is not None
+    np.testing.assert_allclose(mapped.mounting.change, 0.0, atol=1e-6)
+    sigma = np.sqrt(np.diag(mapped.mounting.covariance))
+    np.testing.assert_allclose(sigma[3:5], PLACE_PRIOR_M, rtol=0.1)
+
+
+def test_a_mounted_camera_states_the_covariance_of_its_mounting(published_camera: Camera) -> None:
+    lens = np.diag(np.linspace(1.0, 2.0, PARAMETERS)) * 1e-6
+    stated = with_covariance(published_camera, lens)
+    mounting = np.array(published_camera.robot_from_camera) + 0.01 * np.eye(3, 4, 3)
+    of_change = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) * 1e-4
+    mounted = mounted_camera(stated, mounting, of_change)
+    found = covariance_of(mounted)
+    assert found is not None
+    np.testing.assert_allclose(np.diag(found)[-6:], np.array([4, 5, 6, 1, 2, 3]) * 1e-4)
+    np.testing.assert_allclose(found[:-6, :-6], lens[:-6, :-6], rtol=1e-5)
+    np.testing.assert_array_equal(np.array(mounted.robot_from_camera), mounting)
+    assert mounted_camera(published_camera, mounting, of_change).covariance is None
 
 
 def test_lines_without_parallax_and_lines_always_joined_are_left_out() -> None:
@@ -311,20 +380,22 @@ def test_the_known_solution_of_run_e(shared_data: Path, plain_map: MappedRun) ->
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("row_errors", "chi_squared", "change"),
+    ("row_errors", "place", "chi_squared", "change"),
     [
-        ("corrected", 41_396.34, (-0.0403, 0.0100, 0.0016, -0.0454)),
-        ("recorded", 37_450.18, (-0.0366, 0.0099, 0.0024, -0.0111)),
+        ("corrected", False, 41_396.34, (-0.0403, 0.0100, 0.0016, 0.0, 0.0, -0.0454)),
+        ("recorded", False, 37_450.18, (-0.0366, 0.0099, 0.0024, 0.0, 0.0, -0.0111)),
+        ("recorded", True, 33_759.46, (-0.0398, 0.0133, -0.0032, 0.0248, 0.1028, -0.0123)),
     ],
 )
 def test_calibration_of_run_e(
     run_e_as_shipped: Recording,
     published_camera: Camera,
     row_errors: str,
+    place: bool,
     chi_squared: float,
     change: tuple[float, ...],
 ) -> None:
-    weighting = Weighting(calibrate=True, row_errors=row_errors)  # type: ignore[arg-type]
+    weighting = Weighting(calibrate=True, place=place, row_errors=row_errors)  # type: ignore[arg-type]
     mapped = map_run(run_e_as_shipped, published_camera, weighting)
     assert mapped.table.chi_squared == pytest.approx(chi_squared, abs=0.1)
     assert mapped.mounting is not None

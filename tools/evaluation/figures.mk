@@ -44,7 +44,7 @@ tilt-of-discs = programs 'detect circles $(RUN_E) $(ids) -o @/own.circles' \
     'detect circles $(RUN_E) $(ids) --tilt-sigma-deg 0.6 -o @/free.circles' \
     'slam map @/free.circles --calibrate --camera $(RUN_E)/e.cam -o @/map' 'detect all $(RUN_E) -o @/run' \
     $(foreach tilt,frames.tilt tilt,'tools.evaluation tilt-of-discs @/own.circles @/run/detected.$(tilt) --camera $(RUN_E)/e.cam \
-    --map @/map/map.csv --path @/map/path.csv --raised-m -0.045 --figures @/$(subst .,_,$(tilt)).json')
+    --map @/map/map.csv --path @/map/path.csv --raised-m -0.014 --figures @/$(subst .,_,$(tilt)).json')
 simulated = programs 'tools.simulator run @/$(1)' 'tools.evaluation tilt @/$(firstword $(1)) --figures @/tilt.json'
 tilt-demo = tilt images/e
 tilt-tilted = $(call simulated,tilted --frames 80 --seed 8 --discs 32 --lookalikes 16 --visits 0.8 \

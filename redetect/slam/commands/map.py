@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from camera import write_camera
 from redetect import slam
 from redetect.landmarks.map_file import (
     covariance_file,
@@ -35,13 +36,14 @@ from redetect.slam.mapping.run_map import (
     map_run,
     table_lines,
 )
+from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounds import ABOVE_0, FINITE, demand
 
-TABLE_NAME = "table.json"
+TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
@@ -55,8 +57,10 @@ def perform(command: Map) -> int:
     paths = [PATH_NAME]
     if command.more:
         paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
-    names = (MAP_NAME, joint_name, *paths, TABLE_NAME, MAP_PICTURE)
-    demand_free([output / name for name in names], overwrite=command.force)
+    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE]
+    if command.calibrate:
+        names.append(CAMERA_NAME)
+    demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
@@ -87,7 +91,11 @@ def perform(command: Map) -> int:
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
     write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
-    print(f"{output}: {', '.join((MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE))}")
+    if mapped.mounting is not None and mapped.graph.camera is not None:
+        found = mapped.mounting
+        mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
+        write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
+    print(f"{output}: {', '.join(names)}")
     return 0
 
 
@@ -101,6 +109,7 @@ def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
         loss=command.loss,
         loss_scale=command.loss_scale,
         calibrate=command.calibrate,
+        place=command.place,
         row_errors=command.row_errors,
     )
     return map_run(
@@ -126,11 +135,12 @@ def _report(mapped: MappedRun, seconds: float) -> list[str]:
 
 def _mounting_lines(mounting: Mounting) -> list[str]:
     sigma = np.sqrt(np.diag(mounting.covariance))
-    names = ("rotation about x", "rotation about y", "rotation about z", "height")
-    units = ("rad", "rad", "rad", "m")
+    names = [f"rotation about {axis}" for axis in "xyz"] + ["place x", "place y", "height"]
+    units = ["rad"] * 3 + ["m"] * 3
     lines = [
         f"{name:<28}{value:>12.4f} +- {spread:.4f} {unit}"
         for name, value, spread, unit in zip(names, mounting.change, sigma, units)
+        if spread > 0.0
     ]
     return [*lines, f"{'gained by the mounting':<28}{mounting.gain:>12,.2f}"]
 
@@ -157,7 +167,8 @@ def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:
     if mapped.mounting is not None:
         results["mounting"] = {
             "rotation_rad": mapped.mounting.change[:3].tolist(),
-            "height_m": float(mapped.mounting.change[3]),
+            "place_m": mapped.mounting.change[3:5].tolist(),
+            "height_m": float(mapped.mounting.change[5]),
             "covariance": mapped.mounting.covariance.tolist(),
             "robot_from_camera": mapped.mounting.robot_from_camera.tolist(),
             "chi_squared_gained": mapped.mounting.gain,

@@ -25,8 +25,12 @@ from redetect.storage.bounds import Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
 
-#: Rotation about robot x, y, z, and height.
-MOUNTING_UNKNOWNS = 4
+#: Rotation about robot x, y, z, and place in robot x, y, z.
+MOUNTING = 6
+
+#: Standard deviation of the camera's place over the floor about the calibrated one (m), for runs
+#: that turn too little to tell.
+PLACE_PRIOR_M = 0.1
 
 #: Standard deviation of where lines are believed to be, if anywhere (m).
 LINE_PRIOR_M = 3.0
@@ -38,15 +42,25 @@ class Weighting:
 
     loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
     loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
-    calibrate: bool = False  # whether the camera's rotation and height are unknowns, of discs alone
+    calibrate: bool = False  # whether the camera's mounting is unknown, of discs alone
+    # Whether that is its place over the floor (x, y), too, which discs show when the robot turns;
+    # else its rotation and height.
+    place: bool = True
     # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
     # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
     # row that the calibrated camera would have written is compared with the one it wrote, which is
     # where that covariance belongs.
-    row_errors: RowErrors = "corrected"
+    row_errors: RowErrors = "recorded"
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
+
+    @property
+    def unknown_mounting(self) -> list[int]:
+        """Which of the numbers of the mounting are unknown."""
+        if not self.calibrate:
+            return []
+        return list(range(MOUNTING)) if self.place else [0, 1, 2, 5]
 
 
 class Layout(NamedTuple):
@@ -72,18 +86,22 @@ class Errors:
     discs: FloatArray  # (n, 2): NaN where a disc would be out of the camera's sight
     lines: FloatArray  # (q,)
     prior: FloatArray  # (K, 2) or (0, 2): lines less where they are believed to be
+    place: FloatArray  # (1, 2) or (0, 2): the camera less where it was calibrated to be
 
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
     """Whitened errors at an estimate: predicted minus measured, in standard deviations."""
     step = between(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
     step[:, 2] = wrap_angle(step[:, 2])
-    near = graph.line_prior
+    near, place = graph.line_prior, np.zeros((0, 2))
+    if estimate.mounting is not None and graph.camera is not None:
+        place = (estimate.mounting[None, :2, 3] - graph.camera.centre[:2]) / PLACE_PRIOR_M
     return Errors(
         odometry=_apply(graph.step_whitening, step),
         discs=_apply(graph.disc_whitening, _disc_rows(graph, estimate, weighting)[0]),
         lines=_bearing_errors(graph, estimate),
         prior=np.zeros((0, 2)) if near is None else (estimate.line_xy - near) / LINE_PRIOR_M,
+        place=place,
     )
 
 
@@ -97,6 +115,7 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
             (error.discs, loss),
             (error.lines[:, None], loss),
             (error.prior, Loss()),
+            (error.place, Loss()),
         ]
     )
 
@@ -104,7 +123,8 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
 def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     """The problem near an estimate, its unknowns as in `Layout`; shared is the mounting.
 
-    The mounting changes by a rotation vector in the robot frame, applied from the left, and height.
+    The mounting changes by a rotation vector in the robot frame, applied from the left, and place:
+    by as much of these as is unknown.
     """
     layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
@@ -114,12 +134,13 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
     by_pose, by_disc, by_mounting = (
         graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
     )
+    unknown = weighting.unknown_mounting
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
     whiten = graph.step_whitening
     blocks = [
         Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
-        Block(error.discs, seen, by_mounting if weighting.calibrate else None, loss),
+        Block(error.discs, seen, by_mounting[:, :, unknown] if unknown else None, loss),
         *_line_blocks(graph, estimate, error.lines, loss),
     ]
     if len(error.prior):
@@ -127,7 +148,10 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
         of_line = layout.first_line + 2 * np.arange(lines, dtype=np.int64)
         near = np.tile(np.eye(2) / LINE_PRIOR_M, (lines, 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
-    return stack(blocks, layout.size, MOUNTING_UNKNOWNS if weighting.calibrate else 0)
+    if len(error.place) and unknown:
+        by_place = np.eye(MOUNTING)[None, 3:5, unknown] / PLACE_PRIOR_M
+        blocks.append(Block(error.place, [], by_place))
+    return stack(blocks, layout.size, len(unknown))
 
 
 def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ from redetect.slam.mapping.graph import (
     graph_of_recording,
     with_lines,
 )
-from redetect.slam.mapping.graph_terms import MOUNTING_UNKNOWNS, Weighting, errors
+from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
@@ -65,7 +65,7 @@ def chi_squared(
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
     # The start is measured (it is the origin) and estimated, so it adds as much as it takes.
     measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose)
-    unknown = 3 * poses + 2 * landmarks + MOUNTING_UNKNOWNS * weighting.calibrate
+    unknown = 3 * poses + 2 * landmarks + len(weighting.unknown_mounting)
     # What a lost step says is as good as nothing.
     expected = measured - unknown - 3 * lost_steps
     factor = sum(parts) / expected if expected > 0 else math.nan
@@ -133,9 +133,9 @@ class LeftOut:
 class Mounting:
     """A camera's mounting as the run has it."""
 
-    # (4,): rotation vector in the robot frame (rad) and height (m), true less calibrated.
+    # (6,): rotation vector in the robot frame (rad) and place (m), true less calibrated.
     change: FloatArray
-    covariance: FloatArray  # (4, 4)
+    covariance: FloatArray  # (6, 6), zero where a number was no unknown
     robot_from_camera: FloatArray  # (3, 4)
     gain: float  # by how much less the sum of squares is than with the mounting as calibrated
 

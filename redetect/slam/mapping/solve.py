@@ -28,7 +28,14 @@ from redetect.least_squares.solver import (
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.mapping.graph_terms import Layout, Weighting, cost, layout_of, linearise
+from redetect.slam.mapping.graph_terms import (
+    MOUNTING,
+    Layout,
+    Weighting,
+    cost,
+    layout_of,
+    linearise,
+)
 
 _MOST_STEPS = 200
 
@@ -40,7 +47,8 @@ class Marginals:
     poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
     discs: FloatArray  # (M, 2, 2)
     lines: FloatArray  # (K, 2, 2)
-    mounting: FloatArray | None  # (4, 4): of the rotation vector (rad) and the height (m)
+    # (6, 6): of the rotation vector (rad) and the place (m), zero where that is no unknown.
+    mounting: FloatArray | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +65,9 @@ class _MapProblem:
         return linearise(self.graph, at, self.weighting)
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
-        return moved(at, layout_of(self.graph), step, shared)
+        change = np.zeros(MOUNTING)
+        change[self.weighting.unknown_mounting] = shared
+        return moved(at, layout_of(self.graph), step, change)
 
     def with_best_positions(self, trial: Estimate, reached: float) -> tuple[Estimate, float]:
         """A trial with positions fitted to its headings, if that lowers the cost, and its cost."""
@@ -72,7 +82,7 @@ class _MapProblem:
         except np.linalg.LinAlgError:
             return trial, reached
         step[free] = -normal.solve(jacobian.T @ problem.residual)
-        fitted = moved(trial, layout, step, np.zeros(0))
+        fitted = moved(trial, layout, step, np.zeros(MOUNTING))
         fitted_cost = self.cost(fitted)
         return (fitted, fitted_cost) if fitted_cost < reached else (trial, reached)
 
@@ -144,7 +154,11 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
     with _determined("covariances"):
         found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
     poses = np.concatenate([np.zeros((1, 3, 3)), found[0]])
-    return Marginals(poses, found[1], found[2], shared if weighting.calibrate else None)
+    mounting = None
+    if weighting.calibrate:
+        mounting = np.zeros((MOUNTING, MOUNTING))
+        mounting[np.ix_(weighting.unknown_mounting, weighting.unknown_mounting)] = shared
+    return Marginals(poses, found[1], found[2], mounting)
 
 
 def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
@@ -159,7 +173,7 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
 
 
 def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:
-    """An estimate after a step (K,) of all unknowns but the mounting, and (0,) or (4,) of that."""
+    """An estimate after a step (K,) of all unknowns but the mounting, and (6,) of that."""
     poses, discs, lines = np.split(step, [layout.first_disc, layout.first_line])
     after = replace(
         estimate,
@@ -167,10 +181,10 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
         disc_xy=estimate.disc_xy + discs.reshape(-1, 2),
         line_xy=estimate.line_xy + lines.reshape(-1, 2),
     )
-    if mounting.size and estimate.mounting is not None:
+    if estimate.mounting is not None:
         turn = Rotation.from_rotvec(mounting[:3]).as_matrix()
-        changed = np.concatenate([turn @ estimate.mounting[:, :3], estimate.mounting[:, 3:]], 1)
-        changed[2, 3] += mounting[3]
+        place = estimate.mounting[:, 3] + mounting[3:]
+        changed = np.column_stack([turn @ estimate.mounting[:, :3], place])
         after = replace(after, mounting=changed)
     return after
 
