@@ -22,6 +22,7 @@ from functools import cache
 from typing import NoReturn
 
 from detect.errors import EXIT_FRAMES_FAILED
+from redetect.interrupts import outside_kernels
 from redetect.storage.messages import is_quiet
 
 _received = threading.Event()
@@ -34,7 +35,7 @@ def interrupts_call(note: Callable[..., object]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, note)
+    before = signal.signal(signal.SIGINT, outside_kernels(note))
     try:
         yield
     finally:
