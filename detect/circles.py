@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
@@ -42,8 +41,7 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import floor_positions
-
-FloatArray = NDArray[np.float64]
+from redetect.array_types import FloatArray, GreyImage, IntArray
 
 #: The published covariance: this deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M = 0.04
@@ -61,29 +59,14 @@ _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
 @dataclass(frozen=True)
 class CircleDetections:
-    """The discs found in one image, in scan order of their pixels.
+    """The discs found in one image, in scan order of their pixels."""
 
-    Attributes
-    ----------
-    pixels : (N, 2) int64
-        Pixel (u, v) of each local maximum of the quality.
-    floor_xy : (N, 2) float64
-        Position in the robot frame, metres.
-    covariance : (N, 2, 2) float64
-        Of the position, square metres.
-    quality : (N,) float64
-        Otsu's quality at the pixel, 0 to 1.
-    evidence : (N,) float64
-        Log-odds that it is a disc; NaN where nothing was fitted.
-    levelled_by : (float, float) or None
-        Pitch and roll (rad) that turned the positions level, if any did.
-    """
-
-    pixels: NDArray[np.int64]
-    floor_xy: FloatArray
-    covariance: FloatArray
-    quality: FloatArray
-    evidence: FloatArray
+    pixels: IntArray  #: (N, 2) pixel (u, v) of each local maximum of the quality
+    floor_xy: FloatArray  #: (N, 2) position in the robot frame, metres
+    covariance: FloatArray  #: (N, 2, 2) of the position, square metres
+    quality: FloatArray  #: (N,) Otsu's quality at the pixel, 0 to 1
+    evidence: FloatArray  #: (N,) log-odds that it is a disc; NaN where nothing was fitted
+    #: Pitch and roll (rad) that turned the positions level, if any did
     levelled_by: tuple[float, float] | None = None
 
     def __len__(self) -> int:
@@ -91,7 +74,7 @@ class CircleDetections:
 
 
 def detect_circles(
-    image: NDArray[np.uint8], camera: Camera, table: VoteTable | DiscTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: VoteTable | DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """Find the discs in one image.
 
@@ -147,7 +130,7 @@ def _between_margins(
 
 
 def _by_rims(
-    image: NDArray[np.uint8], camera: Camera, table: VoteTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
 ) -> CircleDetections:
     """The default detector: discs by their rims, placed by fits."""
     noise = estimate_noise(image, _NOISE_ROWS)
@@ -174,7 +157,7 @@ def _by_rims(
 
 
 def candidates_of(
-    image: NDArray[np.uint8], table: VoteTable, settings: CircleSettings, noise: float
+    image: GreyImage, table: VoteTable, settings: CircleSettings, noise: float
 ) -> HoughCandidates:
     """Centres for which edges vote; parameters as of `detect_circles`, and the noise."""
     usual = min(max(steep_gradient(image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
@@ -183,7 +166,7 @@ def candidates_of(
 
 
 def judged(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     camera: Camera,
     settings: CircleSettings,
     candidates: HoughCandidates,
@@ -222,9 +205,7 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
     return adjusted
 
 
-def best_discs(
-    judgement: Judgement, log_odds: FloatArray, settings: CircleSettings
-) -> NDArray[np.int64]:
+def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
     """Indices of the candidates that are discs, none within the separation of a better one."""
     taken = np.flatnonzero(log_odds >= settings.evidence)
     places = judgement.floor_xy[taken]
@@ -232,11 +213,7 @@ def best_discs(
 
 
 def scene_of(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    table: VoteTable,
-    settings: CircleSettings,
-    noise: float,
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
     """An image, and how discs are placed in it; parameters as of `detect_circles`."""
     kernel = _kernel_camera(camera)
@@ -247,7 +224,7 @@ def scene_of(
 
 
 def _by_quality(
-    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The published detector: centres of the table by their quality and contrast alone."""
     weakest = settings.least_contrast
@@ -296,7 +273,7 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     )
 
 
-def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
     """Positions on the floor that are pixels, as the data set has them.
 
     Parameters

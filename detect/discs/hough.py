@@ -22,13 +22,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.candidates import apart
 from lut import VoteTable
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.3
@@ -51,7 +49,7 @@ class HoughCandidates(NamedTuple):
 
 
 def hough_candidates(
-    image: NDArray[np.uint8], table: VoteTable, radius: float, sign: int, least_step: float
+    image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
     """Centres of discs of one radius by the votes of the edges.
 
@@ -84,8 +82,8 @@ def hough_candidates(
 
 @kernel()
 def count_votes(
-    image: NDArray[np.uint8], table: VoteTable, radius: FloatArray, least_step: float
-) -> NDArray[np.float32]:
+    image: GreyImage, table: VoteTable, radius: FloatArray, least_step: float
+) -> Float32Array:
     """(S, M, columns) votes for each cell, shares of a rim, for S radii: of dark discs negative."""
     votes = np.zeros((len(radius), len(table.ahead), table.columns), np.float32)
     width = table.pixel.shape[1]
@@ -131,7 +129,7 @@ def count_votes(
 
 
 @kernel(fastmath={"reassoc", "nsz"})
-def _peaks(votes: NDArray[np.float32], table: VoteTable) -> tuple[FloatArray, FloatArray]:
+def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Places (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     score = np.zeros((rows, columns), np.float32)

@@ -37,9 +37,8 @@ from detect.discs.rim_network import (
     network_inputs,
     network_log_odds,
 )
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Where grey values count as of the disc and of the floor, nominal radii.
 _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
@@ -74,47 +73,23 @@ class Sought(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """Candidates and what became of them; step and later mean something for judged rims.
+    """N candidates and what became of them; step and later mean something for judged rims."""
 
-    Attributes
-    ----------
-    fate : (N,) int8
-        Indices of `FATES`.
-    value : (N,) float64
-        The number that decided: log-odds, or a share of the rim.
-    sign : (N,) float64
-        1 of light discs, -1 of dark ones.
-    features : (N, len(FEATURES)) float64
-    agreeing, radius : (N,) float64
-        Share of the rim that is on a circle, and the radius of that, metres.
-    floor_xy : (N, 2) float64
-        Centre of the rim, metres; where it was not followed, of the candidate.
-    seen_from, doubt : (N, 2) float64
-        Where the rim was followed from, and the difference to the centre of the rim that is found
-        from the other start, metres.
-    step : (N,) float64
-        Of the grey value at the rim, inside minus outside.
-    floor_grey : (N,) float64
-        Mean grey value of the floor round it.
-    quality : (N,) float64
-        Otsu's, of the disc and that floor.
-    log_odds : (N,) float64
-        That it is a disc.
-    """
-
-    fate: NDArray[np.int8]
-    value: FloatArray
-    sign: FloatArray
-    features: FloatArray
-    agreeing: FloatArray
-    radius: FloatArray
+    fate: NDArray[np.int8]  #: (N,) indices of `FATES`
+    value: FloatArray  #: (N,) the number that decided: log-odds, or a share of the rim
+    sign: FloatArray  #: (N,) 1 of light discs, -1 of dark ones
+    features: FloatArray  #: (N, len(FEATURES))
+    agreeing: FloatArray  #: (N,) share of the rim that is on a circle,
+    radius: FloatArray  #: (N,) and the radius of that, metres
+    #: (N, 2) centre of the rim, metres; where it was not followed, of the candidate
     floor_xy: FloatArray
-    seen_from: FloatArray
+    seen_from: FloatArray  #: (N, 2) where the rim was followed from, metres,
+    #: (N, 2) and the difference to the centre of the rim that is found from the other start
     doubt: FloatArray
-    step: FloatArray
-    floor_grey: FloatArray
-    quality: FloatArray
-    log_odds: FloatArray
+    step: FloatArray  #: (N,) of the grey value at the rim, inside minus outside
+    floor_grey: FloatArray  #: (N,) mean grey value of the floor round it
+    quality: FloatArray  #: (N,) Otsu's, of the disc and that floor
+    log_odds: FloatArray  #: (N,) that it is a disc
 
     def where(self, chosen: NDArray[Any]) -> Judgement:
         """Some of the candidates, by indices or a mask."""
@@ -136,7 +111,7 @@ _FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 
 @kernel()
 def judge(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     candidates: HoughCandidates,
     sought: Sought,
     camera_numbers: FloatArray,
@@ -232,7 +207,7 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 
 @kernel()
 def glance(
-    image: NDArray[np.uint8], camera_numbers: FloatArray, x: float, y: float, radius: float
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> tuple[FloatArray, FloatArray]:
     """The nearest grey values along some directions, without perspective within the disc.
 

@@ -14,17 +14,15 @@ import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.fit import Fit, FitSettings, Scene, Start, fit_disc
 from detect.discs.patch import Reach
 from detect.discs.rim import Rim, follow_rim, median, profiles
+from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.judgement import Judgement
-
-FloatArray = NDArray[np.float64]
 
 #: Pixels of a whole disc, and of its edge.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)

@@ -20,9 +20,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Directions from the middle of a candidate.
@@ -82,51 +82,40 @@ _BEGIN, _MIDDLE, _END = (
 class Rim(NamedTuple):
     """The rim of a candidate; lengths are in nominal radii."""
 
-    agreeing: float
-    """Share of all directions in which the rim lies on the circle."""
-    visible: float
-    """Share of all directions in which the circle lies in the image."""
+    agreeing: float  #: Share of all directions in which the rim lies on the circle.
+    visible: float  #: Share of all directions in which the circle lies in the image.
+    #: Stretches of two and more neighbouring directions in which it is not on the circle.
     runs: int
-    """Stretches of two and more neighbouring directions in which it is not on the circle."""
-    scatter: float
-    """Root mean square distance of the points on the circle from it, in tolerances."""
+    scatter: float  #: Root mean square distance of the points on the circle from it, in tolerances.
+    #: Standard deviation of the step over the directions on the circle, relative to its mean.
     unevenness: float
-    """Standard deviation of the step over the directions on the circle, relative to its mean."""
-    step: float
-    """Mean step of the grey value on the circle (grey levels, inside minus outside)."""
-    x: float
-    """Centre on the floor, metres."""
+    step: float  #: Mean step of the grey value on the circle (grey levels, inside minus outside).
+    x: float  #: Centre on the floor, metres.
     y: float
-    radius: float
-    """Metres."""
-    cov_xx: float
-    """Covariance of the centre from the scatter of the points, square metres."""
+    radius: float  #: Metres.
+    cov_xx: float  #: Covariance of the centre from the scatter of the points, square metres.
     cov_xy: float
     cov_yy: float
-    radius_px: float
-    """Geometric mean of the radius over the directions, pixels."""
+    radius_px: float  #: Geometric mean of the radius over the directions, pixels.
+    #: Towards another circle that the rim may be: its square adds to any covariance, metres.
     doubt_x: float
-    """Towards another circle that the rim may be: its square adds to any covariance, metres."""
     doubt_y: float
 
 
 class Profiles(NamedTuple):
     """Grey values along the directions from a point of the floor."""
 
-    x: float
-    """Where the directions begin, metres."""
+    x: float  #: Where the directions begin, metres.
     y: float
-    radius: float
-    """Nominal radius, metres."""
-    grey: NDArray[np.float64]
-    """(DIRECTIONS, STEPS) NaN outside the image."""
-    pixels_per_radius: NDArray[np.float64]
-    """(DIRECTIONS,) Length of a radius in the image in each direction, pixels."""
+    radius: float  #: Nominal radius, metres.
+    grey: FloatArray  #: (DIRECTIONS, STEPS) NaN outside the image.
+    #: (DIRECTIONS,) Length of a radius in the image in each direction, pixels.
+    pixels_per_radius: FloatArray
 
 
 @kernel()
 def profiles(
-    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], x: float, y: float, radius: float
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> Profiles:
     """Grey values along the directions from a point of the floor.
 
@@ -164,7 +153,7 @@ def profiles(
 
 
 @kernel()
-def rim_points(seen: Profiles, contrast: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
     """Where along each direction the grey value changes most from the disc's to the floor's.
 
     Parameters
@@ -217,19 +206,14 @@ class Circle(NamedTuple):
     x: float
     y: float
     radius: float
-    cov_xx: float
-    """Covariance of the centre, for points as scattered as `POINT_SIGMA_PX`."""
+    cov_xx: float  #: Covariance of the centre, for points as scattered as `POINT_SIGMA_PX`.
     cov_xy: float
     cov_yy: float
 
 
 @kernel()
 def fit_circle(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    circle: Circle,
-    radius_sigma: float,
+    x: FloatArray, y: FloatArray, weight: FloatArray, circle: Circle, radius_sigma: float
 ) -> Circle:
     """One Gauss-Newton step of centre and radius to weighed points, from a circle near to them.
 
@@ -282,13 +266,13 @@ def _bounded(step: float) -> float:
 
 @kernel()
 def _choose(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    x: FloatArray,
+    y: FloatArray,
+    weight: FloatArray,
+    tolerance: FloatArray,
     circle: Circle,
     wide: float,
-    chosen: NDArray[np.float64],
+    chosen: FloatArray,
 ) -> tuple[int, bool]:
     """Weights of the points on a circle, 0 of others; how many are on it, and whether others were.
 
@@ -309,11 +293,7 @@ def _choose(
 
 @kernel()
 def best_circle(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
-    best_chosen: NDArray[np.float64],
+    x: FloatArray, y: FloatArray, weight: FloatArray, tolerance: FloatArray, best_chosen: FloatArray
 ) -> tuple[Circle, int, tuple[float, float]]:
     """The circle that most of some points are on.
 
@@ -381,7 +361,7 @@ def best_circle(
 
 @kernel()
 def follow_rim(
-    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], seen: Profiles, contrast: float
+    image: GreyImage, camera_numbers: FloatArray, seen: Profiles, contrast: float
 ) -> Rim:
     """Follow the rim of a candidate.
 
@@ -459,9 +439,7 @@ def follow_rim(
 
 
 @kernel()
-def _placed(
-    x: NDArray[np.float64], y: NDArray[np.float64], chosen: NDArray[np.float64], circle: Circle
-) -> Circle:
+def _placed(x: FloatArray, y: FloatArray, chosen: FloatArray, circle: Circle) -> Circle:
     """The circle by the inner points of each stretch.
 
     Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
@@ -495,7 +473,7 @@ def _placed(
 
 
 @kernel()
-def median(values: NDArray[np.float64]) -> float:
+def median(values: FloatArray) -> float:
     """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
     count = len(values)
     for i in range(1, count):
