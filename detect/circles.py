@@ -346,27 +346,3 @@ def refined_covariance(
             np.radians(settings.tilt_sigma_deg) ** 2,
         )
     )
-
-
-def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """How far positions seem to move when the robot tilts about the robot frame's X and Y axes.
-
-    The robot tilts about its origin on the floor: a floor point then has the height
-    x w_Y - y w_X in the robot's frame, and is seen where the ray through it meets the floor that
-    the calibration believes in.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    floor_xy : (N, 2) float64
-        Positions, metres.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        d(X, Y) / d(rotation about X, about Y), metres per radian.
-    """
-    per_height = (floor_xy - camera.centre[:2]) / camera.centre[2]
-    height_per_tilt = np.stack([-floor_xy[:, 1], floor_xy[:, 0]], axis=-1)
-    return np.asarray(per_height[:, :, None] * height_per_tilt[:, None, :])

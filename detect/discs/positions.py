@@ -2,9 +2,9 @@
 
 With J = d(x, y) / d(u, v), the floor's Jacobian at a position (the inverse of the projection's, by
 central differences), a position has the covariance of its fit, plus p J J^T for a systematic error
-in the image, plus what the tilt of the robot may do: pitch and roll move a position along the line
-of sight, by its offset from the camera over the camera's height, times the height that the tilt
-seems to give the position (`detect.circles.tilt_jacobian`).
+in the image, plus what the tilt of the robot may do: turned about its origin on the floor, by w_X
+and w_Y, it gives a position (x, y) the height x w_Y - y w_X, which moves the position along the
+line of sight, by its offset from the camera over the camera's height.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def refined_covariances(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         _add_pixels(camera_numbers, x, y, pixel_variance, result[k])
-        # A product of a column and a row: see `detect.circles.tilt_jacobian`.
+        # A product of a column, and a row (-y, x) whose square is x^2 + y^2.
         sight = np.array([(x - centre[0]) / centre[2], (y - centre[1]) / centre[2]])
         for i in range(2):
             for j in range(2):

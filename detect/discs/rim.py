@@ -83,12 +83,9 @@ class Rim(NamedTuple):
     """The rim of a candidate; lengths are in nominal radii."""
 
     agreeing: float  #: Share of all directions in which the rim lies on the circle.
-    visible: float  #: Share of all directions in which the circle lies in the image.
     #: Stretches of two and more neighbouring directions in which it is not on the circle.
     runs: int
     scatter: float  #: Root mean square distance of the points on the circle from it, in tolerances.
-    #: Standard deviation of the step over the directions on the circle, relative to its mean.
-    unevenness: float
     step: float  #: Mean step of the grey value on the circle (grey levels, inside minus outside).
     x: float  #: Centre on the floor, metres.
     y: float
@@ -394,14 +391,10 @@ def follow_rim(
     chosen = np.zeros(DIRECTIONS)
     best, best_count, doubt = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(log_px)
-    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
     if best_count < LEAST_POINTS:
-        return nothing
+        return Rim(0.0, 0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
     height, width = image.shape
-    squares = 0.0
-    mean = 0.0
-    mean_2 = 0.0
-    visible = 0
+    squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
         u, v = project_floor_point(
@@ -409,16 +402,11 @@ def follow_rim(
             x + radius * (best.x + best.radius * COS[k]),
             y + radius * (best.y + best.radius * SIN[k]),
         )
-        inside = 0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0
-        visible += inside
-        outside[k] = not inside
+        outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
             squares += (off / tolerance[k]) ** 2
             mean += step[k]
-            mean_2 += step[k] ** 2
-    mean /= best_count
-    mean_2 = max(mean_2 / best_count - mean * mean, 0.0)
     runs = 0
     for k in range(DIRECTIONS):
         # A stretch begins after a direction that agrees, and has two that do not.
@@ -430,8 +418,7 @@ def follow_rim(
     best = _placed(at_x, at_y, chosen, best)
     area = _ALIKE * radius * radius
     return Rim(
-        best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
-        math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
+        best_count / DIRECTIONS, runs, scatter, mean / best_count,
         x + radius * best.x, y + radius * best.y, radius_found,
         area * best.cov_xx, area * best.cov_xy, area * best.cov_yy, radius_px,
         radius * doubt[0], radius * doubt[1],
