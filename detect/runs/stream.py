@@ -195,7 +195,7 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
-        crew = stack.enter_context(Crew(workers))
+        crew = stack.enter_context(closing(Crew(workers)))
         plan = replace(job.plan, json="json" in job.places)
         plan = replace(plan, lean=_lean_of(job.run, plan, crew))
         job, summary.lean = replace(job, plan=plan), plan.lean
@@ -203,11 +203,11 @@ def detect_run(
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
         tasks = files.take_over(every, count)
-        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, crew))):
+        for frames in detect_chunks(tasks, plan, crew):
             files.add(frames)
             for _, rows in frames:
                 count(rows)
-        crew.end()
+        crew.close()
         summary.images_without_step = job.run.frames.left_out
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
@@ -232,8 +232,7 @@ def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
         tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
-        with closing(detect_chunks(tasks, plan, crew)) as chunks:
-            return [rows for chunk in chunks for _, rows in chunk]
+        return [rows for chunk in detect_chunks(tasks, plan, crew) for _, rows in chunk]
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
     rows = rows_by(level)
