@@ -173,18 +173,9 @@ def judged(
     noise: float,
     networks: Networks | None = None,
 ) -> Judgement:
-    """What candidates are (see `detect.discs.judgement`).
+    """What candidates are (see `detect.discs.judgement`); parameters as of `candidates_of`.
 
-    Parameters
-    ----------
-    image, camera, settings
-        As of `detect_circles`.
-    candidates : HoughCandidates
-        Of `candidates_of`.
-    noise : float
-        Of the image, grey levels.
-    networks : Networks, optional
-        Others than the trained ones.
+    The networks are the trained ones, unless others are given.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     sought = Sought(settings.radius_m, max(weakest, _LEAST_STEP))
@@ -274,22 +265,11 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
 
 
 def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Positions on the floor that are pixels, as the data set has them.
+    """Positions on the floor that (N, 2) pixels (u, v) are, as the data set has them.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    pixels : (N, 2) int64
-        Pixels (u, v).
-
-    Returns
-    -------
-    floor_xy : (N, 2) float64
-        Robot frame, metres; NaN where a pixel does not see the floor.
-    covariance : (N, 2, 2) float64
-        (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
-        (`Camera.floor_jacobian_published`).
+    Returns (N, 2) places in the robot frame, metres, NaN where a pixel does not see the floor, and
+    (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
+    the position (`Camera.floor_jacobian_published`).
     """
     numbers, floor_xy = _kernel_camera(camera).published, floor_positions(camera)
     return pixel_positions(
@@ -317,23 +297,9 @@ def _kernel_camera(camera: Camera) -> _KernelCamera:
 def refined_covariance(
     camera: Camera, floor_xy: FloatArray, fitted: FloatArray, settings: CircleSettings
 ) -> FloatArray:
-    """Covariance of refined positions: the fit's, the systematic floor, the camera's tilt.
+    """(N, 2, 2) covariances of refined positions (N, 2), square metres.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    floor_xy : (N, 2) float64
-        Refined positions, metres.
-    fitted : (N, 2, 2) float64
-        Covariances of the fits.
-    settings : CircleSettings
-        `systematic_px` and `tilt_sigma_deg`.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        Square metres.
+    They are the fits', and what the settings add: `systematic_px` and `tilt_sigma_deg`.
     """
     kernel = _kernel_camera(camera)
     return np.asarray(

@@ -205,16 +205,7 @@ def eliminate(matrices: FloatArray, k: int) -> None:
 
 @kernel()
 def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
-    """Fit a disc.
-
-    Parameters
-    ----------
-    scene : Scene
-    start : Start
-    settings : FitSettings
-    work : WORK
-        Working space.
-    """
+    """Fit a disc; `work` is the working space, a `WORK`."""
     patch, rows, by_parts = work.patch, work.rows, settings.by_parts
     candidate, begin = _candidate_at(scene, settings.radius, start)
     shape, ends = gather(

@@ -51,18 +51,10 @@ class HoughCandidates(NamedTuple):
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Centres of discs of one radius by the votes of the edges.
+    """Centres of discs of one radius (m), for which the table is, by the votes of the edges.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    table : VoteTable
-    radius : float
-        For which that is, metres.
-    sign : int
-        1 for light discs, -1 for dark ones, 0 for both.
-    least_step : float
-        Gradient of an edge, grey levels per pixel.
+    The sign is 1 for light discs, -1 for dark ones, 0 for both; the gradient of an edge is at least
+    `least_step`, grey levels per pixel.
     """
     if not len(table.image_row):
         return HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))

@@ -117,17 +117,7 @@ def judge(
     camera_numbers: FloatArray,
     networks: Networks,
 ) -> Judgement:
-    """Judge candidates, the best first.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-    candidates : HoughCandidates
-    sought : Sought
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    networks : Networks
-    """
+    """Judge candidates, the best first; the numbers are `camera.kernels.camera_numbers`."""
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
     seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))

@@ -159,28 +159,12 @@ def gather(
     start: Disc,
     patch: Any,
 ) -> tuple[int, IntArray]:
-    """Fill a patch with the pixels round a candidate; none where it sees no floor.
+    """Fill a patch (`PATCH`) with the pixels round a candidate; none where it sees no floor.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    candidate : Candidate
-    blur_ratio : float
-        Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames.
-    reach : Reach
-    start : Disc
-        Where the fit starts.
-    patch : PATCH
-        The result.
-
-    Returns
-    -------
-    shape : int
-        `EDGE`, or along which axis chords run.
-    ends : (SECTORS + 1,) int64
-        Where in the patch each sector begins, and the last ends.
+    Pixels see the floor at `floor_xy` (H, W, 2), metres. `blur_ratio` is the blur along v over that
+    along u, in pixels: 0.5 in single fields of interlaced frames. The fit begins at `start`.
+    Returns the shape (`EDGE`, or along which axis chords run), and (SECTORS + 1,) where in the
+    patch each sector begins, and the last ends.
     """
     ends = np.zeros(SECTORS + 1, np.int64)
     view = view_of(floor_xy, candidate, start.radius, blur_ratio)

@@ -67,22 +67,10 @@ class Size(NamedTuple):
 
 @kernel()
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
-    """Place discs by fits: those that are wholly in view, then the others, of about their size.
+    """Place N discs by fits: those that are wholly in view, then the others, of about their size.
 
-    Parameters
-    ----------
-    scene : Scene
-    discs : Judgement
-        Of N discs.
-    work : WORK
-        Working space.
-
-    Returns
-    -------
-    floor_xy : (N, 2) float64
-        Centres, metres.
-    covariance : (N, 2, 2) float64
-        Square metres.
+    Returns (N, 2) centres, metres, and their (N, 2, 2) covariances; `work` is the working space, a
+    `detect.discs.fit.WORK`.
     """
     count = len(discs.step)
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -216,14 +204,8 @@ def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
     itself does a little. The radius of a part of a disc trades with its place, so it has to be
     known otherwise: as the robust mean of the others, with the scatter about that.
 
-    Parameters
-    ----------
-    nominal : float
-        Radius of discs, metres.
-    radii : (N, 2) float64
-        Radius of each disc, metres, and one over its variance; 0 where nothing is known.
-    k : int
-        The disc.
+    `radii` (N, 2) are those of each disc, metres, and one over their variance, 0 where nothing is
+    known; k is the disc.
     """
     radius, variance, count = np.empty(len(radii)), np.empty(len(radii)), 0
     for i in range(len(radii)):

@@ -114,15 +114,9 @@ class Profiles(NamedTuple):
 def profiles(
     image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> Profiles:
-    """Grey values along the directions from a point of the floor.
+    """Grey values along the directions from a point (x, y) of the floor, metres.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    x, y, radius : float
-        Where the directions begin, and the nominal radius, metres.
+    The radius is the nominal one, the camera's numbers are `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
@@ -153,18 +147,8 @@ def profiles(
 def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
     """Where along each direction the grey value changes most from the disc's to the floor's.
 
-    Parameters
-    ----------
-    seen : Profiles
-    contrast : float
-        Grey levels inside minus outside.
-
-    Returns
-    -------
-    distance : (DIRECTIONS,) float64
-        From the middle, nominal radii; NaN where no step reaches `LEAST_STEP` of the contrast.
-    step : (DIRECTIONS,) float64
-        The step there, grey levels.
+    Returns (DIRECTIONS,) distances from the middle, nominal radii, NaN where no step reaches
+    `LEAST_STEP` of the contrast (grey levels inside minus outside), and the steps there.
     """
     distance, step = np.empty(DIRECTIONS), np.zeros(DIRECTIONS)
     per_step = (FARTHEST - NEAREST) / (STEPS - 1)
@@ -292,27 +276,12 @@ def _choose(
 def best_circle(
     x: FloatArray, y: FloatArray, weight: FloatArray, tolerance: FloatArray, best_chosen: FloatArray
 ) -> tuple[Circle, int, tuple[float, float]]:
-    """The circle that most of some points are on.
+    """The circle that most of some points are on, how many these are, and a doubt.
 
-    Parameters
-    ----------
-    x, y : (DIRECTIONS,) float64
-        Points about the candidate, nominal radii.
-    weight : (DIRECTIONS,) float64
-        0 where there is no point.
-    tolerance : (DIRECTIONS,) float64
-        What is nearer than this to a circle is on it, nominal radii.
-    best_chosen : (DIRECTIONS,) float64
-        Result: the weights of the points on the circle, 0 of the others.
-
-    Returns
-    -------
-    circle : Circle
-    count : int
-        How many points are on it.
-    doubt : (float, float)
-        Towards another circle that points may be of: the square of this is what that adds to the
-        covariance of the centre, nominal radii.
+    Of (DIRECTIONS,) points about the candidate, nominal radii, those without a weight are none, and
+    those nearer to a circle than their tolerance are on it; `best_chosen` gets the weights of the
+    points on the best one, 0 of the others. The doubt leads towards another circle that points may
+    be of: its square adds to the covariance of the centre.
     """
     points = 0
     for k in range(DIRECTIONS):
@@ -360,22 +329,9 @@ def best_circle(
 def follow_rim(
     image: GreyImage, camera_numbers: FloatArray, seen: Profiles, contrast: float
 ) -> Rim:
-    """Follow the rim of a candidate.
+    """Follow the rim of a candidate, `seen` from about its middle; nothing agrees without a circle.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    seen : Profiles
-        From about the middle of the candidate.
-    contrast : float
-        About how much lighter the disc is than the floor, grey levels.
-
-    Returns
-    -------
-    Rim
-        With nothing agreeing where there is no circle.
+    The contrast is about how much lighter the disc is than the floor, grey levels.
     """
     x, y, radius, scale = seen.x, seen.y, seen.radius, seen.pixels_per_radius
     distance, step = rim_points(seen, contrast)
