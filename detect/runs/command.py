@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from detect.drawing.inputs import KINDS, read_head
+from detect.drawing.inputs import KINDS, RunRows, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.runs.outputs import frames_tilt_place, lean_sentence
@@ -53,7 +53,7 @@ def perform(command: DetectorFlags) -> int:
 
         files = {kind: path for kind, path in job.places.items() if kind in KINDS}
         plan = job.plan if getattr(command, "rejected", False) else None
-        draw_run(job.run, files, pictures, plan, overwrite=command.force)
+        draw_run(job.run, RunRows(files), pictures, plan, overwrite=command.force)
     _print_results(job, summary)
     for hint in _hints(job, summary):
         print(hint, file=sys.stderr)
