@@ -23,7 +23,7 @@ from detect.discs.candidates import alone_published, local_maxima, suppress_neig
 from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
 from detect.discs.fit import Scene, blur_ratio_of, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import JUDGED, Judgement, Sought, judge
+from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
@@ -41,7 +41,7 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import floor_positions
-from redetect.array_types import FloatArray, GreyImage, IntArray
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 #: The published covariance: this deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M = 0.04
@@ -71,6 +71,11 @@ class CircleDetections:
 
     def __len__(self) -> int:
         return len(self.quality)
+
+    def where(self, chosen: BoolArray) -> CircleDetections:
+        """Some of the discs, by a mask."""
+        own = {name: each[chosen] for name, each in vars(self).items() if name != "levelled_by"}
+        return replace(self, **own)
 
 
 def detect_circles(
@@ -178,9 +183,9 @@ def judged(
     The networks are the trained ones, unless others are given.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    sought = Sought(settings.radius_m, max(weakest, _LEAST_STEP))
-    numbers = _kernel_camera(camera).numbers
-    return judge(image, candidates, sought, numbers, networks or trained_networks())
+    step, numbers = max(weakest, _LEAST_STEP), _kernel_camera(camera).numbers
+    networks = networks or trained_networks()
+    return judge(image, candidates, settings.radius_m, step, numbers, networks)
 
 
 def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:

@@ -65,13 +65,6 @@ _SAME = 0.1
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
-class Sought(NamedTuple):
-    """Which discs are looked for."""
-
-    radius: float  # nominal, metres
-    least_step: float  # of the grey value at a rim, grey levels
-
-
 class Judgement(NamedTuple):
     """N candidates and what became of them; step and later mean something for judged rims."""
 
@@ -113,11 +106,15 @@ _FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 def judge(
     image: GreyImage,
     candidates: HoughCandidates,
-    sought: Sought,
+    nominal: float,
+    least_step: float,
     camera_numbers: FloatArray,
     networks: Networks,
 ) -> Judgement:
-    """Judge candidates, the best first; the numbers are `camera.kernels.camera_numbers`."""
+    """Judge candidates, the best first, for discs of a nominal radius, metres.
+
+    The grey value steps by `least_step` at a rim; the numbers are `camera.kernels.camera_numbers`.
+    """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
     seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
@@ -128,8 +125,8 @@ def judge(
     count = 0
     for i in range(n):
         x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
-        grey, scale = glance(image, camera_numbers, x, y, sought.radius)
-        contrast = _contrast(grey, sign, sought.least_step)
+        grey, scale = glance(image, camera_numbers, x, y, nominal)
+        contrast = _contrast(grey, sign, least_step)
         if contrast == 0.0:
             continue
         inputs, scales = network_inputs(grey, scale, sign)
@@ -137,24 +134,24 @@ def judge(
         fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
-        seen = profiles(image, camera_numbers, x, y, sought.radius)
+        seen = profiles(image, camera_numbers, x, y, nominal)
         rim = follow_rim(image, camera_numbers, seen, sign * contrast)
         fate[i], value[i] = _NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
         fate[i] = _SAME_RIM
-        if _is_known(judged[:count], rim, sign, sought.radius):
+        if _is_known(judged[:count], rim, sign, nominal):
             continue
-        seen = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+        seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
         odds, noted = _look(seen, rim, score[0], sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # From its own middle a rim is seen best, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, seen, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
-                seen_again = profiles(image, camera_numbers, again.x, again.y, sought.radius)
+                seen_again = profiles(image, camera_numbers, again.x, again.y, nominal)
                 more, noted_again = _look(seen_again, again, score[0], sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
-                if more > odds and not _is_known(judged[:count], again, sign, sought.radius):
+                if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
                     rim, odds, noted, seen = again, more, noted_again, seen_again
         fate[i], value[i], log_odds[i], step[i] = JUDGED, odds, odds, rim.step

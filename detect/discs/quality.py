@@ -124,8 +124,8 @@ def _quality_of(
 def find_centres(
     grey: ByteArray, outside: int, pixels: NDArray[np.int32],
     samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,
-) -> tuple[IntArray, FloatArray, Float32Array]:  # fmt: skip
-    """The centres of a `lut.DiscTable` within some limits: `Centres`.
+) -> Centres:  # fmt: skip
+    """The centres of a `lut.DiscTable` within some limits.
 
     `grey` is the image in scan order, H W pixels, and anything after it up to `GROUP_COLUMNS`
     pixels; `outside` is H W.
@@ -157,7 +157,7 @@ def find_centres(
             found_at[found, 0], found_at[found, 1] = pixels[c, 0], pixels[c, 1]
             quality[found], contrast[found] = of_centre, step
             found += 1
-    return found_at[:found], quality[:found], contrast[:found]
+    return Centres(found_at[:found], quality[:found], contrast[:found])
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
@@ -174,9 +174,7 @@ def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     grey = image.ravel()
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))
-    return Centres(
-        *find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
-    )
+    return find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
 
 
 def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, Float32Array]:
