@@ -21,7 +21,7 @@ from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
 from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
-from detect.discs.fit import Scene, blur_ratio_of, least_noise, working_space
+from detect.discs.fit import Scene, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
@@ -42,10 +42,6 @@ from lut import (
 )
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
-
-#: The published covariance: this deviation in every direction, and two pixels squared.
-PUBLISHED_FLOOR_M = 0.04
-PUBLISHED_PIXEL_VARIANCE = 2.0
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -212,11 +208,10 @@ def scene_of(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
     """An image, and how discs are placed in it; parameters as of `detect_circles`."""
-    kernel = _kernel_camera(camera)
-    return Scene(
-        image, table.floor_xy, settings.radius_m, least_noise(noise), kernel.blur_ratio,
-        kernel.numbers,
-    )  # fmt: skip
+    # Optics blur equally in all directions. Where a pixel is not square, as in single fields of
+    # interlaced frames, the same blur is fewer pixels along v.
+    ratio, numbers = camera.scale_y / camera.scale_x, _kernel_camera(camera).numbers
+    return Scene(image, table.floor_xy, settings.radius_m, least_noise(noise), ratio, numbers)
 
 
 def _by_quality(
@@ -276,10 +271,7 @@ def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, F
     (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
     the position (`Camera.floor_jacobian_published`).
     """
-    numbers, floor_xy = _kernel_camera(camera).published, floor_positions(camera)
-    return pixel_positions(
-        numbers, floor_xy, pixels, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE
-    )
+    return pixel_positions(_kernel_camera(camera).published, floor_positions(camera), pixels)
 
 
 class _KernelCamera(NamedTuple):
@@ -288,15 +280,12 @@ class _KernelCamera(NamedTuple):
     numbers: FloatArray
     published: FloatArray  # `published_camera_numbers`
     centre: FloatArray
-    blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
     centre = np.array(camera.centre, np.float64)
-    return _KernelCamera(
-        camera_numbers(camera), published_camera_numbers(camera), centre, blur_ratio_of(camera)
-    )
+    return _KernelCamera(camera_numbers(camera), published_camera_numbers(camera), centre)
 
 
 def refined_covariance(

@@ -61,7 +61,7 @@ def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> C
     jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
     covariance = jacobian @ found.covariance @ jacobian.swapaxes(1, 2)
     seen = replace(found, floor_xy=floor_xy, covariance=covariance)
-    return seen.where(np.isfinite(floor_xy).all(axis=-1))
+    return seen.where(np.asarray(np.isfinite(floor_xy).all(axis=-1)))
 
 
 def tilt_arrays(tilts: Sequence[FrameTilt]) -> tuple[FloatArray, FloatArray]:

@@ -36,7 +36,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
 from camera.kernels import project_floor_point
 from detect.discs.model import (
     BY_BLUR_1,
@@ -123,7 +122,7 @@ class Scene(NamedTuple):
     floor_xy: Float32Array
     radius: float  # nominal, metres
     noise: float  # grey levels
-    blur_ratio: float  # of `blur_ratio_of`
+    blur_ratio: float  # blur along v over that along u, in pixels
     camera_numbers: FloatArray
 
 
@@ -629,12 +628,3 @@ def working_space() -> NDArray[Any]:
 def least_noise(noise: float) -> float:
     """Noise of a scene: grey values are rounded."""
     return max(noise, _LEAST_NOISE)
-
-
-def blur_ratio_of(camera: Camera) -> float:
-    """Blur along v over blur along u, in pixels.
-
-    Optics blur equally in all directions. Where the scales differ, as in single fields of
-    interlaced frames, a pixel is not square, and the same blur is fewer pixels along v.
-    """
-    return camera.scale_y / camera.scale_x
