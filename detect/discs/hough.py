@@ -56,8 +56,6 @@ def hough_candidates(
     The sign is 1 for light discs, -1 for dark ones, 0 for both; the gradient of an edge is at least
     `least_step`, grey levels per pixel.
     """
-    if not len(table.image_row):
-        return HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
     signs = np.array([sign] if sign else [1.0, -1.0], np.float64)
     places, scores = [], []
     for votes in count_votes(image, table, radius * signs, least_step):
