@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.metadata import version
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, Lean, RunSummary
 from detect.runs.workers import Crew, Workers, detect_chunks, local_workers
 from detect.sources.interface import ImageRun, RunFrame
+from detect.sources.poses import SomeFrames
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
@@ -228,8 +229,7 @@ def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
     from detect.runs.frame import evidence_of, lean_of_run, pays  # loads the compiler
 
     step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
-    with closing(iter(run.frames)) as frames:
-        tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
+    tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _LEAN_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in detect_chunks(tasks, plan, crew) for _, rows in chunk]

@@ -153,9 +153,12 @@ def _circle(points: int) -> FloatArray:
 # -- which frames -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("every", "expected"), [(1, [0, 1, 2]), (2, [0, 2])])
-def test_frames_are_selected(small_run: Path, every: int, expected: list[int]) -> None:
-    frames = SomeFrames(open_source(small_run).frames, every=every)
+@pytest.mark.parametrize(
+    ("count", "every", "expected"),
+    [(0, 1, [0, 1, 2]), (0, 2, [0, 2]), (2, 1, [0, 1]), (2, 2, [0]), (9, 2, [0, 2])],
+)
+def test_frames_are_selected(small_run: Path, count: int, every: int, expected: list[int]) -> None:
+    frames = SomeFrames(open_source(small_run).frames, count, every)
     assert [frame.step.prefix for frame in frames] == [f"s.{k:04d}" for k in expected]
     assert frames.expected == len(expected)
 
