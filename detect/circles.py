@@ -16,15 +16,14 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
 from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
-from detect.discs.fit import Scene, blur_ratio_of, least_noise, working_space
+from detect.discs.fit import Scene, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import JUDGED, Judgement, Sought, judge
+from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
@@ -42,12 +41,7 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import floor_positions
-
-FloatArray = NDArray[np.float64]
-
-#: The published covariance: this deviation in every direction, and two pixels squared.
-PUBLISHED_FLOOR_M = 0.04
-PUBLISHED_PIXEL_VARIANCE = 2.0
+from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 #: For the noise floor an image's noise is never less than this: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -61,37 +55,27 @@ _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
 @dataclass(frozen=True)
 class CircleDetections:
-    """The discs found in one image, in scan order of their pixels.
+    """The discs found in one image, in scan order of their pixels."""
 
-    Attributes
-    ----------
-    pixels : (N, 2) int64
-        Pixel (u, v) of each local maximum of the quality.
-    floor_xy : (N, 2) float64
-        Position in the robot frame, metres.
-    covariance : (N, 2, 2) float64
-        Of the position, square metres.
-    quality : (N,) float64
-        Otsu's quality at the pixel, 0 to 1.
-    evidence : (N,) float64
-        Log-odds that it is a disc; NaN where nothing was fitted.
-    levelled_by : (float, float) or None
-        Pitch and roll (rad) that turned the positions level, if any did.
-    """
-
-    pixels: NDArray[np.int64]
-    floor_xy: FloatArray
-    covariance: FloatArray
-    quality: FloatArray
-    evidence: FloatArray
+    pixels: IntArray  #: (N, 2) pixel (u, v) of each local maximum of the quality
+    floor_xy: FloatArray  #: (N, 2) position in the robot frame, metres
+    covariance: FloatArray  #: (N, 2, 2) of the position, square metres
+    quality: FloatArray  #: (N,) Otsu's quality at the pixel, 0 to 1
+    evidence: FloatArray  #: (N,) log-odds that it is a disc; NaN where nothing was fitted
+    #: Pitch and roll (rad) that turned the positions level, if any did
     levelled_by: tuple[float, float] | None = None
 
     def __len__(self) -> int:
         return len(self.quality)
 
+    def where(self, chosen: BoolArray) -> CircleDetections:
+        """Some of the discs, by a mask."""
+        own = {name: each[chosen] for name, each in vars(self).items() if name != "levelled_by"}
+        return replace(self, **own)
+
 
 def detect_circles(
-    image: NDArray[np.uint8], camera: Camera, table: VoteTable | DiscTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: VoteTable | DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """Find the discs in one image.
 
@@ -147,7 +131,7 @@ def _between_margins(
 
 
 def _by_rims(
-    image: NDArray[np.uint8], camera: Camera, table: VoteTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
 ) -> CircleDetections:
     """The default detector: discs by their rims, placed by fits."""
     noise = estimate_noise(image, _NOISE_ROWS)
@@ -174,7 +158,7 @@ def _by_rims(
 
 
 def candidates_of(
-    image: NDArray[np.uint8], table: VoteTable, settings: CircleSettings, noise: float
+    image: GreyImage, table: VoteTable, settings: CircleSettings, noise: float
 ) -> HoughCandidates:
     """Centres for which edges vote; parameters as of `detect_circles`, and the noise."""
     usual = min(max(steep_gradient(image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
@@ -183,30 +167,21 @@ def candidates_of(
 
 
 def judged(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     camera: Camera,
     settings: CircleSettings,
     candidates: HoughCandidates,
     noise: float,
     networks: Networks | None = None,
 ) -> Judgement:
-    """What candidates are (see `detect.discs.judgement`).
+    """What candidates are (see `detect.discs.judgement`); parameters as of `candidates_of`.
 
-    Parameters
-    ----------
-    image, camera, settings
-        As of `detect_circles`.
-    candidates : HoughCandidates
-        Of `candidates_of`.
-    noise : float
-        Of the image, grey levels.
-    networks : Networks, optional
-        Others than the trained ones.
+    The networks are the trained ones, unless others are given.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    sought = Sought(settings.radius_m, max(weakest, _LEAST_STEP))
-    numbers = _kernel_camera(camera).numbers
-    return judge(image, candidates, sought, numbers, networks or trained_networks())
+    step, numbers = max(weakest, _LEAST_STEP), _kernel_camera(camera).numbers
+    networks = networks or trained_networks()
+    return judge(image, candidates, settings.radius_m, step, numbers, networks)
 
 
 def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
@@ -222,9 +197,7 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
     return adjusted
 
 
-def best_discs(
-    judgement: Judgement, log_odds: FloatArray, settings: CircleSettings
-) -> NDArray[np.int64]:
+def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
     """Indices of the candidates that are discs, none within the separation of a better one."""
     taken = np.flatnonzero(log_odds >= settings.evidence)
     places = judgement.floor_xy[taken]
@@ -232,22 +205,17 @@ def best_discs(
 
 
 def scene_of(
-    image: NDArray[np.uint8],
-    camera: Camera,
-    table: VoteTable,
-    settings: CircleSettings,
-    noise: float,
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
     """An image, and how discs are placed in it; parameters as of `detect_circles`."""
-    kernel = _kernel_camera(camera)
-    return Scene(
-        image, table.floor_xy, settings.radius_m, least_noise(noise), kernel.blur_ratio,
-        kernel.numbers,
-    )  # fmt: skip
+    # Optics blur equally in all directions. Where a pixel is not square, as in single fields of
+    # interlaced frames, the same blur is fewer pixels along v.
+    ratio, numbers = camera.scale_y / camera.scale_x, _kernel_camera(camera).numbers
+    return Scene(image, table.floor_xy, settings.radius_m, least_noise(noise), ratio, numbers)
 
 
 def _by_quality(
-    image: NDArray[np.uint8], camera: Camera, table: DiscTable, settings: CircleSettings
+    image: GreyImage, camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
     """The published detector: centres of the table by their quality and contrast alone."""
     weakest = settings.least_contrast
@@ -296,28 +264,14 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     )
 
 
-def published_positions(camera: Camera, pixels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Positions on the floor that are pixels, as the data set has them.
+def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Positions on the floor that (N, 2) pixels (u, v) are, as the data set has them.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    pixels : (N, 2) int64
-        Pixels (u, v).
-
-    Returns
-    -------
-    floor_xy : (N, 2) float64
-        Robot frame, metres; NaN where a pixel does not see the floor.
-    covariance : (N, 2, 2) float64
-        (0.04 m)^2 I + 2 px^2 J J^T, square metres. J is the Jacobian of the position
-        (`Camera.floor_jacobian_published`).
+    Returns (N, 2) places in the robot frame, metres, NaN where a pixel does not see the floor, and
+    (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
+    the position (`Camera.floor_jacobian_published`).
     """
-    numbers, floor_xy = _kernel_camera(camera).published, floor_positions(camera)
-    return pixel_positions(
-        numbers, floor_xy, pixels, PUBLISHED_FLOOR_M**2, PUBLISHED_PIXEL_VARIANCE
-    )
+    return pixel_positions(_kernel_camera(camera).published, floor_positions(camera), pixels)
 
 
 class _KernelCamera(NamedTuple):
@@ -326,37 +280,20 @@ class _KernelCamera(NamedTuple):
     numbers: FloatArray
     published: FloatArray  # `published_camera_numbers`
     centre: FloatArray
-    blur_ratio: float
 
 
 @lru_cache(maxsize=4)
 def _kernel_camera(camera: Camera) -> _KernelCamera:
     centre = np.array(camera.centre, np.float64)
-    return _KernelCamera(
-        camera_numbers(camera), published_camera_numbers(camera), centre, blur_ratio_of(camera)
-    )
+    return _KernelCamera(camera_numbers(camera), published_camera_numbers(camera), centre)
 
 
 def refined_covariance(
     camera: Camera, floor_xy: FloatArray, fitted: FloatArray, settings: CircleSettings
 ) -> FloatArray:
-    """Covariance of refined positions: the fit's, the systematic floor, the camera's tilt.
+    """(N, 2, 2) covariances of refined positions (N, 2), square metres.
 
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    floor_xy : (N, 2) float64
-        Refined positions, metres.
-    fitted : (N, 2, 2) float64
-        Covariances of the fits.
-    settings : CircleSettings
-        `systematic_px` and `tilt_sigma_deg`.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        Square metres.
+    They are the fits', and what the settings add: `systematic_px` and `tilt_sigma_deg`.
     """
     kernel = _kernel_camera(camera)
     return np.asarray(
@@ -369,27 +306,3 @@ def refined_covariance(
             np.radians(settings.tilt_sigma_deg) ** 2,
         )
     )
-
-
-def tilt_jacobian(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """How far positions seem to move when the robot tilts about the robot frame's X and Y axes.
-
-    The robot tilts about its origin on the floor: a floor point then has the height
-    x w_Y - y w_X in the robot's frame, and is seen where the ray through it meets the floor that
-    the calibration believes in.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    floor_xy : (N, 2) float64
-        Positions, metres.
-
-    Returns
-    -------
-    (N, 2, 2) float64
-        d(X, Y) / d(rotation about X, about Y), metres per radian.
-    """
-    per_height = (floor_xy - camera.centre[:2]) / camera.centre[2]
-    height_per_tilt = np.stack([-floor_xy[:, 1], floor_xy[:, 0]], axis=-1)
-    return np.asarray(per_height[:, :, None] * height_per_tilt[:, None, :])

@@ -43,7 +43,7 @@ from detect.options import (
 )
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
-from detect.settings_files import read_settings
+from detect.settings_files import SettingsFile, read_settings
 from detect.terminal import interrupts_noted, show_announcements
 from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
 from redetect.storage.messages import is_quiet
@@ -113,22 +113,21 @@ def parsed(arguments: Sequence[str]) -> Any:
         deciding.add_argument(flag, nargs="?", default="", const="")
     given = deciding.parse_known_args(arguments)[0]
     preset, file = given.preset, given.settings
-    circles = CIRCLE_PRESETS.get(preset, CircleSettings())
-    lines = LINE_PRESETS.get(preset, LineSettings())
-    markers = MarkerSettings()
+    values = SettingsFile(
+        CIRCLE_PRESETS.get(preset, CircleSettings()), LINE_PRESETS.get(preset, LineSettings())
+    )
     if file and not {"-h", "--help", "--help-all"} & set(arguments):
         if preset:
             raise DetectError("--preset and --settings: expected one of them")
-        read = read_settings(Path(file))
-        circles, lines, markers = read.circles, read.lines, read.markers
+        values = read_settings(Path(file))
     return PROGRAM.parsed(
         arguments,
         (
-            Circles(run=MISSING, parameters=circles),
-            Lines(run=MISSING, parameters=lines),
-            Markers(run=MISSING, parameters=markers),
-            All(run=MISSING, circles=circles, lines=lines),
-            Explain(image=MISSING, parameters=circles),
+            Circles(run=MISSING, parameters=values.circles),
+            Lines(run=MISSING, parameters=values.lines),
+            Markers(run=MISSING, parameters=values.markers),
+            All(run=MISSING, circles=values.circles, lines=values.lines),
+            Explain(image=MISSING, parameters=values.circles),
         ),
     )
 

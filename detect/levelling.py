@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,8 +46,9 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     floor_xy, covariance, down = level_discs(
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
     )
-    level = _those(found, down, floor_xy, covariance)
-    return replace(level, levelled_by=(tilt.pitch, tilt.roll))
+    by = tilt.pitch, tilt.roll
+    level = replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by)
+    return level.where(down)
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
@@ -60,20 +60,8 @@ def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> C
     floor_xy = camera.floor_from_pixel(pixels)
     jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
     covariance = jacobian @ found.covariance @ jacobian.swapaxes(1, 2)
-    return _those(found, np.isfinite(floor_xy).all(axis=-1), floor_xy, covariance)
-
-
-def _those(
-    found: CircleDetections, down: Any, floor_xy: FloatArray, covariance: FloatArray
-) -> CircleDetections:
-    return replace(
-        found,
-        pixels=found.pixels[down],
-        floor_xy=floor_xy[down],
-        covariance=covariance[down],
-        quality=found.quality[down],
-        evidence=found.evidence[down],
-    )
+    seen = replace(found, floor_xy=floor_xy, covariance=covariance)
+    return seen.where(np.asarray(np.isfinite(floor_xy).all(axis=-1)))
 
 
 def tilt_arrays(tilts: Sequence[FrameTilt]) -> tuple[FloatArray, FloatArray]:

@@ -148,8 +148,6 @@ def carry_ids(
     standard deviations) gives that line its IDs; a joined line can get several, and one that none
     fits has -1.
     """
-    if not rows or not reference:
-        return tuple(rows)
     alpha = np.array([row.alpha for row in rows])
     reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))
     ids: list[list[int]] = [[] for _ in rows]

@@ -18,16 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 from detect import __version__
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
-from detect.drawing.inputs import every_nth
 from detect.errors import DetectError
 from detect.options import CompareOptions, Tune
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
-from detect.runs.workers import Workers, default_jobs, detect_chunks, local_workers
+from detect.runs.workers import Crew, Workers, default_jobs, detect_chunks, local_workers
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
+from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
@@ -45,12 +45,12 @@ def perform(options: Tune) -> int:
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     output = run.output("tune") if options.output is None else options.output
-    _, selection = every_nth(run.frames, options.every)
+    frames = SomeFrames(run.frames, every=options.every)
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
 
-        frames = [frame for _, frame in selection]
-        return serve(TuningSession(run, frames, base, output, options.force), options.port)
+        session = TuningSession(run, list(frames), base, output, options.force)
+        return serve(session, options.port)
 
     names = "table.json", "curve.png"
     demand_free([output / name for name in names], overwrite=options.force)
@@ -58,9 +58,7 @@ def perform(options: Tune) -> int:
     if not path.is_file():
         raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
     reference = FramesByImage(path)
-    chosen = [
-        frame for _, frame in selection if frame.image is not None or frame.content is not None
-    ]
+    chosen = [each for each in frames if each.image is not None or each.content is not None]
     wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
     pairs = [(frame, rows) for frame, rows in wanted if rows is not None]
     if not pairs:
@@ -160,8 +158,8 @@ def tune_run(
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame, _ in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
-    with closing(detect_chunks(work, plans[0], workers)) as chunks:
-        done = chain.from_iterable(chunks)
+    with closing(Crew(workers)) as crew:
+        done = chain.from_iterable(detect_chunks(work, plans[0], crew))
         for _ in plans:
             found: list[Frame] = []
             failures: list[str] = []

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import tempfile
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import SeenRows, every_nth, open_rows
+from detect.drawing.inputs import SeenRows, open_rows
 from detect.errors import DetectError, FrameError, imported_for
 from detect.options import View
 from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
+from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
@@ -35,7 +37,7 @@ def perform(options: View) -> int:
     source = open_rows(run, options.files)
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
-    expected, selection = every_nth(run.frames, options.every)
+    frames = SomeFrames(run.frames, every=options.every)
     sight, settings = source.sight(run.camera), source.circle_settings
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
@@ -52,8 +54,8 @@ def perform(options: View) -> int:
         for name, places in known.items():
             at = rr.Points3D(np.pad(places, ((0, 0), (0, 1))), colors=_MAP)
             recording.log(f"world/map/{name}", at, static=True)
-        with progress_bar("frames", expected) as advance:
-            for position, frame in selection:
+        with progress_bar("frames", frames.expected) as advance:
+            for position, frame in zip(count(step=options.every), frames):
                 recording.set_time("frame", sequence=position)
                 if frame.time_s is not None:
                     recording.set_time("time", **_clock(frame.time_s))

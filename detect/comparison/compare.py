@@ -133,13 +133,11 @@ def compare_frames(
         if _image_cost(as_level["frames"]) < _image_cost(common["frames"]):
             common, sight = as_level, level_sight
     matches: Sequence[FrameMatch] = common["frames"]
-    first, second, _, extra = sides = (
-        circle_arrays([row for m in matches for row in m.paired[0]]),
-        circle_arrays([row for m in matches for row in m.paired[1]]),
-        circle_arrays([row for m in matches for row in m.missed]),
-        circle_arrays([row for m in matches for row in m.extra]),
+    first, second, _, extra = sides = tuple(
+        circle_arrays([row for match in matches for row in getattr(match, side)])
+        for side in ("wanted", "matched", "missed", "extra")
     )
-    alike = [_alike_xy(match.paired[0], match.view) for match in matches]
+    alike = [_alike_xy(match.wanted, match.view) for match in matches]
     alike_xy = np.concatenate([np.zeros((0, 2)), *alike])
     away = first.xy - (np.zeros(2) if sight is None else sight.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
@@ -197,7 +195,8 @@ def compare_line_frames(
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     common = match_runs("lines", *sides, options, names, unlisted=unlisted)
-    first, second = ([row for m in common["frames"] for row in m.paired[side]] for side in (0, 1))
+    first = [row for match in common["frames"] for row in match.wanted]
+    second = [row for match in common["frames"] for row in match.matched]
 
     def difference(name: str) -> FloatArray:
         return numbers(second, name) - numbers(first, name)
@@ -358,12 +357,13 @@ def match_frame(
         name,
         view,
         detected,
-        matched=list(zip(first, second)),
+        wanted=first,
+        matched=second,
         joined=[row for row, with_another in zip(left, joined) if with_another],
         missed=[row for row, with_another in zip(left, joined) if not with_another],
         extra=[alone[j] for j in aside.second_alone],
         set_aside=[alone[j] for j in np.sort(aside.second)],
-        errors=np.asarray(errors),
+        largest_error=float(errors.max()) if len(errors) else None,
     )
 
 
@@ -406,7 +406,7 @@ def apart_px(match: FrameMatch) -> FloatArray:
     """(M,) distances of matched discs in the image; NaN where one is not seen."""
     view = match.view
     assert view is not None
-    first, second = (circle_arrays(rows).xy for rows in match.paired)
+    first, second = (circle_arrays(rows).xy for rows in (match.wanted, match.matched))
     return np.asarray(np.linalg.norm(view.detected_px(second) - view.reference_px(first), axis=1))
 
 

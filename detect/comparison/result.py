@@ -29,24 +29,15 @@ class FrameMatch(NamedTuple):
     name: str  # of the image
     view: Sight | None  # how discs come back into it; None: compared on the floor
     detected: Sequence[Any]  # all of these rows
-    matched: list[tuple[Any, Any]]  # reference and detected row; no row is in two pairs
+    wanted: list[Any]  # reference rows that are matched, and the detected row of each:
+    matched: list[Any]  # no row is in two pairs
     joined: list[Any]  # reference rows that a matched line represents, too
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that fit something that does not count
-    #: Of the pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
+    #: Of any pair: distance on the floor, both rows levelled alike (m), or difference in bearing
     #: (deg).
-    errors: FloatArray
-
-    @property
-    def largest_error(self) -> float | None:
-        """That of any pair."""
-        return float(self.errors.max()) if len(self.errors) else None
-
-    @property
-    def paired(self) -> tuple[list[Any], list[Any]]:
-        """The rows in pairs: reference, detected."""
-        return [row for row, _ in self.matched], [row for _, row in self.matched]
+    largest_error: float | None
 
 
 @dataclass(frozen=True)
@@ -136,7 +127,7 @@ class Comparison(ABC):
     """
 
     what: ClassVar[str]  # that is compared
-    unit: ClassVar[str]  # of `FrameMatch.errors`
+    unit: ClassVar[str]  # of `FrameMatch.largest_error`
     counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
 
     reference_name: str

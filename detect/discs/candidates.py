@@ -10,20 +10,10 @@ from redetect.compiled import kernel
 
 
 def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
-    """Pixels of a map of at least `threshold` that none of their 8 neighbours exceeds.
+    """(H, W) pixels of a map of at least `threshold` that none of their 8 neighbours exceeds.
 
     Connected pixels of equal quality are one maximum, at the one nearest to their centroid: a
-    plateau is neither lost nor found twice.
-
-    Parameters
-    ----------
-    quality : (H, W) float64
-    threshold : float
-        Least quality; 0 is none.
-
-    Returns
-    -------
-    (H, W) bool
+    plateau is neither lost nor found twice. A quality of 0 is none.
     """
     around = np.ones((3, 3), np.uint8)
     quality = np.where((quality >= threshold) & (quality > 0.0), quality, 0.0)
@@ -50,21 +40,9 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
 
 
 def suppress_neighbours(floor_xy: FloatArray, score: FloatArray, separation: float) -> BoolArray:
-    """Which of some floor positions to keep so that no two are closer than `separation`.
+    """(N,) which of floor positions (N, 2) to keep so that no two are closer than `separation` (m).
 
     The best by score stay; of equal ones the first.
-
-    Parameters
-    ----------
-    floor_xy : (N, 2) float64
-        Positions, metres.
-    score : (N,) float64
-    separation : float
-        Metres.
-
-    Returns
-    -------
-    (N,) bool
     """
     order = np.argsort(-score, kind="stable")
     kept = np.zeros(len(score), np.bool_)
@@ -93,19 +71,10 @@ def alone_published(
     pixels: IntArray, quality: FloatArray, floor_xy: Float32Array,
     separation: float,
 ) -> BoolArray:  # fmt: skip
-    """Which centres have none of a higher quality nearby.
+    """(N,) which centres, in scan order, have none of a higher quality nearby.
 
-    Of centres of the same quality, the first stays that has none nearby that stays.
-
-    Parameters
-    ----------
-    pixels : (N, 2) int64
-        (u, v), in scan order.
-    quality : (N,) float64
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    separation : float
-        Nearer than this is nearby, metres.
+    Of centres of the same quality, the first stays that has none nearby that stays. Nearby is
+    nearer than `separation` (m) on the floor, which pixels see at `floor_xy` (H, W, 2).
     """
     kept = np.ones(len(quality), np.bool_)
     x, y = np.empty(len(quality)), np.empty(len(quality))

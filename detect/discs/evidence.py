@@ -16,25 +16,15 @@ _LEAST_OTHERS, _DARKEST = 2, 5.0
 
 
 def lost_by_paleness(contrast: FloatArray, floor_grey: FloatArray, sure: BoolArray) -> FloatArray:
-    """Log-odds that discs of an image lose because they are paler than its sure discs.
+    """(N,) log-odds that discs of an image lose because they are paler than its sure discs.
 
     What has much less contrast than the sure discs is mostly the reflection of one in a polished
     floor or in glass. In shadow a disc has less contrast, too, but its ratio to the floor stays
     what it is elsewhere: that speaks for it. Constants were chosen on the first 1,000 frames of
     run e; rendered buildings confirm them.
 
-    Parameters
-    ----------
-    contrast, floor_grey : (N,) float64
-        Grey levels: of each disc less its floor, and of the floor.
-    sure : (N,) bool
-        Which are certainly discs: they lose nothing, and the others are compared with those of
-        their sign, if there are two.
-
-    Returns
-    -------
-    (N,) float64
-        0 or more.
+    The contrast of a disc is that to its floor, grey levels. Those that are certainly discs lose
+    nothing, and the others are compared with those of their sign, if there are two.
     """
     disc = np.maximum(floor_grey + contrast, _DARKEST)
     ratio = np.abs(np.log(disc / np.maximum(floor_grey, _DARKEST)))
@@ -50,22 +40,10 @@ def lost_by_paleness(contrast: FloatArray, floor_grey: FloatArray, sure: BoolArr
 
 
 def lost_by_sign(contrast: FloatArray, sure: BoolArray) -> FloatArray:
-    """Log-odds that discs of an image lose because either sign is possible, or the other is likely.
+    """(N,) log-odds that discs lose because either sign is possible, or the other is likely.
 
     With m of n sure discs of a sign, the share of that sign is (m + 1) / (n + 2) by Laplace's rule
     of succession: what is stated about polarity would make it 1.
-
-    Parameters
-    ----------
-    contrast : (N,) float64
-        Of each disc less its floor.
-    sure : (N,) bool
-        Which are certainly discs.
-
-    Returns
-    -------
-    (N,) float64
-        0 or more.
     """
     light = np.count_nonzero(sure & (contrast > 0.0))
     dark = np.count_nonzero(sure & (contrast < 0.0))

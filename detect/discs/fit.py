@@ -36,7 +36,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from camera import Camera
 from camera.kernels import project_floor_point
 from detect.discs.model import (
     BY_BLUR_1,
@@ -64,9 +63,8 @@ from detect.discs.patch import (
     gather,
 )
 from detect.discs.rim import median
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Terms of the normal equations: light that is the same for all pixels, that of each sector, the
 #: disc; last the grey values. The fit by parts begins with `OUTSIDE`.
@@ -120,12 +118,12 @@ WORK = np.dtype([("patch", PATCH), ("rows", np.float32, (_TERMS, CAPACITY))])
 class Scene(NamedTuple):
     """An image, and how discs are placed in it."""
 
-    image: NDArray[np.uint8]
-    floor_xy: NDArray[np.float32]
+    image: GreyImage
+    floor_xy: Float32Array
     radius: float  # nominal, metres
     noise: float  # grey levels
-    blur_ratio: float  # of `blur_ratio_of`
-    camera_numbers: NDArray[np.float64]
+    blur_ratio: float  # blur along v over that along u, in pixels
+    camera_numbers: FloatArray
 
 
 class Start(NamedTuple):
@@ -149,24 +147,20 @@ class FitSettings(NamedTuple):
 class Fit(NamedTuple):
     """A fitted disc; lengths in metres."""
 
-    arrived: bool
-    """If not, the covariance is infinite and the rest means nothing."""
+    arrived: bool  #: If not, the covariance is infinite and the rest means nothing.
     x: float
     y: float
     radius: float
-    blur: float
-    """Along u, pixels."""
-    blur_bound: float
-    """The most blur that the patch allowed."""
-    contrast: float
-    """Grey level inside minus outside (by parts: of the first sector)."""
+    blur: float  #: Along u, pixels.
+    blur_bound: float  #: The most blur that the patch allowed.
+    contrast: float  #: Grey level inside minus outside (by parts: of the first sector).
+    #: Share of the variance about the background that the disc explains (of the first sector).
     explained: float
-    """Share of the variance about the background that the disc explains (of the first sector)."""
     cov_xx: float
     cov_xy: float
     cov_yy: float
+    #: One over the variance of the radius, as far as the grey values tell it.
     radius_information: float
-    """One over the variance of the radius, as far as the grey values tell it."""
 
 
 _NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
@@ -184,16 +178,11 @@ class Edge(NamedTuple):
 class Levels(NamedTuple):
     """What is known of the light in each of G groups of pixels: of all, or of each sector."""
 
-    contrast: FloatArray
-    """(G,) grey levels; 0 where there is no edge to be seen."""
-    variance: FloatArray
-    """(G,) of the residuals."""
-    explained: FloatArray
-    """(G,) share of the variance that the disc explains."""
-    off_px: FloatArray
-    """(G,) how far outside the circle the edge is."""
-    weight: FloatArray
-    """(G,) per variance."""
+    contrast: FloatArray  #: (G,) grey levels; 0 where there is no edge to be seen.
+    variance: FloatArray  #: (G,) of the residuals.
+    explained: FloatArray  #: (G,) share of the variance that the disc explains.
+    off_px: FloatArray  #: (G,) how far outside the circle the edge is.
+    weight: FloatArray  #: (G,) per variance.
 
 
 @kernel()
@@ -215,16 +204,7 @@ def eliminate(matrices: FloatArray, k: int) -> None:
 
 @kernel()
 def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
-    """Fit a disc.
-
-    Parameters
-    ----------
-    scene : Scene
-    start : Start
-    settings : FitSettings
-    work : WORK
-        Working space.
-    """
+    """Fit a disc; `work` is the working space, a `WORK`."""
     patch, rows, by_parts = work.patch, work.rows, settings.by_parts
     candidate, begin = _candidate_at(scene, settings.radius, start)
     shape, ends = gather(
@@ -320,7 +300,7 @@ def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _write_rows(
-    patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: NDArray[np.float32]
+    patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: Float32Array
 ) -> None:
     """The derivatives by all unknowns, and the grey values (above `level`), for n pixels."""
     shares = patch.shares
@@ -345,9 +325,7 @@ def _write_rows(
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def _multiply(
-    rows: NDArray[np.float32], ends: NDArray[np.int64], first: int, products: FloatArray
-) -> None:
+def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArray) -> None:
     """Sums of products of rows in each sector, lower halves, from the first term on."""
     for s in range(SECTORS):
         # Three by three at a time: each value that is loaded is used three times.
@@ -451,7 +429,7 @@ def _weigh(levels: Levels, early: bool, noise: float) -> int:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _trust(
-    patch: Any, rows: NDArray[np.float32], ends: NDArray[np.int64], grouped: FloatArray,
+    patch: Any, rows: Float32Array, ends: IntArray, grouped: FloatArray,
     levels: Levels, noise: float,
 ) -> None:  # fmt: skip
     """Weigh the pixels of the sectors that count by what the fit leaves of each."""
@@ -475,7 +453,7 @@ def _trust(
 
 
 @kernel()
-def _median_of(values: FloatArray, chosen: NDArray[np.bool_]) -> float:
+def _median_of(values: FloatArray, chosen: BoolArray) -> float:
     """Median of the chosen values, 0 if there are none."""
     some, count = np.empty(len(values)), 0
     for k in range(len(values)):
@@ -569,16 +547,14 @@ def _radius_information(normal: FloatArray) -> float:
 
 
 @kernel(inline="always")
-def _correlated_area_of(
-    patch: Any, rows: NDArray[np.float32], n: int, products: FloatArray
-) -> float:
+def _correlated_area_of(patch: Any, rows: Float32Array, n: int, products: FloatArray) -> float:
     unknowns = np.zeros(_TERMS)
     _solve(_sum_of(products), 0, unknowns)
     return _correlated_area(patch, rows, n, unknowns)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def _correlated_area(patch: Any, rows: NDArray[np.float32], n: int, unknowns: FloatArray) -> float:
+def _correlated_area(patch: Any, rows: Float32Array, n: int, unknowns: FloatArray) -> float:
     """How many pixels go with one independent residual, from the correlation of neighbours.
 
     White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
@@ -652,12 +628,3 @@ def working_space() -> NDArray[Any]:
 def least_noise(noise: float) -> float:
     """Noise of a scene: grey values are rounded."""
     return max(noise, _LEAST_NOISE)
-
-
-def blur_ratio_of(camera: Camera) -> float:
-    """Blur along v over blur along u, in pixels.
-
-    Optics blur equally in all directions. Where the scales differ, as in single fields of
-    interlaced frames, a pixel is not square, and the same blur is fewer pixels along v.
-    """
-    return camera.scale_y / camera.scale_x

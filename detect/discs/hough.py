@@ -22,13 +22,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.candidates import apart
 from lut import VoteTable
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
 _BACKGROUND = 0.3
@@ -51,23 +49,13 @@ class HoughCandidates(NamedTuple):
 
 
 def hough_candidates(
-    image: NDArray[np.uint8], table: VoteTable, radius: float, sign: int, least_step: float
+    image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Centres of discs of one radius by the votes of the edges.
+    """Centres of discs of one radius (m), for which the table is, by the votes of the edges.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    table : VoteTable
-    radius : float
-        For which that is, metres.
-    sign : int
-        1 for light discs, -1 for dark ones, 0 for both.
-    least_step : float
-        Gradient of an edge, grey levels per pixel.
+    The sign is 1 for light discs, -1 for dark ones, 0 for both; the gradient of an edge is at least
+    `least_step`, grey levels per pixel.
     """
-    if not len(table.image_row):
-        return HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
     signs = np.array([sign] if sign else [1.0, -1.0], np.float64)
     places, scores = [], []
     for votes in count_votes(image, table, radius * signs, least_step):
@@ -84,8 +72,8 @@ def hough_candidates(
 
 @kernel()
 def count_votes(
-    image: NDArray[np.uint8], table: VoteTable, radius: FloatArray, least_step: float
-) -> NDArray[np.float32]:
+    image: GreyImage, table: VoteTable, radius: FloatArray, least_step: float
+) -> Float32Array:
     """(S, M, columns) votes for each cell, shares of a rim, for S radii: of dark discs negative."""
     votes = np.zeros((len(radius), len(table.ahead), table.columns), np.float32)
     width = table.pixel.shape[1]
@@ -131,7 +119,7 @@ def count_votes(
 
 
 @kernel(fastmath={"reassoc", "nsz"})
-def _peaks(votes: NDArray[np.float32], table: VoteTable) -> tuple[FloatArray, FloatArray]:
+def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Places (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     score = np.zeros((rows, columns), np.float32)

@@ -37,9 +37,8 @@ from detect.discs.rim_network import (
     network_inputs,
     network_log_odds,
 )
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Where grey values count as of the disc and of the floor, nominal radii.
 _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
@@ -66,55 +65,24 @@ _SAME = 0.1
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
-class Sought(NamedTuple):
-    """Which discs are looked for."""
-
-    radius: float  # nominal, metres
-    least_step: float  # of the grey value at a rim, grey levels
-
-
 class Judgement(NamedTuple):
-    """Candidates and what became of them; step and later mean something for judged rims.
+    """N candidates and what became of them; step and later mean something for judged rims."""
 
-    Attributes
-    ----------
-    fate : (N,) int8
-        Indices of `FATES`.
-    value : (N,) float64
-        The number that decided: log-odds, or a share of the rim.
-    sign : (N,) float64
-        1 of light discs, -1 of dark ones.
-    features : (N, len(FEATURES)) float64
-    agreeing, radius : (N,) float64
-        Share of the rim that is on a circle, and the radius of that, metres.
-    floor_xy : (N, 2) float64
-        Centre of the rim, metres; where it was not followed, of the candidate.
-    seen_from, doubt : (N, 2) float64
-        Where the rim was followed from, and the difference to the centre of the rim that is found
-        from the other start, metres.
-    step : (N,) float64
-        Of the grey value at the rim, inside minus outside.
-    floor_grey : (N,) float64
-        Mean grey value of the floor round it.
-    quality : (N,) float64
-        Otsu's, of the disc and that floor.
-    log_odds : (N,) float64
-        That it is a disc.
-    """
-
-    fate: NDArray[np.int8]
-    value: FloatArray
-    sign: FloatArray
-    features: FloatArray
-    agreeing: FloatArray
-    radius: FloatArray
+    fate: NDArray[np.int8]  #: (N,) indices of `FATES`
+    value: FloatArray  #: (N,) the number that decided: log-odds, or a share of the rim
+    sign: FloatArray  #: (N,) 1 of light discs, -1 of dark ones
+    features: FloatArray  #: (N, len(FEATURES))
+    agreeing: FloatArray  #: (N,) share of the rim that is on a circle,
+    radius: FloatArray  #: (N,) and the radius of that, metres
+    #: (N, 2) centre of the rim, metres; where it was not followed, of the candidate
     floor_xy: FloatArray
-    seen_from: FloatArray
+    seen_from: FloatArray  #: (N, 2) where the rim was followed from, metres,
+    #: (N, 2) and the difference to the centre of the rim that is found from the other start
     doubt: FloatArray
-    step: FloatArray
-    floor_grey: FloatArray
-    quality: FloatArray
-    log_odds: FloatArray
+    step: FloatArray  #: (N,) of the grey value at the rim, inside minus outside
+    floor_grey: FloatArray  #: (N,) mean grey value of the floor round it
+    quality: FloatArray  #: (N,) Otsu's, of the disc and that floor
+    log_odds: FloatArray  #: (N,) that it is a disc
 
     def where(self, chosen: NDArray[Any]) -> Judgement:
         """Some of the candidates, by indices or a mask."""
@@ -136,22 +104,16 @@ _FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 
 @kernel()
 def judge(
-    image: NDArray[np.uint8],
+    image: GreyImage,
     candidates: HoughCandidates,
-    sought: Sought,
+    nominal: float,
+    least_step: float,
     camera_numbers: FloatArray,
     networks: Networks,
 ) -> Judgement:
-    """Judge candidates, the best first.
+    """Judge candidates, the best first, for discs of a nominal radius, metres.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    candidates : HoughCandidates
-    sought : Sought
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    networks : Networks
+    The grey value steps by `least_step` at a rim; the numbers are `camera.kernels.camera_numbers`.
     """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
@@ -163,8 +125,8 @@ def judge(
     count = 0
     for i in range(n):
         x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
-        grey, scale = glance(image, camera_numbers, x, y, sought.radius)
-        contrast = _contrast(grey, sign, sought.least_step)
+        grey, scale = glance(image, camera_numbers, x, y, nominal)
+        contrast = _contrast(grey, sign, least_step)
         if contrast == 0.0:
             continue
         inputs, scales = network_inputs(grey, scale, sign)
@@ -172,24 +134,24 @@ def judge(
         fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
-        seen = profiles(image, camera_numbers, x, y, sought.radius)
+        seen = profiles(image, camera_numbers, x, y, nominal)
         rim = follow_rim(image, camera_numbers, seen, sign * contrast)
         fate[i], value[i] = _NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
         fate[i] = _SAME_RIM
-        if _is_known(judged[:count], rim, sign, sought.radius):
+        if _is_known(judged[:count], rim, sign, nominal):
             continue
-        seen = profiles(image, camera_numbers, rim.x, rim.y, sought.radius)
+        seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
         odds, noted = _look(seen, rim, score[0], sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # From its own middle a rim is seen best, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, seen, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
-                seen_again = profiles(image, camera_numbers, again.x, again.y, sought.radius)
+                seen_again = profiles(image, camera_numbers, again.x, again.y, nominal)
                 more, noted_again = _look(seen_again, again, score[0], sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
-                if more > odds and not _is_known(judged[:count], again, sign, sought.radius):
+                if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
                     rim, odds, noted, seen = again, more, noted_again, seen_again
         fate[i], value[i], log_odds[i], step[i] = JUDGED, odds, odds, rim.step
@@ -232,7 +194,7 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 
 @kernel()
 def glance(
-    image: NDArray[np.uint8], camera_numbers: FloatArray, x: float, y: float, radius: float
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> tuple[FloatArray, FloatArray]:
     """The nearest grey values along some directions, without perspective within the disc.
 

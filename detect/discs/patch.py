@@ -13,7 +13,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.model import (
     F32,
@@ -21,6 +20,7 @@ from detect.discs.model import (
     PIXEL_VARIANCE,
     Disc,
 )
+from redetect.array_types import Float32Array, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Most pixels of a patch. No power of two: arrays that far apart would share lines of the cache.
@@ -79,16 +79,11 @@ _SHIFT = 0.381966
 class Reach(NamedTuple):
     """Which pixels are fitted."""
 
-    radii: float
-    """All within this many radii of the start,"""
-    px: float
-    """and those this near to the disc's edge, pixels,"""
-    blurs: float
-    """or this many standard deviations of the blur;"""
-    nearest: float
-    """but none nearer than this, radii,"""
-    farthest: float
-    """nor farther."""
+    radii: float  #: All within this many radii of the start,
+    px: float  #: and those this near to the disc's edge, pixels,
+    blurs: float  #: or this many standard deviations of the blur;
+    nearest: float  #: but none nearer than this, radii,
+    farthest: float  #: nor farther.
 
 
 class Candidate(NamedTuple):
@@ -96,28 +91,22 @@ class Candidate(NamedTuple):
 
     u: int
     v: int
-    radius: float
-    """Nominal, metres."""
-    blur: float
-    """About how blurred it is (along u), pixels."""
+    radius: float  #: Nominal, metres.
+    blur: float  #: About how blurred it is (along u), pixels.
 
 
 class View(NamedTuple):
     """How a candidate is seen."""
 
-    shape: int
-    """`EDGE`, or along which axis its chords run."""
+    shape: int  #: `EDGE`, or along which axis its chords run.
     u_per_radius: float
-    v_per_radius: float
-    """How many pixels one radius can be at most; 0 where no floor is seen."""
+    v_per_radius: float  #: How many pixels one radius can be at most; 0 where no floor is seen.
+    #: By how much the floor moves from pixel to pixel: x, y by u, and by v; radii.
     steps: tuple[float, float, float, float]
-    """By how much the floor moves from pixel to pixel: x, y by u, and by v; radii."""
 
 
 @kernel(forceinline=True)
-def floor_steps(
-    floor_xy: NDArray[np.float32], u0: int, v0: int
-) -> tuple[float, float, float, float]:
+def floor_steps(floor_xy: Float32Array, u0: int, v0: int) -> tuple[float, float, float, float]:
     """By how much the floor moves from pixel to pixel: x, y by u, and by v."""
     height, width = floor_xy.shape[:2]
     u = min(max(u0, 1), width - 2)
@@ -131,9 +120,7 @@ def floor_steps(
 
 
 @kernel(forceinline=True)
-def view_of(
-    floor_xy: NDArray[np.float32], candidate: Candidate, relative: float, ratio: float
-) -> View:
+def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio: float) -> View:
     """How a candidate of a radius relative to the nominal one is seen.
 
     `ratio` is the blur along v over that along u, in pixels.
@@ -164,36 +151,20 @@ def view_of(
 
 @kernel()
 def gather(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
+    image: GreyImage,
+    floor_xy: Float32Array,
     candidate: Candidate,
     blur_ratio: float,
     reach: Reach,
     start: Disc,
     patch: Any,
-) -> tuple[int, NDArray[np.int64]]:
-    """Fill a patch with the pixels round a candidate; none where it sees no floor.
+) -> tuple[int, IntArray]:
+    """Fill a patch (`PATCH`) with the pixels round a candidate; none where it sees no floor.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    floor_xy : (H, W, 2) float32
-        Floor position of each pixel, metres.
-    candidate : Candidate
-    blur_ratio : float
-        Blur along v over blur along u, in pixels: 0.5 in single fields of interlaced frames.
-    reach : Reach
-    start : Disc
-        Where the fit starts.
-    patch : PATCH
-        The result.
-
-    Returns
-    -------
-    shape : int
-        `EDGE`, or along which axis chords run.
-    ends : (SECTORS + 1,) int64
-        Where in the patch each sector begins, and the last ends.
+    Pixels see the floor at `floor_xy` (H, W, 2), metres. `blur_ratio` is the blur along v over that
+    along u, in pixels: 0.5 in single fields of interlaced frames. The fit begins at `start`.
+    Returns the shape (`EDGE`, or along which axis chords run), and (SECTORS + 1,) where in the
+    patch each sector begins, and the last ends.
     """
     ends = np.zeros(SECTORS + 1, np.int64)
     view = view_of(floor_xy, candidate, start.radius, blur_ratio)
@@ -215,13 +186,13 @@ def sector_of(x: float, y: float) -> Any:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _sort_by_sector(
-    floor_xy: NDArray[np.float32],
+    floor_xy: Float32Array,
     candidate: Candidate,
     start: Disc,
     reach: Reach,
     count: int,
     patch: Any,
-    ends: NDArray[np.int64],
+    ends: IntArray,
 ) -> None:
     """Sort pixels by sector, and leave out those that are too near or too far.
 
@@ -256,7 +227,7 @@ def _sort_by_sector(
 
 @kernel(forceinline=True)
 def _choose(
-    floor_xy: NDArray[np.float32],
+    floor_xy: Float32Array,
     candidate: Candidate,
     blur_ratio: float,
     reach: Reach,
@@ -339,8 +310,8 @@ def _take(
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _describe(
-    image: NDArray[np.uint8],
-    floor_xy: NDArray[np.float32],
+    image: GreyImage,
+    floor_xy: Float32Array,
     candidate: Candidate,
     shape: int,
     count: int,

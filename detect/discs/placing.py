@@ -14,17 +14,15 @@ import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.fit import Fit, FitSettings, Scene, Start, fit_disc
 from detect.discs.patch import Reach
 from detect.discs.rim import Rim, follow_rim, median, profiles
+from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.judgement import Judgement
-
-FloatArray = NDArray[np.float64]
 
 #: Pixels of a whole disc, and of its edge.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
@@ -69,22 +67,10 @@ class Size(NamedTuple):
 
 @kernel()
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
-    """Place discs by fits: those that are wholly in view, then the others, of about their size.
+    """Place N discs by fits: those that are wholly in view, then the others, of about their size.
 
-    Parameters
-    ----------
-    scene : Scene
-    discs : Judgement
-        Of N discs.
-    work : WORK
-        Working space.
-
-    Returns
-    -------
-    floor_xy : (N, 2) float64
-        Centres, metres.
-    covariance : (N, 2, 2) float64
-        Square metres.
+    Returns (N, 2) centres, metres, and their (N, 2, 2) covariances; `work` is the working space, a
+    `detect.discs.fit.WORK`.
     """
     count = len(discs.step)
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -218,14 +204,8 @@ def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
     itself does a little. The radius of a part of a disc trades with its place, so it has to be
     known otherwise: as the robust mean of the others, with the scatter about that.
 
-    Parameters
-    ----------
-    nominal : float
-        Radius of discs, metres.
-    radii : (N, 2) float64
-        Radius of each disc, metres, and one over its variance; 0 where nothing is known.
-    k : int
-        The disc.
+    `radii` (N, 2) are those of each disc, metres, and one over their variance, 0 where nothing is
+    known; k is the disc.
     """
     radius, variance, count = np.empty(len(radii)), np.empty(len(radii)), 0
     for i in range(len(radii)):

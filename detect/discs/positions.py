@@ -2,9 +2,9 @@
 
 With J = d(x, y) / d(u, v), the floor's Jacobian at a position (the inverse of the projection's, by
 central differences), a position has the covariance of its fit, plus p J J^T for a systematic error
-in the image, plus what the tilt of the robot may do: pitch and roll move a position along the line
-of sight, by its offset from the camera over the camera's height, times the height that the tilt
-seems to give the position (`detect.circles.tilt_jacobian`).
+in the image, plus what the tilt of the robot may do: turned about its origin on the floor, by w_X
+and w_Y, it gives a position (x, y) the height x w_Y - y w_X, which moves the position along the
+line of sight, by its offset from the camera over the camera's height.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from redetect.compiled import kernel
 
 #: Of the central differences of the projection, metres.
 _STEP_M = 1e-5
+#: The published covariance: this deviation in every direction, and two pixels squared.
+PUBLISHED_FLOOR_M, PUBLISHED_PIXEL_VARIANCE = 0.04, 2.0
 
 
 @kernel()
@@ -39,23 +41,19 @@ def _add_pixels(
 
 @kernel()
 def pixel_positions(
-    camera_numbers: FloatArray,
-    floor_xy: FloatArray,
-    pixels: IntArray,
-    floor_variance: float,
-    pixel_variance: float,
+    camera_numbers: FloatArray, floor_xy: FloatArray, pixels: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where (N, 2) pixels (u, v) see the floor, (N, 2), and (N, 2, 2) covariances.
+    """Where (N, 2) pixels (u, v) see the floor, (N, 2), and the published (N, 2, 2) covariances.
 
     `camera_numbers` are those of `camera.kernels`, and `floor_xy` is what every pixel sees, (H, W,
-    2). The variances are of any direction, on the floor and in the image.
+    2).
     """
     position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
     for k in range(len(pixels)):
         x, y = floor_xy[pixels[k, 1], pixels[k, 0]]
         position[k, 0], position[k, 1] = x, y
-        covariance[k, 0, 0] = covariance[k, 1, 1] = floor_variance
-        _add_pixels(camera_numbers, x, y, pixel_variance, covariance[k])
+        covariance[k, 0, 0] = covariance[k, 1, 1] = PUBLISHED_FLOOR_M**2
+        _add_pixels(camera_numbers, x, y, PUBLISHED_PIXEL_VARIANCE, covariance[k])
     return position, covariance
 
 
@@ -77,7 +75,7 @@ def refined_covariances(
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         _add_pixels(camera_numbers, x, y, pixel_variance, result[k])
-        # A product of a column and a row: see `detect.circles.tilt_jacobian`.
+        # A product of a column, and a row (-y, x) whose square is x^2 + y^2.
         sight = np.array([(x - centre[0]) / centre[2], (y - centre[1]) / centre[2]])
         for i in range(2):
             for j in range(2):

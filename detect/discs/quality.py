@@ -124,18 +124,11 @@ def _quality_of(
 def find_centres(
     grey: ByteArray, outside: int, pixels: NDArray[np.int32],
     samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,
-) -> tuple[IntArray, FloatArray, Float32Array]:  # fmt: skip
-    """The centres within some limits: (M, 2) pixels, (M,) qualities and contrasts.
+) -> Centres:  # fmt: skip
+    """The centres of a `lut.DiscTable` within some limits.
 
-    Parameters
-    ----------
-    grey : (M,) uint8
-        The image in scan order, and anything after it up to `GROUP_COLUMNS` pixels.
-    outside : int
-        H W.
-    pixels, samples, groups
-        Of `lut.DiscTable`.
-    limits : Limits
+    `grey` is the image in scan order, H W pixels, and anything after it up to `GROUP_COLUMNS`
+    pixels; `outside` is H W.
     """
     least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
     both = _with_squares(grey, groups.begin, groups.end)
@@ -164,24 +157,13 @@ def find_centres(
             found_at[found, 0], found_at[found, 1] = pixels[c, 0], pixels[c, 1]
             quality[found], contrast[found] = of_centre, step
             found += 1
-    return found_at[:found], quality[:found], contrast[:found]
+    return Centres(found_at[:found], quality[:found], contrast[:found])
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     """The centres of a table that are within some limits.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey image.
-    table : DiscTable
-        The camera's table.
-    limits : Limits
-
-    Raises
-    ------
-    FrameError
-        If the image does not belong to the table.
+    Raises FrameError if the image (H, W) does not belong to the table.
     """
     expected = table.floor_xy.shape[:2]
     if image.shape != expected or image.dtype != np.uint8:
@@ -192,33 +174,15 @@ def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     grey = image.ravel()
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))
-    return Centres(
-        *find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
-    )
+    return find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
 
 
 def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, Float32Array]:
-    """Otsu's quality, and the contrast, of the outlines around every centre of a table.
+    """(H, W) Otsu's quality of the outlines around every centre of a table, and their contrast.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Grey image.
-    table : DiscTable
-        The camera's table.
-
-    Returns
-    -------
-    quality : (H, W) float64
-        Between-class variance / total variance of the outlines' grey values, 0 to 1; 0 where the
-        table has no centre.
-    contrast : (H, W) float32
-        Mean grey value of the inner outline minus that of the outer.
-
-    Raises
-    ------
-    FrameError
-        If the image does not belong to the table.
+    The quality is the between-class variance of their grey values over the total one, 0 where the
+    table has no centre; the contrast the mean grey value of the inner outline minus that of the
+    outer. Raises FrameError if the image does not belong to the table.
     """
     centres = centres_of(image, table, Limits(quality=0.0))
     u, v = centres.pixels.T

@@ -20,9 +20,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
+from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Directions from the middle of a candidate.
@@ -82,61 +82,41 @@ _BEGIN, _MIDDLE, _END = (
 class Rim(NamedTuple):
     """The rim of a candidate; lengths are in nominal radii."""
 
-    agreeing: float
-    """Share of all directions in which the rim lies on the circle."""
-    visible: float
-    """Share of all directions in which the circle lies in the image."""
+    agreeing: float  #: Share of all directions in which the rim lies on the circle.
+    #: Stretches of two and more neighbouring directions in which it is not on the circle.
     runs: int
-    """Stretches of two and more neighbouring directions in which it is not on the circle."""
-    scatter: float
-    """Root mean square distance of the points on the circle from it, in tolerances."""
-    unevenness: float
-    """Standard deviation of the step over the directions on the circle, relative to its mean."""
-    step: float
-    """Mean step of the grey value on the circle (grey levels, inside minus outside)."""
-    x: float
-    """Centre on the floor, metres."""
+    scatter: float  #: Root mean square distance of the points on the circle from it, in tolerances.
+    step: float  #: Mean step of the grey value on the circle (grey levels, inside minus outside).
+    x: float  #: Centre on the floor, metres.
     y: float
-    radius: float
-    """Metres."""
-    cov_xx: float
-    """Covariance of the centre from the scatter of the points, square metres."""
+    radius: float  #: Metres.
+    cov_xx: float  #: Covariance of the centre from the scatter of the points, square metres.
     cov_xy: float
     cov_yy: float
-    radius_px: float
-    """Geometric mean of the radius over the directions, pixels."""
+    radius_px: float  #: Geometric mean of the radius over the directions, pixels.
+    #: Towards another circle that the rim may be: its square adds to any covariance, metres.
     doubt_x: float
-    """Towards another circle that the rim may be: its square adds to any covariance, metres."""
     doubt_y: float
 
 
 class Profiles(NamedTuple):
     """Grey values along the directions from a point of the floor."""
 
-    x: float
-    """Where the directions begin, metres."""
+    x: float  #: Where the directions begin, metres.
     y: float
-    radius: float
-    """Nominal radius, metres."""
-    grey: NDArray[np.float64]
-    """(DIRECTIONS, STEPS) NaN outside the image."""
-    pixels_per_radius: NDArray[np.float64]
-    """(DIRECTIONS,) Length of a radius in the image in each direction, pixels."""
+    radius: float  #: Nominal radius, metres.
+    grey: FloatArray  #: (DIRECTIONS, STEPS) NaN outside the image.
+    #: (DIRECTIONS,) Length of a radius in the image in each direction, pixels.
+    pixels_per_radius: FloatArray
 
 
 @kernel()
 def profiles(
-    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], x: float, y: float, radius: float
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> Profiles:
-    """Grey values along the directions from a point of the floor.
+    """Grey values along the directions from a point (x, y) of the floor, metres.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    x, y, radius : float
-        Where the directions begin, and the nominal radius, metres.
+    The radius is the nominal one, the camera's numbers are `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
@@ -164,21 +144,11 @@ def profiles(
 
 
 @kernel()
-def rim_points(seen: Profiles, contrast: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
     """Where along each direction the grey value changes most from the disc's to the floor's.
 
-    Parameters
-    ----------
-    seen : Profiles
-    contrast : float
-        Grey levels inside minus outside.
-
-    Returns
-    -------
-    distance : (DIRECTIONS,) float64
-        From the middle, nominal radii; NaN where no step reaches `LEAST_STEP` of the contrast.
-    step : (DIRECTIONS,) float64
-        The step there, grey levels.
+    Returns (DIRECTIONS,) distances from the middle, nominal radii, NaN where no step reaches
+    `LEAST_STEP` of the contrast (grey levels inside minus outside), and the steps there.
     """
     distance, step = np.empty(DIRECTIONS), np.zeros(DIRECTIONS)
     per_step = (FARTHEST - NEAREST) / (STEPS - 1)
@@ -217,19 +187,14 @@ class Circle(NamedTuple):
     x: float
     y: float
     radius: float
-    cov_xx: float
-    """Covariance of the centre, for points as scattered as `POINT_SIGMA_PX`."""
+    cov_xx: float  #: Covariance of the centre, for points as scattered as `POINT_SIGMA_PX`.
     cov_xy: float
     cov_yy: float
 
 
 @kernel()
 def fit_circle(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    circle: Circle,
-    radius_sigma: float,
+    x: FloatArray, y: FloatArray, weight: FloatArray, circle: Circle, radius_sigma: float
 ) -> Circle:
     """One Gauss-Newton step of centre and radius to weighed points, from a circle near to them.
 
@@ -282,13 +247,13 @@ def _bounded(step: float) -> float:
 
 @kernel()
 def _choose(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    x: FloatArray,
+    y: FloatArray,
+    weight: FloatArray,
+    tolerance: FloatArray,
     circle: Circle,
     wide: float,
-    chosen: NDArray[np.float64],
+    chosen: FloatArray,
 ) -> tuple[int, bool]:
     """Weights of the points on a circle, 0 of others; how many are on it, and whether others were.
 
@@ -309,33 +274,14 @@ def _choose(
 
 @kernel()
 def best_circle(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
-    best_chosen: NDArray[np.float64],
+    x: FloatArray, y: FloatArray, weight: FloatArray, tolerance: FloatArray, best_chosen: FloatArray
 ) -> tuple[Circle, int, tuple[float, float]]:
-    """The circle that most of some points are on.
+    """The circle that most of some points are on, how many these are, and a doubt.
 
-    Parameters
-    ----------
-    x, y : (DIRECTIONS,) float64
-        Points about the candidate, nominal radii.
-    weight : (DIRECTIONS,) float64
-        0 where there is no point.
-    tolerance : (DIRECTIONS,) float64
-        What is nearer than this to a circle is on it, nominal radii.
-    best_chosen : (DIRECTIONS,) float64
-        Result: the weights of the points on the circle, 0 of the others.
-
-    Returns
-    -------
-    circle : Circle
-    count : int
-        How many points are on it.
-    doubt : (float, float)
-        Towards another circle that points may be of: the square of this is what that adds to the
-        covariance of the centre, nominal radii.
+    Of (DIRECTIONS,) points about the candidate, nominal radii, those without a weight are none, and
+    those nearer to a circle than their tolerance are on it; `best_chosen` gets the weights of the
+    points on the best one, 0 of the others. The doubt leads towards another circle that points may
+    be of: its square adds to the covariance of the centre.
     """
     points = 0
     for k in range(DIRECTIONS):
@@ -381,24 +327,11 @@ def best_circle(
 
 @kernel()
 def follow_rim(
-    image: NDArray[np.uint8], camera_numbers: NDArray[np.float64], seen: Profiles, contrast: float
+    image: GreyImage, camera_numbers: FloatArray, seen: Profiles, contrast: float
 ) -> Rim:
-    """Follow the rim of a candidate.
+    """Follow the rim of a candidate, `seen` from about its middle; nothing agrees without a circle.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    seen : Profiles
-        From about the middle of the candidate.
-    contrast : float
-        About how much lighter the disc is than the floor, grey levels.
-
-    Returns
-    -------
-    Rim
-        With nothing agreeing where there is no circle.
+    The contrast is about how much lighter the disc is than the floor, grey levels.
     """
     x, y, radius, scale = seen.x, seen.y, seen.radius, seen.pixels_per_radius
     distance, step = rim_points(seen, contrast)
@@ -414,14 +347,10 @@ def follow_rim(
     chosen = np.zeros(DIRECTIONS)
     best, best_count, doubt = best_circle(at_x, at_y, weight, tolerance, chosen)
     radius_px = math.exp(log_px)
-    nothing = Rim(0.0, 0.0, 0, 0.0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
     if best_count < LEAST_POINTS:
-        return nothing
+        return Rim(0.0, 0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
     height, width = image.shape
-    squares = 0.0
-    mean = 0.0
-    mean_2 = 0.0
-    visible = 0
+    squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
         u, v = project_floor_point(
@@ -429,16 +358,11 @@ def follow_rim(
             x + radius * (best.x + best.radius * COS[k]),
             y + radius * (best.y + best.radius * SIN[k]),
         )
-        inside = 0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0
-        visible += inside
-        outside[k] = not inside
+        outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
             squares += (off / tolerance[k]) ** 2
             mean += step[k]
-            mean_2 += step[k] ** 2
-    mean /= best_count
-    mean_2 = max(mean_2 / best_count - mean * mean, 0.0)
     runs = 0
     for k in range(DIRECTIONS):
         # A stretch begins after a direction that agrees, and has two that do not.
@@ -450,8 +374,7 @@ def follow_rim(
     best = _placed(at_x, at_y, chosen, best)
     area = _ALIKE * radius * radius
     return Rim(
-        best_count / DIRECTIONS, visible / DIRECTIONS, runs, scatter,
-        math.sqrt(mean_2) / max(abs(mean), 1e-9), mean,
+        best_count / DIRECTIONS, runs, scatter, mean / best_count,
         x + radius * best.x, y + radius * best.y, radius_found,
         area * best.cov_xx, area * best.cov_xy, area * best.cov_yy, radius_px,
         radius * doubt[0], radius * doubt[1],
@@ -459,9 +382,7 @@ def follow_rim(
 
 
 @kernel()
-def _placed(
-    x: NDArray[np.float64], y: NDArray[np.float64], chosen: NDArray[np.float64], circle: Circle
-) -> Circle:
+def _placed(x: FloatArray, y: FloatArray, chosen: FloatArray, circle: Circle) -> Circle:
     """The circle by the inner points of each stretch.
 
     Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
@@ -495,7 +416,7 @@ def _placed(
 
 
 @kernel()
-def median(values: NDArray[np.float64]) -> float:
+def median(values: FloatArray) -> float:
     """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
     count = len(values)
     for i in range(1, count):

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from redetect.array_types import Float32Array, FloatArray
 from redetect.compiled import kernel
 
 WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
@@ -37,7 +37,7 @@ _NOISE = 9.0
 #: Log-odds by one network below and above which the others are not asked.
 HOPELESS, CERTAIN = -4.0, 5.0
 
-_Weights = NDArray[np.float32]
+_Weights = Float32Array
 
 
 class RimNetwork(NamedTuple):
@@ -75,7 +75,7 @@ def trained_networks() -> Networks:
 
 @kernel()
 def network_inputs(
-    grey: NDArray[np.float64], pixels_per_radius: NDArray[np.float64], sign: float
+    grey: FloatArray, pixels_per_radius: FloatArray, sign: float
 ) -> tuple[_Weights, _Weights]:
     """What a network sees of (K, M) grey values in K directions at M distances.
 
@@ -140,7 +140,7 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
 
 @kernel()
 def network_log_odds(
-    inputs: _Weights, scales: _Weights, features: NDArray[np.float64], network: RimNetwork
+    inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
 ) -> float:
     """Log-odds that a rim is a disc's, the mean of the networks; (F,) features are the rim's."""
     members, channels = network.around_bias.shape

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from math import isfinite
 from pathlib import Path
 
@@ -12,13 +13,14 @@ import cv2
 import numpy as np
 
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
-from detect.drawing.inputs import RunRows, every_nth, open_rows, picture_name
+from detect.drawing.inputs import RunRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.sources.interface import ImageRun, Run, RunFrame, read_image
+from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
+from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from lut import cached_vertical_table
 from redetect.array_types import ByteArray
@@ -33,6 +35,7 @@ def perform(options: Draw) -> int:
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
+    run = replace(run, frames=SomeFrames(run.frames, every=options.every))
     rows = open_rows(run, options.files)
     if not isinstance(run, Run) and set(rows.detected) != {"markers"}:
         raise DetectError(
@@ -41,78 +44,58 @@ def perform(options: Draw) -> int:
         )
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
-    expected, selection = every_nth(run.frames, options.every)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
-
-    drawn = 0
-    failures: list[str] = []
-    with ExitStack() as stack:
-        video = None
-        if options.video is not None:
-            video = stack.enter_context(mp4(options.video, options.fps, overwrite=options.force))
-        advance = stack.enter_context(progress_bar("pictures", expected))
-        for name, picture in pictures(run, rows, (frame for _, frame in selection), failures):
-            if options.output is not None:
-                path = options.output / f"{name}.png"
-                write_bytes(path, png_of(picture), overwrite=options.force)
-            if video is not None:
-                video(picture)
-            drawn += 1
-            advance()
+    force, path = options.force, options.video
+    with nullcontext() if path is None else mp4(path, options.fps, overwrite=force) as video:
+        drawn, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:
             print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
     return report_failures(len(failures), failures)
 
 
-def pictures(
-    run: ImageRun,
-    rows: RunRows,
-    frames: Iterable[RunFrame],
-    failures: list[str],
-    plan: FramePlan | None = None,
-) -> Iterator[tuple[str, ByteArray]]:
-    """The pictures of frames with their rows, and their names; `failures` gets why some have none.
-
-    With the plan of their detection, verticals are drawn as tracks, and markers with what is none.
-    """
-    sight = rows.sight(run.camera) if isinstance(run, Run) else None
-    for frame in frames:
-        try:
-            image = read_image(frame, None if sight is None else sight.camera)
-        except FrameError as error:
-            failures.append(str(error))
-            continue
-        prefix = frame.step.prefix
-        name = picture_name(prefix)
-        picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
-        if plan is not None:
-            (found,) = detect_batch([FrameTask(frame)], plan)
-            if found.lines is not None and plan.camera is not None:
-                picture = draw_tracks(image, cached_vertical_table(plan.camera), found.lines)
-            if found.markers is not None:
-                picture = draw_candidates(picture, found.markers)
-        yield name, picture
+Video = Callable[[ByteArray], None]
 
 
 def draw_run(
-    run: ImageRun,
-    files: Mapping[str, Path],
-    folder: Path,
-    plan: FramePlan | None,
-    *,
-    overwrite: bool,
-) -> None:
-    """Draw what was detected in a run, in `files` by kind; with a plan, what was rejected, too."""
+    run: ImageRun, rows: RunRows, folder: Path | None, plan: FramePlan | None = None,
+    *, video: Video | None = None, overwrite: bool,
+) -> tuple[int, list[str]]:  # fmt: skip
+    """Draw rows into the images of a run: PNG files in a folder, and what a video takes.
+
+    With the plan of their detection, verticals are drawn as tracks, and markers with what is none.
+    Returns how many pictures there are, and why some frames have none.
+    """
+    drawn, failures = 0, list[str]()
+    sight = rows.sight(run.camera) if isinstance(run, Run) else None
     with progress_bar("pictures", run.frames.expected) as advance:
-        for name, picture in pictures(run, RunRows(files), run.frames, [], plan):
-            write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
+        for frame in run.frames:
+            try:
+                image = read_image(frame, None if sight is None else sight.camera)
+            except FrameError as error:
+                failures.append(str(error))
+                continue
+            prefix = frame.step.prefix
+            name = picture_name(prefix)
+            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
+            if plan is not None:
+                (found,) = detect_batch([FrameTask(frame)], plan)
+                if found.lines is not None and plan.camera is not None:
+                    picture = draw_tracks(image, cached_vertical_table(plan.camera), found.lines)
+                if found.markers is not None:
+                    picture = draw_candidates(picture, found.markers)
+            if folder is not None:
+                write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
+            if video is not None:
+                video(picture)
+            drawn += 1
             advance()
+    return drawn, failures
 
 
 @contextmanager
-def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Callable[[ByteArray], None]]:
+def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
     """A video that appears once it is complete; yields what takes its pictures.
 
     Raises DetectError if OpenCV cannot write such videos, or pictures are not all of one size.

@@ -132,7 +132,7 @@ def _draw_discs(
     apart = apart_px(match)
     drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
-    drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.paired[1], apart)]
+    drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.matched, apart)]
     for row, text, colour in drawn:
         _outline_disc(canvas, view, row, settings, f"{row.quality:.2f}{text}", colour)
 
@@ -142,7 +142,7 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
-    for wanted, row in match.matched:
+    for wanted, row in zip(match.wanted, match.matched):
         error = (row.alpha - wanted.alpha + np.pi) % (2.0 * np.pi) - np.pi
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))

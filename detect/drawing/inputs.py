@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
 
@@ -18,7 +17,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import word_value
 from detect.sources.image_files import image_name
-from detect.sources.interface import Frames, ImageRun, RunFrame
+from detect.sources.interface import ImageRun
 from redetect.landmarks import Frame, FrameTilt, read_tilts
 
 KINDS = ("circles", "lines", "markers", "tilt")
@@ -157,12 +156,3 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
 def picture_name(prefix: str) -> str:
     """Name of an image's picture without its ending: nothing that leads out of a folder."""
     return image_name(prefix) or "frame"
-
-
-# -- frames -----------------------------------------------------------------------------------
-
-
-def every_nth(frames: Frames, every: int) -> tuple[int | None, Iterator[tuple[int, RunFrame]]]:
-    """How many every n-th frames are, if that is known, and these with their places in the run."""
-    expected = None if frames.expected is None else -(-frames.expected // every)
-    return expected, islice(enumerate(frames), 0, None, every)

@@ -209,7 +209,7 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatA
     levels = np.asarray(qualities, np.float64)
     found, beside = np.zeros((2, len(levels)), np.int64)
     for match in comparison.frames:
-        found += (levels[:, None] <= numbers(match.paired[1], "quality")).sum(axis=1)
+        found += (levels[:, None] <= numbers(match.matched, "quality")).sum(axis=1)
         beside += (levels[:, None] <= numbers(match.extra, "quality")).sum(axis=1)
     with np.errstate(invalid="ignore"):
         recall, precision = found / np.float64(comparison.reference), found / (found + beside)

@@ -7,10 +7,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
-from detect.drawing.inputs import KINDS, read_head
+from detect.drawing.inputs import KINDS, RunRows, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.runs.outputs import frames_tilt_place, lean_sentence
@@ -20,6 +19,7 @@ from detect.runs.workers import Workers, cluster_workers, default_jobs, local_wo
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_run, open_source
+from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray
 from redetect.landmarks import read_tilts
@@ -53,7 +53,7 @@ def perform(command: DetectorFlags) -> int:
 
         files = {kind: path for kind, path in job.places.items() if kind in KINDS}
         plan = job.plan if getattr(command, "rejected", False) else None
-        draw_run(job.run, files, pictures, plan, overwrite=command.force)
+        draw_run(job.run, RunRows(files), pictures, plan, overwrite=command.force)
     _print_results(job, summary)
     for hint in _hints(job, summary):
         print(hint, file=sys.stderr)
@@ -145,7 +145,7 @@ def _some_images(run: Run) -> Iterator[ByteArray]:
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")
     step = max(1, run.frames.expected // _RADIUS_IMAGES)
-    for frame in islice(run.frames, 0, step * _RADIUS_IMAGES, step):
+    for frame in SomeFrames(run.frames, step * _RADIUS_IMAGES, step):
         with suppress(FrameError):
             yield read_image(frame, run.camera)
 

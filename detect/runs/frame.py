@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby, islice, zip_longest
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -87,18 +87,15 @@ class FrameDetections:
     error: str | None = None  # why the frame cannot be worked on
 
 
-class Search(NamedTuple):
-    """What discs are searched with: the camera, as it leans, and its table."""
-
-    camera: Camera
-    table: VoteTable | DiscTable
+#: What discs are searched with: the camera, as it leans, and its table.
+Search = tuple[Camera, VoteTable | DiscTable]
 
 
 @lru_cache(maxsize=16)
 def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Search:
     """The search for discs of a camera: a process makes it or takes it from the cache once."""
     leaning = camera if lean is None else leaning_camera(camera, lean)
-    return Search(leaning, disc_table(leaning, circles))
+    return leaning, disc_table(leaning, circles)
 
 
 def prepare(plan: FramePlan) -> None:
@@ -178,8 +175,9 @@ def _discs(
     image: GreyImage, camera: Camera, settings: CircleSettings, search: Search
 ) -> CircleDetections:
     """The discs as the calibrated camera sees them, searched as it leans."""
-    found = detect_circles(image, search.camera, search.table, settings)
-    return found if search.camera == camera else as_calibrated(found, search.camera, camera)
+    leaning, table = search
+    found = detect_circles(image, leaning, table, settings)
+    return found if leaning == camera else as_calibrated(found, leaning, camera)
 
 
 @lru_cache(maxsize=4)

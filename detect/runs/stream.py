@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from importlib.metadata import version
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, Lean, RunSummary
 from detect.runs.workers import Crew, Workers, detect_chunks, local_workers
 from detect.sources.interface import ImageRun, RunFrame
+from detect.sources.poses import SomeFrames
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
@@ -195,7 +196,7 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
-        crew = stack.enter_context(Crew(workers))
+        crew = stack.enter_context(closing(Crew(workers)))
         plan = replace(job.plan, json="json" in job.places)
         plan = replace(plan, lean=_lean_of(job.run, plan, crew))
         job, summary.lean = replace(job, plan=plan), plan.lean
@@ -203,11 +204,11 @@ def detect_run(
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
         tasks = files.take_over(every, count)
-        for frames in stack.enter_context(closing(detect_chunks(tasks, plan, crew))):
+        for frames in detect_chunks(tasks, plan, crew):
             files.add(frames)
             for _, rows in frames:
                 count(rows)
-        crew.end()
+        crew.close()
         summary.images_without_step = job.run.frames.left_out
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
@@ -228,12 +229,10 @@ def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
     from detect.runs.frame import evidence_of, lean_of_run, pays  # loads the compiler
 
     step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
-    with closing(iter(run.frames)) as frames:
-        tasks = [FrameTask(frame) for frame in islice(frames, 0, step * _LEAN_FRAMES, step)]
+    tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _LEAN_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
-        with closing(detect_chunks(tasks, plan, crew)) as chunks:
-            return [rows for chunk in chunks for _, rows in chunk]
+        return [rows for chunk in detect_chunks(tasks, plan, crew) for _, rows in chunk]
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
     rows = rows_by(level)

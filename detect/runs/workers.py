@@ -20,7 +20,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -62,39 +62,36 @@ class Workers:
 
 
 def detect_chunks(
-    tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers | Crew
-) -> Generator[list[tuple[FrameTask, FrameRows]], None, None]:
+    tasks: Iterable[FrameTask], plan: FramePlan, crew: Crew
+) -> Iterator[list[tuple[FrameTask, FrameRows]]]:
     """Frames with their rows, in the order of the tasks, as many at a time as a worker gives back.
 
-    Close the generator if not all of them are consumed: that ends the workers, but those of a crew.
     Raises WorkerError if workers die with any frame, disappear, or do not have this program, and
     `lut.TableError` if there can be no table for the camera.
     """
     source = iter(tasks)
-    chunks = iter(lambda: tuple(islice(source, workers.chunk)), ())
+    chunks = iter(lambda: tuple(islice(source, crew.chunk)), ())
     # A chunk without a future is suspect: to be processed while nothing else is under way.
     under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
-    with ExitStack() as started:
-        crew = workers if isinstance(workers, Crew) else started.enter_context(Crew(workers))
-        crew.plan = plan
-        while True:
-            if all(future is not None for _, future in under_way):
-                more = max(0, crew.window() - len(under_way))
-                under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
-            if not under_way:
-                return
-            chunk, future = under_way.popleft()
-            if future is None:
-                yield [(task, crew.rows_alone(task)) for task in chunk]
-                continue
-            try:
-                rows = crew.rows(future)
-            except crew.died as error:
-                crew.dismiss(error)
-                under_way.appendleft((chunk, None))
-                under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
-                continue
-            yield list(zip(chunk, rows))
+    crew.plan = plan
+    while True:
+        if all(future is not None for _, future in under_way):
+            more = max(0, crew.window() - len(under_way))
+            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
+        if not under_way:
+            return
+        chunk, future = under_way.popleft()
+        if future is None:
+            yield [(task, crew.rows_alone(task)) for task in chunk]
+            continue
+        try:
+            rows = crew.rows(future)
+        except crew.died as error:
+            crew.dismiss(error)
+            under_way.appendleft((chunk, None))
+            under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
+            continue
+        yield list(zip(chunk, rows))
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
@@ -107,7 +104,7 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
 class Crew:
     """The workers of a run, started when they are needed, and replaced when one of them has died.
 
-    A context manager, which ends them.
+    Close it when all is done: that ends them.
     """
 
     plan: FramePlan  # what they do with frames
@@ -119,13 +116,7 @@ class Crew:
         self._executor: Executor | None = None
         self._deadly = 0
 
-    def __enter__(self) -> Crew:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.end()
-
-    def end(self) -> None:
+    def close(self) -> None:
         """End the workers."""
         self._executor = None
         self._started.close()
@@ -172,7 +163,7 @@ class Crew:
     def dismiss(self, error: BaseException) -> None:
         """End the rest of broken workers; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
-            self.end()
+            self.close()
 
     def lost(self, future: Future[list[FrameRows]] | None) -> bool:
         """Whether a chunk was lost with its worker."""

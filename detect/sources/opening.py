@@ -11,7 +11,7 @@ from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
-from detect.sources.poses import FirstFrames, FramesAlongPoses, PoseStream, tick_poses, tum_poses
+from detect.sources.poses import FramesAlongPoses, PoseStream, SomeFrames, tick_poses, tum_poses
 from detect.sources.video import LiveCamera, VideoFile
 
 #: Endings of bags that are one file.
@@ -77,7 +77,7 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     else:
         frames, odometry = _frames(source, options)
         has_times = source.has_times
-    frames = FirstFrames(frames, options.frames) if options.frames else frames
+    frames = SomeFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     return run if camera is None else run.calibrated(camera)

@@ -205,15 +205,16 @@ class FramesAlongPoses(Frames):
                 last = pose
 
 
-class FirstFrames(Frames):
-    """The first `count` frames of others."""
+class SomeFrames(Frames):
+    """Of the first `count` frames of others (0: of all) every n-th."""
 
-    def __init__(self, frames: Frames, count: int) -> None:
-        self._frames, self._count = frames, count
+    def __init__(self, frames: Frames, count: int = 0, every: int = 1) -> None:
+        self._frames, self._count, self._every = frames, count, every
         self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
-        self.expected = count if frames.expected is None else min(frames.expected, count)
+        known = [number for number in (frames.expected, count or None) if number is not None]
+        self.expected = -(-min(known) // every) if known else None
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with closing(iter(self._frames)) as frames:
-            yield from islice(frames, self._count)
+            yield from islice(frames, 0, self._count or None, self._every)
             self.left_out = self._frames.left_out

@@ -12,7 +12,6 @@ import scipy.ndimage
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from detect.circles import (
@@ -22,7 +21,6 @@ from detect.circles import (
     disc_table,
     published_positions,
     quality_of_centres,
-    tilt_jacobian,
 )
 from detect.errors import DetectError, FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
@@ -442,22 +440,6 @@ def test_mirrored_discs_are_refined_alike(published_camera: Camera, seed: int) -
     # covariance, fit or rim, places it.
     assert np.all(turned < 2.0 * largest)
     np.testing.assert_allclose(back.quality[partner], found.quality, rtol=0.0, atol=0.02)
-
-
-def test_tilt_jacobian_is_how_positions_move(published_camera: Camera) -> None:
-    """Finite differences: the robot turns about its origin, what is seen is held to be level."""
-    place = np.array([[0.4, -1.6], [-0.8, -2.7]])
-    points = np.column_stack([place, np.zeros(2)])
-    analytic = tilt_jacobian(published_camera, place)
-    step = 1e-6
-    for axis in range(2):
-        ends = []
-        for sign in (1.0, -1.0):
-            tilted_from_level = Rotation.from_rotvec(sign * step * np.eye(3)[axis]).inv()
-            pixels = published_camera.project_robot(tilted_from_level.apply(points))
-            ends.append(published_camera.floor_from_pixel(pixels))
-        numeric = (ends[0] - ends[1]) / (2.0 * step)
-        np.testing.assert_allclose(analytic[:, :, axis], numeric, rtol=1e-6, atol=1e-7)
 
 
 # -- accuracy -------------------------------------------------------------------------------

@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import refined_covariance, tilt_jacobian, vote_shape
+from detect.circles import refined_covariance, vote_shape
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
+from detect.seen import image_positions
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table
 from tests.detect.discs.single_fits import fit_discs
@@ -101,13 +102,22 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: V
 
 
 def test_refined_covariance_is_the_sum(published_camera: Camera) -> None:
-    """The fit's, J J^T per square pixel, and the tilt's, from the camera's own functions."""
+    """The fit's, J J^T per square pixel, and the tilt's, from the camera's own functions.
+
+    Of the tilt by finite differences: the robot turns about its origin, what is seen is held to be
+    level.
+    """
     settings = CircleSettings(systematic_px=0.02, tilt_sigma_deg=0.4)
     places = np.array(PLACES)
     fitted = np.random.default_rng(1).normal(0.0, 1e-3, (len(places), 2, 2))
     fitted = fitted @ fitted.swapaxes(-1, -2)
     jacobian = published_camera.floor_jacobian(published_camera.project_floor(places))
-    tilt = tilt_jacobian(published_camera, places)
+    step = 1e-5
+    ends = [
+        published_camera.floor_from_pixel(image_positions(published_camera, places, lean))
+        for lean in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step))
+    ]
+    tilt = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * step)
     expected = fitted + 0.02**2 * jacobian @ jacobian.swapaxes(-1, -2)
     expected += np.radians(0.4) ** 2 * tilt @ tilt.swapaxes(-1, -2)
     found = refined_covariance(published_camera, places, fitted, settings)

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, every_nth, read_head
+from detect.drawing.inputs import SeenRows, read_head
 from detect.seen import Sight, image_positions, level_seen
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
+from detect.sources.poses import SomeFrames
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -152,11 +153,14 @@ def _circle(points: int) -> FloatArray:
 # -- which frames -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("every", "expected"), [(1, [0, 1, 2]), (2, [0, 2])])
-def test_frames_are_selected(small_run: Path, every: int, expected: list[int]) -> None:
-    count, selection = every_nth(open_source(small_run).frames, every)
-    assert [position for position, _ in selection] == expected
-    assert count == len(expected)
+@pytest.mark.parametrize(
+    ("count", "every", "expected"),
+    [(0, 1, [0, 1, 2]), (0, 2, [0, 2]), (2, 1, [0, 1]), (2, 2, [0]), (9, 2, [0, 2])],
+)
+def test_frames_are_selected(small_run: Path, count: int, every: int, expected: list[int]) -> None:
+    frames = SomeFrames(open_source(small_run).frames, count, every)
+    assert [frame.step.prefix for frame in frames] == [f"s.{k:04d}" for k in expected]
+    assert frames.expected == len(expected)
 
 
 # -- the command ------------------------------------------------------------------------------

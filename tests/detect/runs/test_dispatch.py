@@ -16,7 +16,7 @@ import pytest
 from camera import Camera
 from detect.errors import WorkerError
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
-from detect.runs.workers import Chunk, Workers, detect_chunks
+from detect.runs.workers import Chunk, Crew, Workers, detect_chunks
 from detect.sources.interface import RunFrame
 from redetect.landmarks import Step
 
@@ -44,13 +44,13 @@ def detect_frames(
     tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
 ) -> Generator[FrameRows, None, None]:
     """The frames of all chunks, one by one; each comes with its own task."""
-    with closing(detect_chunks(tasks, plan, workers)) as chunks:
-        for task, rows in chain.from_iterable(chunks):
+    with closing(Crew(workers)) as crew:
+        for task, rows in chain.from_iterable(detect_chunks(tasks, plan, crew)):
             assert task.frame.step.prefix in rows.rows["circles"]
             yield rows
 
 
-class Crew(Executor):
+class Threads(Executor):
     """An executor that does not look at images: what it does with a chunk is the test's."""
 
     def __init__(self, work: Callable[[Chunk], list[FrameRows]], threads: int) -> None:
@@ -91,11 +91,11 @@ class Hired:
         @contextmanager
         def start(_: FramePlan) -> Iterator[Executor]:
             self.started += 1
-            crew = Crew(work, threads)
+            executor = Threads(work, threads)
             try:
-                yield crew
+                yield executor
             finally:
-                crew.pool.shutdown(wait=True, cancel_futures=True)
+                executor.pool.shutdown(wait=True, cancel_futures=True)
                 self.ended += 1
 
         self.workers = Workers(start, chunk=chunk, window=lambda: window, died=died)
