@@ -51,10 +51,19 @@ class HoughCandidates(NamedTuple):
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Centres of discs of one radius (m), for which the table is, by the votes of the edges.
+    """Centres of discs of one radius by the votes of the edges.
 
-    The sign is 1 for light discs, -1 for dark ones, 0 for both; the gradient of an edge is at least
-    `least_step`, grey levels per pixel.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    table : VoteTable
+        The camera's, for this radius.
+    radius : float
+        Metres.
+    sign : int
+        1 for light discs, -1 for dark ones, 0 for both.
+    least_step : float
+        Gradient of an edge, grey levels per pixel.
     """
     signs = np.array([sign] if sign else [1.0, -1.0], np.float64)
     places, scores = [], []

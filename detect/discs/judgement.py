@@ -111,9 +111,19 @@ def judge(
     camera_numbers: FloatArray,
     networks: Networks,
 ) -> Judgement:
-    """Judge candidates, the best first, for discs of a nominal radius, metres.
+    """Judge candidates, the best first.
 
-    The grey value steps by `least_step` at a rim; the numbers are `camera.kernels.camera_numbers`.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    candidates : HoughCandidates
+    nominal : float
+        Radius of discs, metres.
+    least_step : float
+        Of the grey value at a rim.
+    camera_numbers : (K,) float64
+        `camera.kernels.camera_numbers`.
+    networks : Networks
     """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()

@@ -69,8 +69,20 @@ class Size(NamedTuple):
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
     """Place N discs by fits: those that are wholly in view, then the others, of about their size.
 
-    Returns (N, 2) centres, metres, and their (N, 2, 2) covariances; `work` is the working space, a
-    `detect.discs.fit.WORK`.
+    Parameters
+    ----------
+    scene : Scene
+    discs : Judgement
+        Of N discs.
+    work : WORK
+        Working space (`detect.discs.fit`).
+
+    Returns
+    -------
+    floor_xy : (N, 2) float64
+        Centres, metres.
+    covariance : (N, 2, 2) float64
+        Square metres.
     """
     count = len(discs.step)
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
