@@ -303,6 +303,6 @@ def refined_covariance(
             np.ascontiguousarray(floor_xy, np.float64),
             np.ascontiguousarray(fitted, np.float64),
             settings.systematic_px**2,
-            np.radians(settings.tilt_sigma_deg) ** 2,
+            settings.tilt_sigma_rad**2,
         )
     )

@@ -12,6 +12,7 @@ from redetect.storage.bounds import (
     PROBABILITY,
     Bounds,
     Limit,
+    MaybeFloat,
     NotNegative,
     Positive,
     Share,
@@ -21,6 +22,9 @@ from redetect.storage.bounds import (
     from_to,
     whole,
 )
+
+#: Standard deviation of the pitch and the roll of a robot on an even floor, degrees.
+USUAL_TILT_DEG = 0.3
 
 #: Tilt by which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
@@ -76,11 +80,18 @@ class CircleSettings:
     #: position's covariance by the commands. Calibrations commonly fit to 0.1-0.3 px.
     calibration_px: NotNegative = 0.15
     #: Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
-    #: refined position's covariance if the frame's tilt is unknown.
-    tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
+    #: refined position's covariance if the frame's tilt is unknown. By default 0.3, and as much as
+    #: the camera leans, where a run shows that.
+    tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
+
+    @property
+    def tilt_sigma_rad(self) -> float:
+        """Standard deviation of an unknown pitch or roll, radians."""
+        sigma_deg = USUAL_TILT_DEG if self.tilt_sigma_deg is None else self.tilt_sigma_deg
+        return math.radians(sigma_deg)
 
     @property
     def inner_radius_m(self) -> float:

@@ -12,11 +12,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
+from redetect.storage.bounds import MaybeFloat
 from redetect.storage.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
@@ -80,7 +81,10 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     try:
         return _of_type(hints[name], value)
     except (TypeError, OverflowError):
-        kinds = {bool: "True or False", int: "a whole number", float: "a number"}
+        kinds: dict[Any, str] = {
+            bool: "True or False", int: "a whole number", float: "a number",
+            MaybeFloat: "a number or none",
+        }  # fmt: skip
         words = ", ".join(map(str, get_args(hints[name])))
         expected = kinds.get(hints[name], f"one of {words}")
         if get_origin(hints[name]) is tuple:
@@ -95,6 +99,10 @@ def _of_type(hint: Any, value: Any) -> Any:
         each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
         if len(each) == len(value):
             return tuple(_of_type(kind, one) for kind, one in zip(each, value))
+    if get_origin(hint) is Union:
+        for kind in get_args(hint):
+            with suppress(TypeError):
+                return _of_type(kind, value)
     if hint is float and type(value) in (int, float):
         return float(value)
     if type(value) is hint or (get_origin(hint) is Literal and value in get_args(hint)):
@@ -107,7 +115,7 @@ def word_value(kind: type, name: str, word: str) -> Any:
 
     Raises DetectError if it is none, or there is no such setting.
     """
-    value: Any = {"true": True, "false": False}.get(word.lower(), word)
+    value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
     for number in (float, int):  # whole numbers are both
         with suppress(ValueError):
             value = number(word)

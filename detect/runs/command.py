@@ -200,6 +200,11 @@ def _print_results(job: Job, summary: RunSummary) -> None:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
     if summary.lean is not None:
         print(lean_sentence(summary.lean))
+    if summary.unlevelled_deg is not None:
+        print(
+            "the camera leans, and positions are not levelled: they are taken to be wrong by "
+            f"{summary.unlevelled_deg:g} degrees of pitch and roll (detect all levels them)"
+        )
     camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:
         print(
@@ -220,9 +225,10 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     others = summary.frames - summary.failed - summary.found["tilts"]
     if plan.circles is None or plan.levelling == "none" or others == 0:
         return ""
-    if plan.circles.tilt_sigma_deg == 0.0:
+    sigma_deg = math.degrees(plan.circles.tilt_sigma_rad)
+    if sigma_deg == 0.0:
         return f"; the other {others} count as level beyond doubt (see --circles.tilt-sigma-deg)"
-    return f"; the other {others} count as level within {plan.circles.tilt_sigma_deg:g} degrees"
+    return f"; the other {others} count as level within {sigma_deg:g} degrees"
 
 
 def _hints(job: Job, summary: RunSummary) -> Iterator[str]:

@@ -397,8 +397,8 @@ def level_run(
             tilt_as_written(FrameTilt(prefix, pitch, roll, cpp, 0.0, crr, lines))
             for (prefix, lines, _), (pitch, roll, cpp, crr) in zip(frames, numbers, strict=True)
         ]
-    elif settings.tilt_sigma_deg or settings.calibration_px or common is not None:
-        unknown = math.radians(settings.tilt_sigma_deg) ** 2
+    elif settings.tilt_sigma_rad or settings.calibration_px or common is not None:
+        unknown = settings.tilt_sigma_rad**2
         tilts = [t or FrameTilt(name, 0.0, 0.0, unknown, 0.0, unknown, 0) for name, _, t in frames]
     else:
         tilts = [tilt for _, _, tilt in frames]

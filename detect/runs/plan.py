@@ -220,6 +220,7 @@ class RunSummary:
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0  # the odometry does not have them
     lean: Lean | None = None  # of the camera, with which discs were searched
+    unlevelled_deg: float | None = None  # sigma of pitch and roll, enlarged by the camera's lean
     tilt: RunTilt | None = None  # that discs were levelled by, if by the run's
 
     def add(self, rows: FrameRows) -> None:

@@ -24,6 +24,7 @@ import errno
 import hashlib
 import json
 import logging
+import math
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -41,7 +42,7 @@ from detect import __version__
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, Lean, RunSummary
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import Crew, Workers, detect_chunks, local_workers
 from detect.sources.interface import ImageRun, RunFrame
 from detect.sources.poses import SomeFrames
@@ -198,7 +199,9 @@ def detect_run(
     with ExitStack() as stack:
         crew = stack.enter_context(closing(Crew(workers)))
         plan = replace(job.plan, json="json" in job.places)
-        plan = replace(plan, lean=_lean_of(job.run, plan, crew))
+        plan = _with_lean(job.run, plan, crew)
+        if plan.circles != job.plan.circles and plan.circles:
+            summary.unlevelled_deg = plan.circles.tilt_sigma_deg
         job, summary.lean = replace(job, plan=plan), plan.lean
         files = stack.enter_context(RunFiles(job))
         source = stack.enter_context(closing(iter(job.run.frames)))
@@ -219,13 +222,13 @@ def detect_run(
     return summary
 
 
-def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
-    """How the camera leans where discs are searched, by some frames of a run."""
+def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
+    """The plan with the camera's lean, by some frames of a run: to search with, and as unknown."""
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
-        return None
+        return plan
     if expected < _LEAN_FRAMES:
-        return None
+        return plan
     from detect.runs.frame import evidence_of, lean_of_run, pays  # loads the compiler
 
     step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
@@ -237,9 +240,15 @@ def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
     rows = rows_by(level)
     lean = lean_of_run(camera, rows)
-    if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
-        return None
-    return lean
+    if lean is None:
+        return plan
+    if circles.tilt_sigma_deg is None and plan.levelling != "run":
+        sigma_rad = math.hypot(circles.tilt_sigma_rad, math.hypot(*lean) / math.sqrt(2.0))
+        circles = replace(circles, tilt_sigma_deg=round(math.degrees(sigma_rad), 1))
+        plan = replace(plan, circles=circles)
+    if not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
+        return plan
+    return replace(plan, lean=lean)
 
 
 def make_folder(folder: Path) -> None:

@@ -255,6 +255,8 @@ class _InProcess(Executor):
             future.set_result(fn(*args, **kwargs))
         except _CompiledElsewhereError:
             future.set_result(fn(*args, **kwargs))
+        finally:
+            self._chunk = ()
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -263,7 +265,7 @@ class _InProcess(Executor):
     def _before_compilation(self) -> None:
         raise_if_interrupt_waits()
         say_compiling()
-        if not self._shared:
+        if not self._shared or not self._chunk:  # or between tasks
             return
         self._shared = False  # only before the first kernel
         from detect.runs.first_run import level_none, place_none

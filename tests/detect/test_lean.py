@@ -18,7 +18,8 @@ from detect.cli import main
 from detect.levelling import as_calibrated, level_discs
 from detect.runs.frame import lean_of_frame
 from detect.seen import leaning_camera
-from redetect.landmarks import FrameTilt, read_frames
+from detect.settings_files import read_settings
+from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
 
 #: A calibration is wrong by so much, degrees.
 LEANS = [(2.3, 0.0), (-2.3, 0.8)]
@@ -69,6 +70,16 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     seen = level_rows(tmp_path / "seen.circles")
     assert [len(rows) for rows in seen] == [len(rows) for rows in wrong]
     assert found_again(seen, wrong) < 0.8
+    # They say how wrong they may be: by the lean of the first frames, and by 0.3 degrees as usual.
+    settings = read_settings(tmp_path / "seen.circles.log.json").circles
+    assert settings.tilt_sigma_deg is not None
+    assert settings.tilt_sigma_deg == pytest.approx(
+        np.hypot(0.3, np.linalg.norm(lean_deg) / np.sqrt(2.0)), abs=0.2
+    )
+    off = np.concatenate(seen) - np.concatenate(wrong)
+    frames = read_frames(tmp_path / "seen.circles")
+    covariance = np.concatenate([circle_arrays(frame.circles).covariance for frame in frames])
+    assert 0.3 < squared_mahalanobis(off, covariance).mean() / 2.0 < 1.4
 
 
 def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Path) -> None:

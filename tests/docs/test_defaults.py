@@ -21,7 +21,7 @@ from detect.discs.hough import _MOST_DOUBTFUL
 from detect.discs.judgement import GLANCED, GLANCED_AT
 from detect.discs.rim import DIRECTIONS
 from detect.line_settings import LineSettings
-from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
+from detect.settings import PUBLISHED, REPORT, USUAL_TILT_DEG, CircleSettings, MarkerSettings
 from redetect.cli import PROGRAMS
 from tests.docs.blocks import documents
 
@@ -34,7 +34,7 @@ DISCS, MARKERS, LINES = CircleSettings(), MarkerSettings(), LineSettings()
 
 #: What documents say without naming a flag: the page, the sentence with its numbers, and these.
 SENTENCES: list[tuple[str, str, list[float]]] = [
-    ("README.md", r"for unknown within #°", [DISCS.tilt_sigma_deg]),
+    ("README.md", r"not #° as usual", [USUAL_TILT_DEG]),
     ("docs/discs.md", r"# grey values are taken from each", [DISCS.samples]),
     ("docs/discs.md", r"# pairs of samples at # and # radii; .*?; # must;",
      [PUBLISHED.samples, PUBLISHED.inner_ring, PUBLISHED.outer_ring, PUBLISHED.least_pairs]),
@@ -49,7 +49,7 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
     ("docs/discs.md", r"the rim is followed in # directions", [DIRECTIONS]),
     ("docs/discs.md", r"at # directions times # pixels", [GLANCED, len(GLANCED_AT)]),
     ("docs/discs.md", r"The best # centres of either polarity", [_MOST_DOUBTFUL]),
-    ("docs/discs.md", r"and a tilt of #°", [DISCS.tilt_sigma_deg]),
+    ("docs/discs.md", r"and a tilt of #°", [USUAL_TILT_DEG]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),
     ("docs/markers.md", r"takes #, #, #, # and #", list(MARKERS.thresholds)),
     ("docs/camera.md", r"leave it open by more than #", [_ASPECT_SIGMA]),

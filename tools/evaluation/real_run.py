@@ -15,14 +15,11 @@ from tyro.conf import Positional
 from tools.evaluation.figures import Figures, Study, compared, run_program
 from tools.evaluation.tables import Table
 
-#: How the rows of each line of the table are made; the camera's true spread of tilt and the lens
-#: are stated for the honest ones (`docs/slam/real-run.md`).
-_SPREAD = ("--tilt-sigma-deg", "0.6", "--calibration-px", "0.3")
+#: How the rows of each line of the table are made.
 WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("shipped", "", ()),
     ("--preset published", "circles", ("--preset", "published")),
     ("default", "circles", ()),
-    ("default, tilt and lens stated", "circles", _SPREAD),
     ("detect all", "all", ()),
     ("detect all, lens stated", "all", ("--circles.calibration-px", "0.3")),
 )
