@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from numba import njit
 from numba.core import event
 
 import detect.runs.workers as workers_module
@@ -51,6 +52,13 @@ PATIENCE_S = 600.0
 def run_folder(project_root: Path, tmp_path: Path) -> Path:
     """Long enough to be disturbed: frames of the demo run, over and over."""
     return demo_frames(project_root, tmp_path / "e", [place % 8 for place in range(FRAMES)])
+
+
+def test_a_kernel_may_be_compiled_between_two_tasks(project_root: Path) -> None:
+    camera = open_run(project_root / "images" / "e").camera
+    plan = FramePlan(camera, LineSettings(), CircleSettings())
+    with local_workers(1, shared=True).start(plan):
+        assert njit(lambda number: number + 1)(1) == 2
 
 
 def detected(
