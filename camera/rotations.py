@@ -19,8 +19,10 @@ def rotation_of(vectors: FloatArray) -> FloatArray:
 def cross_matrices(vectors: FloatArray) -> FloatArray:
     """(..., 3, 3) matrices [v]x with [v]x w = v x w, of (..., 3) vectors."""
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    cross = np.zeros((*x.shape, 3, 3))
+    cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -z, y, -x
+    cross[..., 1, 0], cross[..., 2, 0], cross[..., 2, 1] = z, -y, x
+    return cross
 
 
 def left_jacobian(vectors: FloatArray) -> FloatArray:

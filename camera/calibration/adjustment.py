@@ -18,6 +18,7 @@ from camera.calibration.model import (
     FreeLens,
     corner_radius,
     is_possible,
+    pixels_of_points,
     project_points,
 )
 from camera.rotations import cross_matrices, rotation_of
@@ -304,7 +305,7 @@ def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatA
     on_board = points.board[:, None, :] + ring
     in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], on_board)
     in_camera += estimate.translations[view][:, None, :]
-    outline = project_points(estimate.intrinsics, in_camera.reshape(-1, 3))[0]
+    outline = pixels_of_points(estimate.intrinsics, in_camera.reshape(-1, 3))
     outline = outline.reshape(len(view), _OUTLINE_POINTS, 2)
     centre = project_estimate(estimate, points)[0]
     relative = outline - centre[:, None, :]

@@ -8,6 +8,7 @@ equal scales are one column and a coefficient that is left at 0 has none.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +70,35 @@ def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
     return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
 
 
+class _Seen(NamedTuple):
+    """Points in the camera frame through a lens; NaN where it does not see them."""
+
+    z: FloatArray  # (N,)
+    xy: FloatArray  # (N, 2): undistorted normalised coordinates
+    r: FloatArray  # (N,): their radius
+    denominator: FloatArray  # (N,): of the distortion
+    ratio: FloatArray  # (N,): the rational function
+    distorted: FloatArray  # (N, 2): distorted normalised coordinates
+
+
+def _seen(coef: Coef, brown: Brown, points_camera: FloatArray) -> _Seen:
+    a2, a3, b1, b2, b3 = coef
+    z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
+    xy = points_camera[:, :2] / z[:, None]
+    r = np.hypot(xy[:, 0], xy[:, 1])
+    r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
+    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+    ratio = r * (a2 + r * a3) / denominator
+    distorted = xy * (1.0 + ratio)[:, None] + brown_shift(xy, brown)
+    return _Seen(z, xy, r, denominator, ratio, distorted)
+
+
+def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
+    """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
+    distorted = _seen(*lens_of(intrinsics), points_camera).distorted
+    return np.asarray(intrinsics[:2] * distorted + intrinsics[2:4])
+
+
 def project_points(
     intrinsics: FloatArray, points_camera: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -79,14 +109,7 @@ def project_points(
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
     coef, brown = lens_of(intrinsics)
-    a2, a3, b1, b2, b3 = coef
-    z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
-    xy = points_camera[:, :2] / z[:, None]
-    r = np.hypot(xy[:, 0], xy[:, 1])
-    r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
-    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
-    ratio = r * (a2 + r * a3) / denominator
-    seen = xy * (1.0 + ratio)[:, None] + brown_shift(xy, brown)
+    z, xy, r, denominator, ratio, seen = _seen(coef, brown, points_camera)
 
     by_intrinsics = np.zeros((len(r), 2, COUNT))
     by_intrinsics[:, [0, 1], [0, 1]] = seen
@@ -114,17 +137,24 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
         return False
     coef, brown = lens_of(intrinsics)
     r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
-    edge = r_max * _DIRECTIONS
-    edge = edge * radial_factor(np.array(r_max), coef) + brown_shift(edge, brown)
-    border = border_pixels(width, height, _BORDER_PLACES)
-    border = (border - intrinsics[2:4]) / intrinsics[:2]
-    reach = np.interp(
-        np.arctan2(border[:, 1], border[:, 0]),
-        np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
-        np.hypot(edge[:, 0], edge[:, 1]),
-        period=2.0 * np.pi,
-    )
+    factor = radial_factor(np.array(r_max), coef)
+    border = (_border(width, height) - intrinsics[2:4]) / intrinsics[:2]
+    reach = r_max * factor
+    if any(brown):  # else it is the same in all directions
+        edge = r_max * _DIRECTIONS
+        edge = edge * factor + brown_shift(edge, brown)
+        reach = np.interp(
+            np.arctan2(border[:, 1], border[:, 0]),
+            np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
+            np.hypot(edge[:, 0], edge[:, 1]),
+            period=2.0 * np.pi,
+        )
     return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + _FOLD_MARGIN) < reach))
+
+
+@lru_cache(maxsize=16)
+def _border(width: int, height: int) -> FloatArray:
+    return border_pixels(width, height, _BORDER_PLACES)
 
 
 def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:

@@ -45,6 +45,8 @@ def run(block: Block) -> None:
         program, *arguments = shlex.split(text, comments=True)
         if program in PROGRAMS:
             code = import_module(PROGRAMS[program]).main(arguments)
+        elif text.startswith("python -m tools."):
+            code = import_module(f"{arguments[1]}.__main__").main(arguments[2:])
         else:
             code = subprocess.run(["bash", "-euc", text], check=False).returncode
         assert code == 0, f"{block.document.name}:{line}: {text}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ _TILTS_RAD = np.array([0.45, 0.45, 0.3])
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
 # Dots of a ChArUco board's print per square.
 _DOTS = 120
+_TOGETHER = 8  # rows of sub-pixels whose grey values are computed at once: they fit into a cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,7 @@ def rays_of(camera: Camera, samples: int = 4) -> Rays:
     inner = (np.arange(samples) + 0.5) / samples - 0.5
     u = (np.arange(camera.width)[:, None] + inner).ravel()
     v = (np.arange(camera.height)[:, None] + inner).ravel()
-    grid = np.stack(np.meshgrid(u, v), axis=-1)
-    return Rays(camera.undistort(grid), samples, camera)
+    return Rays(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1)), samples, camera)
 
 
 def render_board(
@@ -55,13 +56,9 @@ def render_board(
     """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
     import cv2
 
-    normal = rotation[:, 2]
-    along = rays.xy @ normal[:2] + normal[2]
-    depth = float(normal @ translation) / np.where(np.abs(along) > 1e-9, along, np.nan)
-    point = np.concatenate([rays.xy, np.ones_like(rays.xy[..., :1])], axis=-1) * depth[..., None]
-    on_board = (point - translation) @ rotation[:, :2]
-    visible = np.isfinite(depth) & (depth > 0.0)
-    fine = np.where(visible, _print(board, np.where(visible[..., None], on_board, 1e9)), _ROOM)
+    fine = np.empty(rays.xy.shape[:2])
+    for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
+        fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
     if blur_px > 0.0:
         fine = cv2.GaussianBlur(fine, (0, 0), blur_px * rays.samples)
     n = rays.samples
@@ -71,17 +68,21 @@ def render_board(
     return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
 
 
-def _print(board: Board, xy: FloatArray) -> FloatArray:
-    """Grey value of places on the board's plane, (..., 2) in metres."""
+def _greys(xy: FloatArray, board: Board, rotation: FloatArray, place: FloatArray) -> FloatArray:
+    """Grey values along rays (x, y, 1), (..., 2), to a board whose middle is at a place."""
+    along = xy @ rotation[:2, 2] + rotation[2, 2]
+    depth = float(rotation[:, 2] @ place) / np.where(np.abs(along) > 1e-9, along, np.nan)
+    visible = np.isfinite(depth) & (depth > 0.0)
+    a, b, c = xy[..., 0] * depth - place[0], xy[..., 1] * depth - place[1], depth - place[2]
+    x, y = (np.where(visible, a * e[0] + b * e[1] + c * e[2], 1e9) for e in rotation.T[:2])
     square = board.square_m
     half = board.points[:, :2].max(axis=0) + (1.0 if "circles" not in board.kind else 1.5) * square
-    x, y = xy[..., 0], xy[..., 1]
     inside = (np.abs(x) <= half[0]) & (np.abs(y) <= half[1])
     margin = (np.abs(x) <= half[0] + square) & (np.abs(y) <= half[1] + square)
     column = np.where(inside, (x + half[0]) / square, 0.0)
     row = np.where(inside, (half[1] - y) / square, 0.0)
     if board.kind == "checkerboard":
-        black = (np.floor(column) + np.floor(row)) % 2 == 0
+        black = (column.astype(np.int64) + row.astype(np.int64)) & 1 == 0
     elif board.kind == "charuco":
         grey = _charuco(board)
         r = np.clip((row * _DOTS).astype(int), 0, grey.shape[0] - 1)
@@ -95,6 +96,7 @@ def _print(board: Board, xy: FloatArray) -> FloatArray:
     return np.asarray(np.where(inside & black, _INK, np.where(margin, _PAPER, _ROOM)))
 
 
+@lru_cache(maxsize=4)
 def _charuco(board: Board) -> ByteArray:
     import cv2
 

@@ -10,7 +10,7 @@ from detect.cli import main
 from tests.detect.interrupted_runs import a_run, results
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that is not to be changed."""
     return a_run(project_root, tmp_path_factory.mktemp("run") / "e")
@@ -22,7 +22,7 @@ def own_run(project_root: Path, tmp_path: Path) -> Path:
     return a_run(project_root, tmp_path / "e")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def undisturbed(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """What the run writes when nothing happens to it."""
     output = tmp_path_factory.mktemp("undisturbed")
