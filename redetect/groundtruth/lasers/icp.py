@@ -36,8 +36,36 @@ def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
     count = np.count_nonzero(within)
     if kept < 1.0 and count > 0:
         last = math.ceil(kept * count) - 1
-        within &= squared <= np.partition(squared[within], last)[last]
+        within &= squared <= _smallest(squared[within], last)
     return within
+
+
+@kernel()
+def _smallest(values: FloatArray, which: int) -> float:
+    """The `which` smallest of some values, from 0, by Hoare's method; they change places.
+
+    `np.partition` would do it, but takes four seconds to compile.
+    """
+    first, last = 0, len(values) - 1
+    while first < last:
+        pivot = values[(first + last) // 2]
+        i, j = first, last
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if which <= j:
+            last = j
+        elif which >= i:
+            first = i
+        else:
+            break
+    return float(values[which])
 
 
 class Scan:
@@ -169,26 +197,37 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
 
     The plane's closed form of the fit by singular values (Arun, Huang, Blostein 1987).
     """
-    if not np.any(used):
+    # Plain loops: NumPy's sums and parts of arrays take seconds to compile.
+    n, px, py, qx, qy = 0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(used)):
+        if used[i]:
+            n += 1
+            px, py = px + points[i, 0], py + points[i, 1]
+            qx, qy = qx + target[i, 0], qy + target[i, 1]
+    if n == 0:
         return np.full(3, np.nan)
-    p, q = points[used], target[used]
-    n = len(p)
-    middle_p, middle_q = p.sum(axis=0) / n, q.sum(axis=0) / n
-    a, b = p - middle_p, q - middle_q
-    dot = np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
-    theta = math.atan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), dot)
+    px, py, qx, qy = px / n, py / n, qx / n, qy / n
+    dot = cross = 0.0
+    for i in range(len(used)):
+        if used[i]:
+            ax, ay = points[i, 0] - px, points[i, 1] - py
+            bx, by = target[i, 0] - qx, target[i, 1] - qy
+            dot += ax * bx + ay * by
+            cross += ax * by - ay * bx
+    theta = math.atan2(cross, dot)
     c, s = math.cos(theta), math.sin(theta)
-    x = middle_q[0] - (c * middle_p[0] - s * middle_p[1])
-    y = middle_q[1] - (s * middle_p[0] + c * middle_p[1])
-    return np.array([x, y, theta])
+    return np.array([qx - (c * px - s * py), qy - (s * px + c * py), theta])
 
 
 @kernel()
 def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Points taken by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y = points[:, 0], points[:, 1]
-    return np.column_stack((pose[0] + c * x - s * y, pose[1] + s * x + c * y))
+    there = np.empty((len(points), 2))
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        there[i, 0], there[i, 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
+    return there
 
 
 @kernel()
@@ -217,7 +256,11 @@ def fit_outline(
             return pose, np.inf, near
         used = best_share(squared, gate_m, kept)
         count = int(np.count_nonzero(used))
-        rms = math.sqrt(squared[used].sum() / count)
+        total = 0.0
+        for i in range(len(squared)):
+            if used[i]:
+                total += squared[i]
+        rms = math.sqrt(total / count)
         if abs(before - rms) < threshold_m or step == most_steps:
             return pose, rms, count
         before = rms

@@ -213,7 +213,8 @@ def _hold_open(
             open_count += 1
             row = np.ascontiguousarray(vectors[:, k]) @ there
             g -= p * row * (row @ to_start)
-            h += np.outer(p * row, row)
+            for a in range(3):  # np.outer takes longer to compile
+                h[a] += p * row[a] * row
     return open_count, vectors[:, 0].copy()
 
 
