@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 # As the command lines have it, and before NumPy is loaded: threads that wait for each other beside
@@ -21,6 +23,9 @@ from tools.published_camera import PUBLISHED_CAM
 # examples of the default: the same ones each time, more of them tell little.
 settings.register_profile("project", deadline=None, derandomize=True, max_examples=30)
 settings.load_profile("project")
+
+# The help of flags is read out of the source each time that a command line is parsed.
+inspect.getsource = lru_cache(maxsize=None)(inspect.getsource)  # type: ignore[assignment]
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,6 +47,7 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
     gc.disable()
     yield
     gc.freeze()
+    gc.set_threshold(50_000)
     gc.enable()
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shlex
+from contextlib import redirect_stdout
+from functools import cache
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -14,15 +17,17 @@ import pytest
 from redetect.cli import PROGRAMS, main
 
 
-def help_of(program: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as end:
+@cache
+def help_of(program: str, *words: str) -> str:
+    shown = io.StringIO()
+    with redirect_stdout(shown), pytest.raises(SystemExit) as end:
         import_module(PROGRAMS[program]).main([*words, "--help"])
     assert end.value.code == 0
-    return capsys.readouterr().out
+    return shown.getvalue()
 
 
-def commands_of(program: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    choices = re.search(r"\{(\w+(?:,\s*\w+)*)\}", help_of(program, [], capsys))
+def commands_of(program: str) -> list[str]:
+    choices = re.search(r"\{(\w+(?:,\s*\w+)*)\}", help_of(program))
     assert choices is not None
     return re.split(r",\s*", choices[1])
 
@@ -43,13 +48,11 @@ def examples_in(text: str) -> list[list[str]]:
 
 @pytest.mark.lowest
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_every_help_shows_an_example_that_parses(
-    program: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    commands = commands_of(program, capsys)
+def test_every_help_shows_an_example_that_parses(program: str) -> None:
+    commands = commands_of(program)
     assert len(commands) >= 3
     for command in commands:
-        examples = examples_in(help_of(program, [command], capsys))
+        examples = examples_in(help_of(program, command))
         assert [program, command] in [words[:2] for words in examples], command
         for words in examples:
             # It may be another program's.
@@ -58,10 +61,8 @@ def test_every_help_shows_an_example_that_parses(
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_the_programs_own_help_shows_an_example_that_parses(
-    program: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (words,) = examples_in(help_of(program, [], capsys))
+def test_the_programs_own_help_shows_an_example_that_parses(program: str) -> None:
+    (words,) = examples_in(help_of(program))
     assert type(import_module(PROGRAMS[program]).parsed(words[1:])).__name__.lower() == words[1]
 
 
@@ -85,9 +86,9 @@ def test_every_program_says_its_version(program: str, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("program", sorted(PROGRAMS))
-def test_every_flag_has_help(program: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in commands_of(program, capsys):
-        text = help_of(program, [command], capsys)
+def test_every_flag_has_help(program: str) -> None:
+    for command in commands_of(program):
+        text = help_of(program, command)
         assert "options options" not in text, command
         lines = [line.strip("│╭╰ \n") for line in text.split("\n")]
         for line, following in pairwise(lines):

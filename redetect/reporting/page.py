@@ -94,6 +94,11 @@ def figure_file(
             FigureCanvasAgg(figure)
         content = io.BytesIO()
         yield figure, content
+        engine = figure.get_layout_engine()
+        if new is Figure and kind == "png" and engine is not None:
+            # Else all of it is drawn once more, only to be laid out.
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         # Without date, name and version of the program: the same bytes each time.
         nameless = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
         figure.savefig(content, format=kind, dpi=_DPI, metadata=nameless)

@@ -116,8 +116,11 @@ def _blurred_pixel(distance: FloatArray, blur: float) -> FloatArray:
     def primitive(z: FloatArray) -> FloatArray:
         return np.asarray(z * ndtr(z) + np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi))
 
-    upper, lower = (distance + 0.5) / blur, (distance - 0.5) / blur
-    return blur * (primitive(upper) - primitive(lower))
+    share = np.where(distance > 0.0, 1.0, 0.0)
+    near = np.abs(distance) < 0.5 + 9.0 * blur  # farther off it is 0 or 1 to the last digits
+    upper, lower = (distance[near] + 0.5) / blur, (distance[near] - 0.5) / blur
+    share[near] = blur * (primitive(upper) - primitive(lower))
+    return share
 
 
 def _pose(
