@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
-from tools.simulator.single_disc import render_disc
+from tools.simulator.single_disc import DiscCrop, render_disc
 
 FLOOR = 90.0
 LIGHT = 200.0
@@ -32,9 +33,8 @@ class PaintedFloor:
     def disc(
         self, floor_xy: ArrayLike, grey: float = LIGHT, radius_m: float = 0.10, blur_px: float = 0.7
     ) -> PaintedFloor:
-        crop = render_disc(
-            self.camera, floor_xy, radius_m, grey, self.floor, blur_px, rounded=False
-        )
+        x, y = np.asarray(floor_xy, np.float64).tolist()
+        crop = _rendered(self.camera, (x, y), radius_m, grey, self.floor, blur_px)
         height, width = crop.grey.shape
         part = np.s_[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width]
         self.grey[part] += crop.grey - self.floor
@@ -67,6 +67,15 @@ class PaintedFloor:
     def image(self, noise: float = 1.5, seed: int = 0) -> NDArray[np.uint8]:
         noisy = self.grey + np.random.default_rng(seed).normal(0.0, noise, self.grey.shape)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=256)
+def _rendered(
+    camera: Camera, floor_xy: tuple[float, float], radius_m: float, grey: float, floor: float,
+    blur_px: float,
+) -> DiscCrop:  # fmt: skip
+    """Half of all discs of the tests are painted more than once."""
+    return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px, rounded=False)
 
 
 def mirrored_camera(camera: Camera) -> Camera:

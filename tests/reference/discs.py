@@ -95,18 +95,16 @@ def chord_share(
     reach = np.abs(step) * math.sqrt(7.0 * (blur_2**2 + PIXEL_VARIANCE))
     first = np.arcsin(np.clip((across - reach) / radius, -1.0, 1.0))
     last = np.arcsin(np.clip((across + reach) / radius, -1.0, 1.0))
-    share = np.zeros_like(at.x)
-    for k in (np.arange(400) + 0.5) / 400:
-        theta = first + k * (last - first)
-        off = radius * np.sin(theta) - across
-        ends = []
-        for sign in (1.0, -1.0):
-            d = off * slant - along + sign * radius * np.cos(theta) / length
-            bend = np.clip(at.growth * d, -0.7, 0.7)
-            ends.append(ndtr(d * (1.0 - 0.5 * bend) / math.sqrt(blur_1**2 + PIXEL_VARIANCE)))
-        kernel = 15.0 / 16.0 * (1.0 - (off / reach) ** 2) ** 2 / reach
-        share += kernel * (ends[0] - ends[1]) * radius * np.cos(theta) * (last - first) / 400
-    return share
+    theta = first + (np.arange(400)[:, None] + 0.5) / 400 * (last - first)
+    half = radius * np.cos(theta)
+    off = radius * np.sin(theta) - across
+    ends = []
+    for sign in (1.0, -1.0):
+        d = off * slant - along + sign * half / length
+        bend = np.clip(at.growth * d, -0.7, 0.7)
+        ends.append(ndtr(d * (1.0 - 0.5 * bend) / math.sqrt(blur_1**2 + PIXEL_VARIANCE)))
+    kernel = 15.0 / 16.0 * (1.0 - (off / reach) ** 2) ** 2 / reach
+    return np.asarray(np.sum(kernel * (ends[0] - ends[1]) * half, axis=0) * (last - first) / 400)
 
 
 # -- the patch ----------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def render_board(
     """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
     import cv2
 
-    fine = np.empty(rays.xy.shape[:2])
+    fine: FloatArray = np.empty(rays.xy.shape[:2])
     for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
         fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
     if blur_px > 0.0:
