@@ -78,24 +78,14 @@ def test_one_pass_writes_what_two_passes_do(run_folder: Path, tmp_path: Path) ->
         assert (once / name).read_bytes() == (twice / name).read_bytes()
 
 
-@pytest.mark.long
-def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None:
-    by_jobs = {}
-    for jobs in (1, 2):
-        folder = folder_of(tmp_path / str(jobs))
-        in_one_pass(run_folder, folder, jobs)
-        by_jobs[jobs] = files_in(folder)
-    assert by_jobs[2] == by_jobs[1]
-
-
 def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
     """Every kind of file: rows, tilts, IDs carried over, JSON."""
-    plain = {"lines": output / "plain.lines", "tilt": output / "plain.tilt"}
-    detect(run, plain, lines=LineSettings())
+    in_one_pass(run, output, jobs)
+    plain = in_folder(output, "lines", "tilt")
     reference = output / "reference.lines"
     numbered = (
         row[:-2] + f"{number}" if row.startswith("LANDMARK_L") else row
-        for number, row in enumerate((output / "plain.lines").read_text().splitlines())
+        for number, row in enumerate(plain["lines"].read_text().splitlines())
     )
     reference.write_text("\n".join(numbered) + "\n")
     places = {"lines": output / "known.lines", "tilt": output / "known.tilt"}
@@ -108,7 +98,7 @@ def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
 
 
 @pytest.mark.long
-def test_ids_and_json_are_the_same_by_any_number(run_folder: Path, tmp_path: Path) -> None:
+def test_processes_write_what_one_does(run_folder: Path, tmp_path: Path) -> None:
     one = all_there_is(run_folder, folder_of(tmp_path / "one"), 1)
     two = all_there_is(run_folder, folder_of(tmp_path / "two"), 2)
     assert one == two
