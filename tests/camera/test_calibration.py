@@ -29,6 +29,7 @@ from camera.calibration.model import (
     CalibrationSettings,
     FreeLens,
     is_possible,
+    pixels_of_points,
     project_points,
 )
 from camera.errors import CalibrationError
@@ -83,6 +84,7 @@ def test_points_are_projected_as_the_camera_projects_them(
     points = np.random.default_rng(1).normal(loc=[0.0, 0.0, 1.0], size=(200, 3))
     pixels, _, _ = project_points(intrinsics_of(camera), points)
     np.testing.assert_allclose(pixels, camera.project(points), rtol=0.0, atol=1e-10)
+    np.testing.assert_array_equal(pixels_of_points(intrinsics_of(camera), points), pixels)
     assert with_intrinsics(published_camera, intrinsics_of(camera)) == camera
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from redetect.groundtruth.lasers.icp import (
+    best_share,
     fit_outline,
     moved,
     nearest_on_segments,
@@ -31,6 +34,18 @@ def on_walls(segments: FloatArray, count: int, rng: np.random.Generator) -> Floa
     k = rng.choice(len(segments), count, p=lengths / lengths.sum())
     t = rng.uniform(0.0, 1.0, (count, 1))
     return np.asarray(segments[k, :2] + t * (segments[k, 2:] - segments[k, :2]))
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.01, 0.02, 0.03, 0.05, 0.08, np.inf]) | st.floats(0.0, 0.1)),
+    st.floats(0.01, 1.0),
+)
+def test_the_best_share_is_that_of_the_sorted_distances(squared: list[float], kept: float) -> None:
+    """However many of them are equal."""
+    inside = sorted(d for d in squared if d <= 0.3 * 0.3)
+    last = inside[math.ceil(kept * len(inside)) - 1] if inside else -1.0
+    found = best_share(np.array(squared, np.float64), 0.3, kept)
+    assert found.tolist() == [d <= last for d in squared]
 
 
 @given(poses, poses)
