@@ -60,7 +60,7 @@ def render_board(
     for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
         fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
     if blur_px > 0.0:
-        fine = cv2.GaussianBlur(fine, (0, 0), blur_px * rays.samples)
+        fine = np.asarray(cv2.GaussianBlur(fine, (0, 0), blur_px * rays.samples), np.float64)
     n = rays.samples
     height, width = fine.shape[0] // n, fine.shape[1] // n
     image = fine.reshape(height, n, width, n).mean(axis=(1, 3))
