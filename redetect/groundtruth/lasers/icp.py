@@ -36,36 +36,8 @@ def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
     count = np.count_nonzero(within)
     if kept < 1.0 and count > 0:
         last = math.ceil(kept * count) - 1
-        within &= squared <= _smallest(squared[within], last)
+        within &= squared <= np.sort(squared[within])[last]  # a partition takes longer to compile
     return within
-
-
-@kernel()
-def _smallest(values: FloatArray, which: int) -> float:
-    """The `which` smallest of some values, from 0, by Hoare's method; they change places.
-
-    `np.partition` would do it, but takes four seconds to compile.
-    """
-    first, last = 0, len(values) - 1
-    while first < last:
-        pivot = values[(first + last) // 2]
-        i, j = first, last
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if which <= j:
-            last = j
-        elif which >= i:
-            first = i
-        else:
-            break
-    return float(values[which])
 
 
 class Scan:
