@@ -68,7 +68,7 @@ def least_part_quality(quality: float, samples: int) -> float:
 
 @kernel(forceinline=True)
 def _with_squares(grey: ByteArray, first: int, end: int) -> NDArray[np.uint32]:
-    """x 2^20 + x^2 of some pixels; uninitialised before and after them."""
+    """Terms x 2^20 + x^2 of some pixels; uninitialised before and after them."""
     both = np.empty(len(grey), np.uint32)
     for i in range(_U64(first), _U64(end)):
         x = _U32(grey[i])

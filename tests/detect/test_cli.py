@@ -225,11 +225,11 @@ def test_outputs_into_no_folder(small_run: Path, capsys: Captured, flag: str) ->
         (["circles", "RUN", "-o", "X/rows", "--json", "X/./rows"], "rows: named for two results"),
         (["circles", "RUN", "-o", "X/r", "--json", "X/r.log.json"], "r.log.json: named for two"),
         (["lines", "RUN", "-o", "X/rows.tilt"], "rows.tilt: named for two results"),
-        (["circles", "RUN", "-o", ""], "is a folder: expected the file to write"),
-        (["lines", "RUN", "-o", "."], "is a folder: expected the file to write"),
-        (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is no folder"),
-        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is no folder"),
-        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is no folder"),
+        (["circles", "RUN", "-o", ""], "is a folder: expected an output file"),
+        (["lines", "RUN", "-o", "."], "is a folder: expected an output file"),
+        (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is not a folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is not a folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is not a folder"),
     ],
 )
 @pytest.mark.parametrize("force", [(), ("--force",)])
