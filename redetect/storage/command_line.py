@@ -111,7 +111,7 @@ def _message(error: Exception) -> str:
 def _is_of_cache(error: Exception) -> bool:
     """Whether Numba raised it over its cache of compiled kernels, here or in a worker.
 
-    There is not a folder for it, no space left in it, or its index names classes of another version of
+    There is no folder for it, no space left in it, or its index names classes of another version of
     the program: Numba's own words are no help.
     """
     return _NUMBAS_CACHING in "".join(traceback.format_exception(error))
