@@ -136,7 +136,7 @@ def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> 
         (small_run / "images" / f"z{number}.png").touch()
     assert main(["markers", str(small_run)]) == 3
     lines = capsys.readouterr().err.splitlines()
-    assert "14 frames could not be worked on:" in lines
+    assert "14 frames could not be processed:" in lines
     assert sum("is empty" in line for line in lines) == 10
     assert lines[-1] == "  and 4 more"
 
@@ -362,7 +362,7 @@ def test_demands_decide_the_exit_code(
     shown = capsys.readouterr()
     lines = shown.err.splitlines()
     assert len(lines) == unmet
-    assert all(line.startswith("recall is 0.7500: at least 0.") for line in lines)
+    assert all(line.startswith("recall is 0.7500: expected at least 0.") for line in lines)
     assert "0.75" in shown.out or "75" in shown.out
 
 
