@@ -1,11 +1,11 @@
 """The disc detector: one image in, discs on the floor out.
 
-The way of one image begins at `detect_circles`. The published detector (DLR Spatial
-Cognition data set report, circle detection) needs no more than the quality of each centre: it
-accepts those of a good quality and contrast, keeps the best within a disc's width, and reports the
-pixel with a covariance of one pixel and some centimetres. The default goes by rims: edges vote for
-centres, the rim about each of the best is followed and judged, and a disc that is fitted through
-the camera gives the position.
+The entry point is `detect_circles`. The published detector (DLR Spatial Cognition data set report,
+circle detection) needs only the quality of each centre: it accepts centres of sufficient quality
+and contrast, keeps the best within a disc's width, and reports the pixel with a covariance of one
+pixel and some centimetres. The default detector uses rims: edges vote for centres, the rim around
+each of the best is traced and classified, and fitting a disc through the camera model gives the
+position.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
-from detect.discs.evidence import SURE, lost_by_paleness, lost_by_sign
+from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JUDGED, Judgement, judge
@@ -43,13 +43,13 @@ from lut import (
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
-#: For the noise floor an image's noise is never less than this: one grey level, its resolution.
+#: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
-#: Rows of an image from which its noise is estimated.
+#: Number of rows from which an image's noise is estimated.
 _NOISE_ROWS = 16
-#: Gradient of an edge that votes, at least and where the image is full of edges, grey levels per
-#: pixel, and in deviations of the noise as a share of `noise_floor`; least step of a rim.
+#: Lowest gradient of an edge that votes, and the same in images full of edges, grey levels per
+#: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
 
@@ -69,7 +69,7 @@ class CircleDetections:
         return len(self.quality)
 
     def where(self, chosen: BoolArray) -> CircleDetections:
-        """Some of the discs, by a mask."""
+        """The discs that a boolean mask selects."""
         own = {name: each[chosen] for name, each in vars(self).items() if name != "levelled_by"}
         return replace(self, **own)
 
@@ -86,7 +86,7 @@ def detect_circles(
     camera : Camera
         The calibrated camera.
     table : VoteTable or DiscTable
-        Of `disc_table`.
+        From `disc_table`.
     settings : CircleSettings
         What to look for.
 
@@ -97,13 +97,13 @@ def detect_circles(
     Raises
     ------
     FrameError
-        If the image has not the camera's size.
+        If the image does not have the camera's size.
     DetectError
-        If the table is of the other detector.
+        If the table belongs to the other detector.
     """
     if isinstance(table, DiscTable) == settings.refine:
-        whose = "the published detector" if settings.refine else "the detector by rims"
-        raise DetectError(f"the table is of {whose}: expected disc_table(camera, settings)")
+        owner = "the published detector" if settings.refine else "the default detector"
+        raise DetectError(f"the table is for {owner}: expected disc_table(camera, settings)")
     if image.shape != (camera.height, camera.width):
         raise FrameError(
             f"the image is {image.shape[1]}x{image.shape[0]} px: "
@@ -124,7 +124,7 @@ def detect_circles(
 def _between_margins(
     camera: Camera, left: int, right: int, shape: VoteShape
 ) -> tuple[Camera, VoteTable]:
-    """The camera that sees an image without its margins, and its table."""
+    """The camera of an image without its margins, and its table."""
     width, offset_x = camera.width - left - right, camera.offset_x - left
     camera = replace(camera, width=width, offset_x=offset_x)
     return camera, cached_vote_table(camera, shape)
@@ -133,7 +133,7 @@ def _between_margins(
 def _by_rims(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
 ) -> CircleDetections:
-    """The default detector: discs by their rims, placed by fits."""
+    """The default detector: finds discs by their rims and locates them by fits."""
     noise = estimate_noise(image, _NOISE_ROWS)
     candidates = candidates_of(image, table, settings, noise)
     judgement = judged(image, camera, settings, candidates, noise)
@@ -143,7 +143,7 @@ def _by_rims(
     scene = scene_of(image, camera, table, settings, noise)
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     seen_at = np.rint(project_floor_points(_kernel_camera(camera).numbers, floor_xy))
-    # Of a disc whose centre is out of sight too little is seen to say where it is.
+    # If the centre is outside the image, too little of the disc is visible to locate it.
     in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
     order = np.flatnonzero(in_sight)
     order = order[np.lexsort((seen_at[order, 0], seen_at[order, 1]))]
@@ -160,7 +160,7 @@ def _by_rims(
 def candidates_of(
     image: GreyImage, table: VoteTable, settings: CircleSettings, noise: float
 ) -> HoughCandidates:
-    """Centres for which edges vote; parameters as of `detect_circles`, and the noise."""
+    """Centres for which edges vote; parameters as for `detect_circles`, plus the noise."""
     usual = min(max(steep_gradient(image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
     edge = max(usual, _EDGE_NOISE * settings.noise_floor * max(noise, _LEAST_NOISE))
     return hough_candidates(image, table, settings.radius_m, _SIGNS[settings.polarity], edge)
@@ -174,9 +174,9 @@ def judged(
     noise: float,
     networks: Networks | None = None,
 ) -> Judgement:
-    """What candidates are (see `detect.discs.judgement`); parameters as of `candidates_of`.
+    """Classify candidates (see `detect.discs.judgement`); parameters as for `candidates_of`.
 
-    The networks are the trained ones, unless others are given.
+    `networks` defaults to the trained ones.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
     step, numbers = max(weakest, _LEAST_STEP), _kernel_camera(camera).numbers
@@ -185,20 +185,20 @@ def judged(
 
 
 def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
-    """(N,) log-odds of candidates beside each other; minus infinity of those without a rim."""
+    """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
     rims = np.flatnonzero(judgement.fate == JUDGED)
     step, log_odds = judgement.step[rims], judgement.log_odds[rims]
     sure = log_odds >= SURE
-    lost = lost_by_paleness(step, judgement.floor_grey[rims], sure)
+    penalty = paleness_penalty(step, judgement.floor_grey[rims], sure)
     if settings.polarity == "any":
-        lost += lost_by_sign(step, sure)
+        penalty += sign_penalty(step, sure)
     adjusted = np.full(len(judgement.fate), -np.inf)
-    adjusted[rims] = log_odds - lost
+    adjusted[rims] = log_odds - penalty
     return adjusted
 
 
 def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
-    """Indices of the candidates that are discs, none within the separation of a better one."""
+    """Indices of the candidates that are discs, without those too close to a better one."""
     taken = np.flatnonzero(log_odds >= settings.evidence)
     places = judgement.floor_xy[taken]
     return taken[suppress_neighbours(places, log_odds[taken], settings.separation_m)]
@@ -207,9 +207,9 @@ def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSetti
 def scene_of(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
-    """An image, and how discs are placed in it; parameters as of `detect_circles`."""
-    # Optics blur equally in all directions. Where a pixel is not square, as in single fields of
-    # interlaced frames, the same blur is fewer pixels along v.
+    """The input of the fits in an image; parameters as for `detect_circles`."""
+    # Optics blur equally in all directions. Where pixels are not square, as in single fields of
+    # interlaced frames, the same blur spans fewer pixels along v.
     ratio, numbers = camera.scale_y / camera.scale_x, _kernel_camera(camera).numbers
     return Scene(image, table.floor_xy, settings.radius_m, least_noise(noise), ratio, numbers)
 
@@ -217,7 +217,7 @@ def scene_of(
 def _by_quality(
     image: GreyImage, camera: Camera, table: DiscTable, settings: CircleSettings
 ) -> CircleDetections:
-    """The published detector: centres of the table by their quality and contrast alone."""
+    """The published detector: selects centres of the table by quality and contrast alone."""
     weakest = settings.least_contrast
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
@@ -238,19 +238,19 @@ def _by_quality(
 
 
 def disc_table(camera: Camera, settings: CircleSettings) -> VoteTable | DiscTable:
-    """The table with which `detect_circles` finds discs, from the cache."""
+    """The table that `detect_circles` needs, from the cache."""
     if settings.refine:
         return cached_vote_table(camera, vote_shape(settings))
     return cached_disc_table(camera, disc_shape(settings))
 
 
 def vote_shape(settings: CircleSettings) -> VoteShape:
-    """What the table of votes needs to know of the settings."""
+    """The settings on which the table of votes depends."""
     return VoteShape(settings.radius_m, settings.border_px, settings.far_limit_m_per_px)
 
 
 def disc_shape(settings: CircleSettings) -> DiscShape:
-    """What the table of outlines needs to know of the settings."""
+    """The settings on which the table of outlines depends."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
     return DiscShape(
         inner_radius_m=inner,
@@ -265,9 +265,9 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
 
 
 def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Positions on the floor that (N, 2) pixels (u, v) are, as the data set has them.
+    """Floor positions of (N, 2) pixels (u, v), computed as in the data set.
 
-    Returns (N, 2) places in the robot frame, metres, NaN where a pixel does not see the floor, and
+    Returns (N, 2) positions in the robot frame, metres, NaN if a pixel does not see the floor, and
     (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
     the position (`Camera.floor_jacobian_published`).
     """
@@ -275,7 +275,7 @@ def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, F
 
 
 class _KernelCamera(NamedTuple):
-    """A camera in the forms that kernels take."""
+    """A camera in the form that kernels take."""
 
     numbers: FloatArray
     published: FloatArray  # `published_camera_numbers`
@@ -293,7 +293,7 @@ def refined_covariance(
 ) -> FloatArray:
     """(N, 2, 2) covariances of refined positions (N, 2), square metres.
 
-    They are the fits', and what the settings add: `systematic_px` and `tilt_sigma_deg`.
+    The covariances of the fits, plus `systematic_px` and `tilt_sigma_deg` of the settings.
     """
     kernel = _kernel_camera(camera)
     return np.asarray(

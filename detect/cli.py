@@ -1,10 +1,10 @@
 """The command ``detect``.
 
-Only what `--help` needs is imported at once; everything heavy waits for the command that uses it.
+Only what `--help` needs is imported at once; each command imports its own heavy modules.
 
-Exit codes: 0 all went well; 1 the command could not be carried out, or a demand of `compare` or
-`--strict` was not met; 2 the command line was wrong; 3 some frames could not be worked on (the
-others were); 130 it was interrupted, and wrote only what `--resume` needs.
+Exit codes: 0 success; 1 the command failed, or a condition of `compare` or `--strict` was not met;
+2 wrong command line; 3 some frames could not be processed (the others were); 130 interrupted, with
+only what `--resume` needs written.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from detect.terminal import interrupts_noted, show_announcements
 from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
 from redetect.storage.messages import is_quiet
 
-#: What `--help` leaves to `--help-all`.
+#: Flags that only `--help-all` shows.
 EXPERT: dict[type, frozenset[str]] = {
     DetectorFlags: frozenset({"line_ends", "cluster", "strict"}),
     SourceOptions: all_but(SourceOptions, "odometry", "times", "frames"),
@@ -91,8 +91,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     code = exit_code_of(work)
     if code == EXIT_INTERRUPTED and arguments is None:
-        # Left to itself, Python dies of an interrupt that passed through an `exec` of some
-        # library's, although it was caught.
+        # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
+        # it was caught.
         atexit._run_exitfuncs()
         os._exit(code)
     return code
@@ -109,7 +109,7 @@ def parsed(arguments: Sequence[str]) -> Any:
     """Parse a command line; exits after `--help` and on errors."""
     arguments = _with_radius_found(arguments)
     deciding = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--preset", "--settings"):  # the other flags' defaults are theirs
+    for flag in ("--preset", "--settings"):  # they set the other flags' defaults
         deciding.add_argument(flag, nargs="?", default="", const="")
     given = deciding.parse_known_args(arguments)[0]
     preset, file = given.preset, given.settings
@@ -133,7 +133,7 @@ def parsed(arguments: Sequence[str]) -> Any:
 
 
 def _with_radius_found(arguments: Sequence[str]) -> list[str]:
-    """The command line with `--find-radius` in the place of a radius that is `auto`."""
+    """The command line with `--find-radius` instead of a radius of `auto`."""
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
     given, rest = parser.parse_known_args(arguments)

@@ -10,7 +10,7 @@ from detect.report.page import perform as write_report
 from detect.runs.command import perform as detect_run
 from redetect.storage import demand_free
 
-#: Images that come with the program: the first of the demo run (`images/README.md`).
+#: Images included in the program: the first ones of the demo run (`images/README.md`).
 DEMO_RUN = Path(__file__).resolve().parent.parent / "redetect" / "demo"
 
 

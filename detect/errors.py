@@ -7,30 +7,30 @@ from contextlib import contextmanager
 
 from redetect.storage.messages import OneLineError
 
-#: Exit code of a command of which some frames could not be worked on; the others were.
+#: Exit code if some frames could not be processed; the others were.
 EXIT_FRAMES_FAILED = 3
 
 
 class DetectError(OneLineError, ValueError):
-    """A run or setting that cannot be worked on.
+    """A run or setting that cannot be processed.
 
     The message names the file or the setting, its value and what was expected.
     """
 
 
 class FrameError(OneLineError, ValueError):
-    """One image that cannot be worked on; it costs its frame only."""
+    """An image that cannot be processed; it affects its own frame only."""
 
 
 class WorkerError(OneLineError, RuntimeError):
-    """Worker processes or machines cannot do the work; the message says what is missing."""
+    """Worker processes or machines are missing or failed; the message states what is missing."""
 
 
 @contextmanager
 def imported_for(
     use: str, extra: str, otherwise: str = "", error: type[Exception] = DetectError
 ) -> Iterator[None]:
-    """Import a package of an extra in a block; where it is missing, an error says how to get it."""
+    """Import a package of an extra in a block; if missing, the error tells how to install it."""
     try:
         yield
     except ImportError:
@@ -38,4 +38,4 @@ def imported_for(
 
 
 class CompareError(ValueError):
-    """Two runs that cannot be compared; the message says which file or frame and why."""
+    """Two runs that cannot be compared; the message names the file or frame and the reason."""

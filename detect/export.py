@@ -1,8 +1,8 @@
 """The command ``detect export``: rows in other programs' formats.
 
-CSV has a line of names at the top, the shortest numbers that give the same float64, empty cells for
+CSV has a header line, numbers in the shortest form that gives the same float64, and empty cells for
 unknown values. Columns of Parquet (package ``pyarrow``) have units and descriptions. MCAP (package
-``rosbags``; no ROS is needed) has standard messages of ROS 2 (`detect.ros_messages`).
+``rosbags``; ROS is not needed) has standard messages of ROS 2 (`detect.ros_messages`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from redetect.storage import demand_place, write_whole
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-# Which table a file of a kind has rows of, even where there are none.
+# The table of each kind of file, even if it has no rows.
 _TABLES: dict[str, TableName] = {
     ".circles": "circles",
     ".lines": "lines",
@@ -84,7 +84,7 @@ def perform(command: Export) -> int:
 
 
 def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
-    """The file of each table: the first but steps goes to `output`, others beside it."""
+    """The file of each table: the first one except steps goes to `output`, others beside it."""
     first, *others = sorted(tables, key=lambda table: table == "steps")
     beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
     return {first: output, **beside}
@@ -102,16 +102,16 @@ def _times(command: Export) -> dict[str, float] | None:
     return None
 
 
-#: The values of all columns of a table: number, prefix and time of the frame, and what follows.
+#: The values of a row's columns: number, prefix and time of the frame, then the table's own.
 Row = tuple[Value, ...]
 
 
 def read_tables(
     path: Path, times: Mapping[str, float] | None, rate_hz: float | None
 ) -> dict[TableName, list[Row]]:
-    """The tables of a landmark or tilt file: first the one that its name says, even without rows.
+    """The tables of a landmark or tilt file, first the one that its name implies, even if empty.
 
-    The times of frames are `times`, by their prefix, or follow from the frame rate, if known.
+    The times of frames are from `times`, by prefix, or from the frame rate, if known.
     """
     named = _TABLES.get(path.suffix)
     tables: dict[TableName, list[Row]] = {} if named is None else {named: []}
@@ -152,14 +152,14 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Sequence[Row]) -> None:
 
 
 def required_pyarrow() -> Any:
-    """The package; a DetectError where it is not installed."""
+    """The package; a DetectError if it is not installed."""
     with imported_for("Parquet is written by the package pyarrow", "parquet", _OR_CSV):
         import pyarrow.parquet  # type: ignore[import-untyped]
     return pyarrow
 
 
 def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], source: str) -> None:
-    """Write a table as `write_csv`; `source` is for the file's own description."""
+    """Write a table like `write_csv`; `source` goes into the file's description."""
     pa = required_pyarrow()
     types: dict[str, Any] = {
         "text": pa.string(),
@@ -177,13 +177,13 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
         arrays = [pa.array(column, field.type) for column, field in zip(columns, fields)]
     except UnicodeEncodeError:
         raise DetectError(
-            f"{source}: the name of an image is no Unicode: Parquet cannot hold it"
+            f"{source}: the name of an image is not valid Unicode: Parquet cannot store it"
         ) from None
     pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), stream)
 
 
 def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
-    """Write the messages of each frame, at its time; returns how many there are."""
+    """Write the messages of each frame, at its time; returns their number."""
     with imported_for("MCAP is written by the package rosbags", "bags", _OR_CSV):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
@@ -214,14 +214,14 @@ def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], sour
 
 
 def _message(store: Typestore, kind: str, **fields: Any) -> Any:
-    """A message of a store's type; the fields that are not given are zero or empty."""
+    """A message of a store's type; missing fields are zero or empty."""
     _, descriptions = store.fielddefs[kind]
     empty = {name: _empty(store, of) for name, (_, of) in descriptions if name not in fields}
     return store.types[kind](**empty, **fields)
 
 
 def _empty(store: Typestore, kind: Any) -> Any:
-    """What a field holds of itself; its kind is a message's, a number's or text's, or elements'."""
+    """The default value of a field, by its kind: message, number or text, or array."""
     if isinstance(kind, str):
         return _message(store, kind)
     element, _ = kind
@@ -234,8 +234,8 @@ def _nanoseconds(image: Value, time_s: Value, source: str) -> int:
     """The time of a message about an image."""
     if not isinstance(time_s, float):
         raise DetectError(
-            f"{source}: no time of {image}: messages need one: name a file of rows "
-            "'prefix seconds' by --times, or give --rate-hz"
+            f"{source}: no time for {image}: messages need one: give a file of rows "
+            "'prefix seconds' by --times, or --rate-hz"
         )
     time_ns = round(time_s * 1e9)
     if not 0 <= time_ns < 2**31 * 10**9:

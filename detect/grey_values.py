@@ -1,4 +1,4 @@
-"""What grey values alone say about an image: its noise, and blank columns at its sides."""
+"""Properties of an image from grey values alone: its noise, and blank columns at its sides."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 from redetect.array_types import GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: With fewer pixels than this that are neither black nor saturated, all count for the noise.
+#: If fewer pixels than this are neither black nor saturated, all are used for the noise.
 _LEAST_COUNTABLE = 100
-#: Grey values that count lie between these.
+#: Bounds of the grey values that count.
 _DARK, _LIGHT = 2, 253
 #: The mask's absolute coefficients add up to 16, so no response is larger.
 _MOST_RESPONSE = 16 * 255
@@ -18,8 +18,8 @@ _MOST_RESPONSE = 16 * 255
 def estimate_noise(image: GreyImage, most_rows: int | None = None) -> float:
     """Standard deviation of an image's noise, grey levels; 0 for less than 3 rows or columns.
 
-    The median absolute response, in at most `most_rows` rows, to the second difference in both
-    directions, which sees neither planes nor straight edges (after Immerkaer, "Fast noise variance
+    The median absolute response, in at most `most_rows` rows, of the second difference in both
+    directions, which is zero for planes and straight edges (after Immerkaer, "Fast noise variance
     estimation", 1996); black and saturated pixels do not count.
     """
     height, width = image.shape
@@ -28,7 +28,7 @@ def estimate_noise(image: GreyImage, most_rows: int | None = None) -> float:
     rows = np.arange(1, height - 1)
     if most_rows is not None and most_rows < len(rows):
         rows = rows[np.arange(most_rows) * (len(rows) - 1) // (most_rows - 1)]
-    # The mask's coefficients have a sum of squares of 36; 0.6745 makes a median a deviation.
+    # The mask's squared coefficients sum to 36; 0.6745 converts a median to a standard deviation.
     return _median_response(image, rows) / 0.6745 / 6.0
 
 
@@ -37,7 +37,7 @@ def _median_response(image: GreyImage, rows: IntArray) -> float:
     """Median of the absolute responses in some rows, by their histogram."""
     width = image.shape[1]
     bend, response = np.empty(width, np.int32), np.empty(width, np.int32)
-    # Of the pixels that count, and then of the others.
+    # First the pixels that count, then the others.
     histogram = np.zeros(2 * (_MOST_RESPONSE + 1), np.int32)
     for v in rows:
         above, here, below = image[v - 1], image[v], image[v + 1]
@@ -56,7 +56,7 @@ def _median_response(image: GreyImage, rows: IntArray) -> float:
         for k in range(_MOST_RESPONSE + 1):
             histogram[k] += histogram[k + _MOST_RESPONSE + 1]
             count += histogram[k + _MOST_RESPONSE + 1]
-    # The two in the middle, or twice the one.
+    # The two middle values, or twice the middle one.
     total = 0.0
     for rank in ((count - 1) // 2, count // 2):
         k, seen = 0, histogram[0]
@@ -67,19 +67,19 @@ def _median_response(image: GreyImage, rows: IntArray) -> float:
     return total
 
 
-#: The grey values of a margin differ by no more than this, grey levels: noise, and what compression
-#: adds. Most of the column behind it differ from it by more.
+#: Largest range of the grey values of a margin: noise and compression artefacts; least step to the
+#: column next to it, grey levels, and the share of that column's pixels with such a step.
 _MOST_RANGE, _LEAST_STEP, _LEAST_SHARE = 24, 8, 0.5
 #: Widths of margins are multiples of this (columns), so that few tables are needed.
 _COLUMNS = 8
-#: Where more columns than this share of the width are blank, it is the scene that is.
+#: If a larger share of the width is blank, it is a blank scene, not a margin.
 _LARGEST_SHARE = 0.05
-#: One row in this many is enough to see a margin.
+#: Spacing of the rows in which margins are searched for.
 _ROWS_APART = 4
 
 
 def steep_gradient(image: GreyImage, most_rows: int) -> float:
-    """Gradient along some rows that a tenth of their pixels exceeds, grey levels per pixel."""
+    """90 % quantile of the gradient along some rows, grey levels per pixel."""
     rows = image[:: max(len(image) // most_rows, 1)].astype(np.int64)
     steps = np.abs(rows[:, 2:] - rows[:, :-2]).ravel()
     below = np.cumsum(np.bincount(steps, minlength=256))
@@ -87,11 +87,10 @@ def steep_gradient(image: GreyImage, most_rows: int) -> float:
 
 
 def blank_margins(image: GreyImage) -> tuple[int, int]:
-    """How many columns at the left and right of an image (H, W) show nothing; 0 for no margin.
+    """Number of blank columns at the left and right of an image (H, W).
 
-    Digitized video often begins late in a line: the first columns have one grey value, from which
-    the image begins at a sharp edge. A disc that is cut there must not be taken for one that ends
-    there.
+    In digitized video, lines often begin late: the first columns have a constant grey value, with a
+    sharp edge to the image. A disc that is cut there must not be mistaken for one that ends there.
     """
     rows = image[::_ROWS_APART]
     return _blank(rows), _blank(rows[:, ::-1])
@@ -105,7 +104,7 @@ def _blank(image: GreyImage) -> int:
     if len(varied) == 0:
         return 0
     blank = int(varied[0])
-    # The first of these may be half a margin's, and half the image's.
+    # The first of these may be partly margin and partly image.
     margin = (blank // _COLUMNS + 1) * _COLUMNS
     step = np.abs(image[:, margin] - image[:, 0].mean())
     is_edge = np.mean(step > _LEAST_STEP) >= _LEAST_SHARE

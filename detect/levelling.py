@@ -1,19 +1,19 @@
 """Errors that all discs of a frame share: the robot's tilt, and the camera's calibration.
 
-The robot tilts about the origin of its frame on the floor, by pitch and roll. Its camera, at c,
-believes the floor where it would be on a level robot: a disc seen at p lies on the ray
-c + s (p - c). Turned level by R, that ray meets the floor at
+The robot tilts about the origin of its frame on the floor, by pitch and roll. Its camera, at c, is
+calibrated for a level robot: a disc seen at p is on the ray c + s (p - c). Levelled by R, that ray
+meets the floor at
 
     q = R (c + s (p - c)),    s = -(R c)_z / (R (p - c))_z    (`detect.seen.level_seen`).
 
 The covariance of q is J diag(C_p, C_tilt) J^T, J = dq / d(p, pitch, roll).
 
-The part of a covariance that is the calibration's is the same error in all rows. With the
-covariance C of the calibration's parameters (`camera.uncertainty`) and the derivatives J of a
-position by them, it is J C J^T. Where positions are levelled by verticals, the tilt that the same
-camera sees in these follows its errors, too: what its mounting leans by falls out, and what the
-lens does to verticals comes in. A calibration that does not state C is taken to be wrong by a part
-of a pixel everywhere (`CircleSettings.calibration_px`).
+Calibration errors are common to all rows. With the covariance C of the calibration's parameters
+(`camera.uncertainty`) and the derivatives J of a position by them, they contribute J C J^T to a
+covariance. If positions are levelled by verticals, the tilt from the same camera depends on the
+calibration, too: errors of the mounting's tilt cancel, and effects of the lens on verticals are
+added. Without C, the calibration is assumed to have an error of a fraction of a pixel everywhere
+(`CircleSettings.calibration_px`).
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from detect.settings import CircleSettings
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, read_frames
 
-#: Over which length (m) and angle (rad) levelled positions are differenced, either way.
+#: Step of central differences of levelled positions, metres and radians.
 _STEP = 1e-6
 
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
     """The same discs, their positions and covariances corrected for the tilt of their frame.
 
-    Discs that the levelled camera would see above the horizon are left out.
+    Discs above the horizon of the levelled camera are dropped.
     """
     floor_xy, covariance, down = level_discs(
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
@@ -52,9 +52,9 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
-    """Discs that a leaning camera sees, where the camera as calibrated would see them on the floor.
+    """Convert discs of a leaning camera to the floor positions of the camera as calibrated.
 
-    What that would see above the horizon is left out.
+    Discs above the horizon of the latter are dropped.
     """
     pixels = leaning.project_floor(found.floor_xy)
     floor_xy = camera.floor_from_pixel(pixels)
@@ -79,10 +79,10 @@ def level_discs(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
-    Positions are those that the calibrated camera sees on a level robot. Pitch and roll (rad) and
-    their covariances are those of each position, (N, 2) and (N, 2, 2), or one of each for all. The
-    covariances returned are their own, carried along, and that due to the tilt's. Where the
-    levelled ray does not meet the floor, numbers are NaN and the mask is false.
+    Positions are those of the calibrated camera on a level robot. Pitch and roll (rad) and their
+    covariances are given for each position, (N, 2) and (N, 2, 2), or once for all. The returned
+    covariances are the propagated ones of the positions plus those due to the tilt. If the levelled
+    ray does not meet the floor, numbers are NaN and the mask is false.
     """
     steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])[:, None]
     level_xy, *ends = level_seen(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
@@ -98,11 +98,11 @@ def level_discs(
 def common_covariance(
     camera: Camera, floor_xy: FloatArray, unstated_px: float, *, by_verticals: bool | BoolArray
 ) -> FloatArray:
-    """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) by the calibration's errors.
+    """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) due to the calibration's errors.
 
-    `unstated_px` is the standard deviation of the pixels of a camera that doesn't state its
-    covariance; `by_verticals`, for each position (N,) or all of them: it is levelled by the
-    verticals that the camera sees.
+    `unstated_px` is the standard deviation of pixels of a camera without a covariance;
+    `by_verticals`, for each position (N,) or all of them, whether it is levelled by verticals of
+    the same camera.
     """
     nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)
@@ -129,9 +129,9 @@ _tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:
-    """(2,) variances of pitch and roll that all frames' verticals share, if the camera knows them.
+    """(2,) variances of pitch and roll from verticals that are common to all frames, rad^2.
 
-    Square radians.
+    None if the camera has no covariance.
     """
     covariance = covariance_of(camera)
     if covariance is None:
@@ -141,7 +141,7 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
 
 
 def sentence_of(circles: Path, camera: Camera) -> str:
-    """How much of the variances of the rows of a file is the calibration's own."""
+    """A sentence on the calibration's share of the variances in a file's rows."""
     shares = []
     for frame in read_frames(circles):
         rows = frame.circles
@@ -151,6 +151,6 @@ def sentence_of(circles: Path, camera: Camera) -> str:
         shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
     share = 100.0 * float(np.median(shares)) if shares else 0.0
     return (
-        f"{share:.0f} % of the discs' variance (median) are the calibration's, as its file states: "
-        "the same error in all rows"
+        f"{share:.0f} % of the discs' variance (median) are due to the calibration, according to "
+        "its file: a common error of all rows"
     )

@@ -30,32 +30,32 @@ _WIDTH = Bounds("a number above 1, at most 10", lambda x: 1.0 < x <= 10.0)
 class LineSettings:
     """Parameters of the detector of verticals. The defaults are the all-round preset.
 
-    Lengths along a line are given in widths of a pixel, so that they mean the same for full frames
-    and for single fields, whose rows are twice as high; parameters of the filter are in rows.
-    Parameters named `largest_...` may be infinite: no limit.
+    Lengths along a line are in pixel widths, so that they apply to full frames and to single
+    fields, whose rows are twice as high; parameters of the filter are in rows. Parameters named
+    `largest_...` may be infinite: no limit.
     """
 
     sigma_across_px: Positive = 0.8  #: Gaussian window of the filter across the line.
     sigma_along_rows: Positive = 2.0  #: Gaussian window of the filter along the line.
-    #: Added to the variance in the window, grey values squared: steps much smaller than its root
-    #: give no response.
+    #: Added to the variance in the window, grey values squared: suppresses steps much smaller than
+    #: its square root.
     regulariser: Positive = 40.0
     threshold: ShareAbove0 = 0.12  #: Least response of a point, 0 to 1; an ideal step has 2/pi.
-    #: Rows at the upper and lower border that are left out.
+    #: Number of rows to ignore at the upper and lower border.
     border_rows: Annotated[int, whole(0)] = 2
     #: Tracks start on the horizon and on rows up to this far from it,
     start_band_rows: Annotated[int, whole(0)] = 20
     start_spacing_rows: Annotated[int, whole(1)] = 4  #: on every n-th of them.
-    gap_rows: Annotated[int, whole(0)] = 6  #: Rows without a point that a track bridges.
-    #: Whether tracks expect straight lines; else they follow any curve.
+    gap_rows: Annotated[int, whole(0)] = 6  #: Largest gap that a track bridges, rows.
+    #: Whether tracks predict straight lines; else they follow any curve.
     guided: bool = True
-    #: The least share of a point's offset by which the place expected next is corrected.
+    #: Lower bound of the gain by which a point's offset corrects the prediction.
     guided_pull: ShareAbove0 = 0.07
-    guided_reach_px: Positive = 0.6  #: Largest offset of a point from the place expected.
+    guided_reach_px: Positive = 0.6  #: Largest offset of a point from the prediction.
     #: Steps in which lines are refined on the grey values: width of the Gaussian and largest
     #: displacement of a line by the step; none for the eigen-decomposition of the tracked points
-    #: alone. Small widths exclude neighbouring edges, but suffer from aliasing: if a wide one
-    #: agrees with them in the end, the edge is isolated and the wide one is right.
+    #: alone. Small widths exclude neighbouring edges but suffer from aliasing: if a final wide step
+    #: agrees with them, the edge is isolated and the wide one is more accurate.
     refine_steps_px: tuple[tuple[float, float], ...] = (
         (1.2, math.inf),
         (0.8, 1.5),
@@ -67,60 +67,60 @@ class LineSettings:
     coarse_scale_px: Positive = 1.6
     least_rows: Annotated[int, whole(5)] = 14  #: Least number of points of a line.
     least_length_px: NotNegative = 24.0  #: The same as a length.
-    #: Least sum of the points' responses, per pixel's width of length, weakened for soft edges.
+    #: Least evidence: responses summed over the length in pixel widths, times squared sharpness.
     least_evidence: NotNegative = 7.0
-    #: Edges fainter than the image's median must have this part of the sharpness that a quarter of
-    #: its lines stay below: fainter and softer ones are shadows and glare.
+    #: Least sharpness of edges fainter than the image's median, relative to the lower quartile of
+    #: the sharpness: fainter and softer edges are shadows and glare,
     least_sharpness: NotNegative = 0.87
-    soft_evidence: NotNegative = 40.0  #: Unless they have this evidence.
-    #: Largest distance of a line's end from the horizon (or from the anchor that replaces it where
-    #: the camera does not see it: `lut.verticals`).
+    soft_evidence: NotNegative = 40.0  #: unless they have this evidence.
+    #: Largest distance of a line's end from the horizon (or from the anchor that replaces it if the
+    #: horizon is not visible: `lut.verticals`).
     largest_horizon_gap_px: LimitOr0 = 11.0
     #: Largest root-mean-square distance of the points from the line.
     largest_scatter_px: LimitOr0 = 1.0
     largest_shift_px: LimitOr0 = 1.0  #: Largest displacement of a line by the refinement.
-    #: Largest standard deviation of a line's place at the horizon due to noise.
+    #: Largest standard deviation of a line's position at the horizon due to noise.
     largest_noise_px: LimitOr0 = 0.3
     #: Standard deviation of a line's lean over its length due to causes other than noise.
     bend_px: NotNegative = 0.06
     #: Variance of a line's lean due to noise, relative to that of noise which is independent from
     #: row to row: the surroundings of an edge and its blur are correlated over many rows.
     lean_noise: NotNegative = 3.0
-    largest_lean_deg: LimitOr0 = 0.7  #: How far a line may lean from the vertical: by this angle,
+    largest_lean_deg: LimitOr0 = 0.7  #: Largest lean of a line from the vertical: this angle,
     largest_lean_sigmas: LimitOr0 = 8.0  #: this many standard deviations due to noise,
-    largest_lean_px: LimitOr0 = 1.5  #: and this many pixels over its length, added in squares.
+    largest_lean_px: LimitOr0 = 1.5  #: and this many pixels over its length, added in quadrature.
     largest_tilt_deg: Positive = 8.0  #: Largest absolute pitch and roll.
-    #: Standard deviation of the tilt; decides only between tilts that the lines support alike.
+    #: Prior standard deviation of the tilt; decides only between tilts with equal support.
     tilt_prior_deg: Positive = 2.0
     building_deg: Positive = 0.025  #: Standard deviation of real verticals about the vertical.
-    #: Candidates for the tilt come from pairs of this many lines, the strongest.
+    #: Candidates for the tilt are computed from pairs of this number of lines, the strongest.
     proposers: Annotated[int, whole(2, 1000)] = 24
-    least_lines: Annotated[int, whole(2)] = 3  #: With fewer lines that agree there is no tilt.
-    #: Share of lines that are no verticals: the tilt's covariance is then the mean square error of
+    least_lines: Annotated[int, whole(2)] = 3  #: Least number of lines that agree on a tilt.
+    #: Share of lines that are not vertical: the tilt's covariance is then the mean square error of
     #: `detect.verticals.tilt`; 0 for that of least squares.
     stray_share: Annotated[float, from_to(0.0, 0.5)] = 0.15
-    #: Votes of a line in the consensus grow with its evidence up to this.
+    #: Votes of a line in the consensus increase with its evidence, up to this number.
     weight_limit: Positive = 3.0
-    #: Of two lines of equal polarity closer than this at the horizon only the stronger is kept.
+    #: Of two lines of equal polarity closer than this at the horizon, only the stronger is kept.
     same_edge_px: NotNegative = 2.0
     join_px: NotNegative = 2.7  #: Lines closer than this at the horizon are joined to one row.
-    #: Lines with less than this part of the other's evidence are dropped instead.
+    #: Lines with less than this share of the other's evidence are dropped instead.
     join_share: NotNegative = 0.5
     #: Joined lines are weighted by their evidence, and the row has the ends of the strongest; or
-    #: all have equal weight, and ends and inclination are means as well, as in the data set's own
+    #: all have equal weight, and ends and inclination are means, too, as in the data set's own
     #: rows.
     joined: Joining = "evidence"
-    #: Lines closer than this to another one are effects of light beside an edge, and dropped,
+    #: Lines closer than this to another one are lighting effects beside an edge, and are dropped,
     shoulder_px: NotNegative = 5.0
     shoulder_share: NotNegative = 0.5  #: if they have at most this share of its contrast.
-    #: Standard deviation of an edge about the line of the building that it shows.
+    #: Standard deviation of an edge about the building's line that causes it.
     sigma_px: Positive = 0.9
-    #: Images whose edges have a median sharpness below this are processed again,
+    #: Images with a median sharpness of edges below this are processed again,
     blurred_sharpness: Share = 0.62
-    #: with a filter wider by whichever of these factors suits the blur (see
+    #: with a filter wider by the one of these factors that suits the blur (see
     #: `detect.verticals.blur`); none: never.
     blurred_widths: Annotated[tuple[float, ...], _WIDTH] = (1.5, 2.0, 3.0, 4.0, 6.0)
-    #: Bearings compensated for the tilt, or with the sign that the data set's own rows have.
+    #: Bearings compensated for the tilt, or with the sign of the data set's own rows.
     alpha: BearingConvention = "level"
 
     def __post_init__(self) -> None:
@@ -134,13 +134,13 @@ class LineSettings:
                 )
 
     def least_points(self, row_aspect: float) -> int:
-        """Least number of points of a line, given the height of a row in widths of a pixel."""
+        """Least number of points of a line, given the height of a row in pixel widths."""
         return max(self.least_rows, math.ceil(self.least_length_px / row_aspect))
 
 
 DEFAULT = LineSettings()
 
-# What compiled code reads of settings, stage by stage: a field takes time at each call.
+# The settings that kernels need, stage by stage, since each field takes time at each call.
 TrackingNumbers = namedtuple(
     "TrackingNumbers", "threshold border_rows gap_rows guided_pull guided_reach_px"
 )
@@ -161,7 +161,7 @@ JoiningNumbers = namedtuple(
 
 
 class LineNumbers(NamedTuple):
-    """The numbers of some settings for compiled code: fields of `LineSettings`."""
+    """The numbers of some settings for kernels: fields of `LineSettings`."""
 
     tracking: TrackingNumbers
     judgement: JudgementNumbers
@@ -170,8 +170,8 @@ class LineNumbers(NamedTuple):
 
     @classmethod
     def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
-        """Those of some settings, for rows of some height in widths of a pixel."""
-        # Compiled code distinguishes 1 from 1.0: each number is of its default's type.
+        """Those of some settings, for rows of some height in pixel widths."""
+        # Kernels are compiled for 1 and 1.0 separately: each number gets its default's type.
         given = {
             name: type(usual)(getattr(settings, name)) for name, usual in vars(DEFAULT).items()
         }

@@ -1,12 +1,12 @@
 """The detector of verticals: from one image to lines with bearings and standard deviations.
 
-The path of an image, each step a function of its own:
+The stages of an image, each a function of its own:
 
     starts          maxima of the response on the horizon (or the anchor: `lut.verticals`)
     tracks          the edges through them, followed up and down
     fits            straight lines, refined on the grey values
-    consensus       the tilt that most of them agree with; the others are no verticals
-    again           tracks that are no lines, but might be, along the verticals of that tilt
+    consensus       the tilt on which most of them agree; the others are not vertical
+    again           doubtful tracks, followed along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
 If all edges are blurred, everything is repeated with filters as wide as the blur
@@ -38,7 +38,7 @@ from redetect.landmarks import LineLandmark, wrap_angle
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
-#: A reference line is the same as a detected one within this bearing, or two standard deviations.
+#: Largest difference of bearings of the same line, unless two standard deviations are larger.
 _SAME_LINE_RAD = np.radians(0.5)
 
 
@@ -56,18 +56,18 @@ class LineDetections:
 
     @cached_property
     def members(self) -> tuple[tuple[int, ...], ...]:
-        """The tracks that each line consists of, the strongest first; its ends are that one's."""
+        """The tracks of each line, the strongest first, which determines the line's ends."""
         own = self.lines.members.tolist()
         return tuple(tuple(own[a:b]) for a, b in pairwise(self.lines.bounds.tolist()))
 
     @property
     def tilt(self) -> TiltEstimate | None:
-        """None where too few lines agree."""
+        """The tilt estimate; None if too few lines agree."""
         return self.judged.tilt
 
     @cached_property
     def fate(self) -> tuple[str, ...]:
-        """(T,) "accepted", "joined" (to a stronger one), or why the track is no line."""
+        """(T,) "accepted", "joined" (to a stronger one), or why the track is not a line."""
         return tuple(FATES[number] for number in self.judged.fate.tolist())
 
     def landmarks(self) -> tuple[LineLandmark, ...]:
@@ -84,7 +84,7 @@ class LineDetections:
 def _prepared(
     table: VerticalTable, settings: LineSettings
 ) -> tuple[Strip, LineFilter, StartBand, StepFilters, LineNumbers]:
-    """What a table and settings decide before the first image."""
+    """Quantities that depend on the table and the settings only."""
     band, numbers = start_band(table, settings), LineNumbers.of(settings, table.row_aspect)
     return strip_of(table), line_filter(settings), band, step_filters(settings), numbers
 
@@ -99,19 +99,19 @@ def detect_lines(
     image : (H, W) uint8
         Grey values.
     table : VerticalTable
-        Of the image's camera.
+        The table of the image's camera.
     settings : LineSettings
-        See there; `detect.line_settings.PUBLISHED` are the report's.
+        `detect.line_settings.PUBLISHED` are those of the report.
 
     Returns
     -------
     LineDetections
-        Lines, leftmost first, and all that they were made from.
+        Lines, leftmost first, and their tracks and fits.
 
     Raises
     ------
     FrameError
-        If the image is not of the table's size or not of 8 bit grey values.
+        If the image does not have the table's size or 8 bit grey values.
     """
     if image.shape != table.column.shape or image.dtype != np.uint8:
         raise FrameError(
@@ -142,11 +142,11 @@ def detect_lines(
 def carry_ids(
     rows: Sequence[LineLandmark], reference: Sequence[LineLandmark]
 ) -> tuple[LineLandmark, ...]:
-    """Detected lines of a frame with the IDs of the reference rows that are theirs beyond doubt.
+    """Detected lines of a frame with the IDs of unambiguously matching reference rows.
 
-    A reference row whose bearing fits exactly one detected line (within half a degree or two
-    standard deviations) gives that line its IDs; a joined line can get several, and one that none
-    fits has -1.
+    A reference row whose bearing matches exactly one detected line (within half a degree or two
+    standard deviations) gives that line its IDs; a joined line can get several, and a line without
+    a match has -1.
     """
     alpha = np.array([row.alpha for row in rows])
     reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))

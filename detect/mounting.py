@@ -2,9 +2,9 @@
 
 The command is one of the program `camera`; it is implemented here because it needs detection.
 
-The lean comes from the verticals of all frames (`detect.run_tilt`). The height follows from the
-outlines of discs of known size: at a wrong height they agree with a circle at another pitch than
-that of the verticals (`detect.discs.outline_tilt`). Both assume that the lens is right.
+The lean is estimated from the verticals of all frames (`detect.run_tilt`), the height from the
+outlines of discs of known size: with a wrong height, their pitch differs from that of the verticals
+(`detect.discs.outline_tilt`). Both assume that the lens is calibrated correctly.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.storage import demand_place
 
-#: Outlines of discs are tried at heights that differ by these shares of the calibrated one.
+#: Changes of the height at which outlines of discs are evaluated, relative to the calibrated one.
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
 #: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
-#: Places of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
+#: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
 _LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
 
@@ -70,14 +70,14 @@ def perform(options: Level) -> int:
             pitches.append([math.nan if one is None else one.pitch for one in outlines])
     report_failures(len(failures), failures)
     if not tilts:
-        raise DetectError(f"{options.run}: none of its images could be worked on")
+        raise DetectError(f"{options.run}: none of its images could be processed")
     mounting = mounting_of_run(
         height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
     )
     if mounting is None:
         raise DetectError(
             f"{options.run}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
-            "drive where doors, shelves or walls are in view"
+            "drive where doors, shelves or walls are visible"
         )
     print("\n".join(mounting.sentences()))
     write_camera(remounted(camera, mounting), options.output, overwrite=options.force)
@@ -89,12 +89,12 @@ def perform(options: Level) -> int:
 class Mounting:
     """How a camera is mounted, compared with its calibration."""
 
-    tilt_rad: FloatArray  # (2,) pitch and roll that turn measured directions level
-    sigma_rad: FloatArray  # (2,) their standard deviations, that of the lens included
+    tilt_rad: FloatArray  # (2,) pitch and roll that level measured directions
+    sigma_rad: FloatArray  # (2,) their standard deviations, including errors of the lens
     raised_m: float  # higher than calibrated; NaN if there are too few discs
     raised_sigma_m: float
-    frames: int  # that have a tilt by verticals
-    frames_with_discs: int  # those of them that contribute to the height
+    frames: int  # with a tilt from verticals
+    frames_with_discs: int  # those that contribute to the height
 
     def sentences(self) -> list[str]:
         """The result in words."""
@@ -104,11 +104,11 @@ class Mounting:
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
         ]
         if math.isnan(self.raised_m):
-            lines.append("its height is left as calibrated: too few discs to estimate it")
+            lines.append("its height is unchanged: too few discs to estimate it")
         else:
             lines.append(
-                f"it hangs {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} cm "
-                f"from the calibrated height, by the discs of {self.frames_with_discs} frames"
+                f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
+                f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
             )
         return lines
 
@@ -116,11 +116,11 @@ class Mounting:
 def mounting_of_run(
     height_m: float, verticals: FrameTilts, outline_pitch_rad: FloatArray
 ) -> Mounting | None:
-    """The mounting that a run shows; None where too few frames have a tilt by verticals.
+    """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    `height_m` is the calibrated height of the camera, `verticals` has the tilts of N frames, and
-    `outline_pitch_rad` (N, 3) the pitch by the outlines of discs, the height changed by each of
-    `HEIGHT_STEPS`; NaN where no outlines are.
+    `height_m` is the calibrated height of the camera, `verticals` are the tilts of N frames, and
+    `outline_pitch_rad` (N, 3) the pitch from the outlines of discs, with the height changed by each
+    of `HEIGHT_STEPS`; NaN without outlines.
     """
     run = tilt_of_run(verticals)
     if run is None:
@@ -129,7 +129,7 @@ def mounting_of_run(
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
     if count >= LEAST_FRAMES:
-        # Pitch by outlines is nearly linear in the height; frames share the slope.
+        # Pitch from outlines is nearly linear in the height; frames share the slope.
         lower, same, higher = (outline_pitch_rad[known] - verticals.tilt[known, :1]).T
         slope = float(np.median(higher - lower)) / (HEIGHT_STEPS[2] - HEIGHT_STEPS[0])
         bend = float(np.median(higher + lower - 2.0 * same)) / HEIGHT_STEPS[2] ** 2

@@ -1,6 +1,6 @@
-"""The flags of the commands: one frozen dataclass per command, and those that several share.
+"""The flags of the commands: one frozen dataclass per command, and shared ones.
 
-Nothing heavy is imported: `--help` needs it all.
+Imports nothing heavy, since `--help` needs this module.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ DetectorPreset = Literal["default", "published", "report"]
 class SourceOptions:
     """Options of a source besides its name."""
 
-    #: Where the steps come from, if not from the source itself: a TUM trajectory (.tum; rows t x y
-    #: z qx qy qz qw, X forward), counters of two wheels (.ticks; rows t left right), a file of STEP
-    #: rows of image files, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: Source of the steps, if not the image source itself: a TUM trajectory (.tum; rows t x y z qx
+    #: qy qz qw, X forward), wheel encoder counts (.ticks; rows t left right), a file of STEP rows
+    #: of image files, a nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
-    wheel_base_m: NotNegative = 0.0  #: Distance of the two wheels whose ticks are counted.
-    metres_per_tick: NotNegative = 0.0  #: Way of a wheel from one tick to the next.
+    wheel_base_m: NotNegative = 0.0  #: Distance between the two wheels, for .ticks.
+    metres_per_tick: NotNegative = 0.0  #: Distance that a wheel travels per tick.
     #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
     times: str = ""
-    image_topic: str = ""  #: The images of a bag, if there are several topics of them.
-    #: Stop after this many frames; 0 for all of them (of a live camera: until Ctrl-C).
+    image_topic: str = ""  #: Image topic of a bag, if there are several.
+    #: Stop after this many frames; 0 for all of them (with a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0)] = 0
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class RunFlags:
     #: Run folder, folder or pattern of images, video or bag, as for `detect circles`.
     run: Positional[Path]
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None  #: The file to write.
-    camera: MaybePath = None  #: Calibration, if it is not the one in the run folder.
+    camera: MaybePath = None  #: Calibration, if not the one in the run folder.
     force: bool = False  #: Replace existing files.
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
 
@@ -72,38 +72,38 @@ class DetectorFlags(RunFlags):
     run : Path
         Run folder of the data set's layout; a folder of images, or a pattern in quotes
         ('drive/*.png'); a video; a ROS 1 or 2 bag or MCAP file; or a camera of this machine,
-        camera:0. With a .cam beside it, or named by --camera.
+        camera:0. The .cam file is beside it, or given by --camera.
     output : Path
         The file to write; by default detected.circles, .lines or .markers in the run folder, or
         named after the video or bag and beside it.
     """
 
-    #: JSON file with the values that the other flags start from: that of `detect tune --serve`, or
-    #: a result's .log.json, to detect with the same ones again.
+    #: JSON file with defaults of the other flags: from `detect tune --serve`, or a result's
+    #: .log.json, to detect with the same settings again.
     settings: MaybePath = None
-    #: How lines end in files of landmarks; the data set's own end with CR and LF.
+    #: Line ends of landmark files; the data set's own files have CR and LF.
     line_ends: Literal["lf", "crlf"] = "lf"
-    #: Processes that share the work, 1 for none beside this one; by default one for every 500
-    #: frames, at most as many as there are cores. What is written is the same.
+    #: Number of processes; by default one for every 500 frames, up to the number of cores. The
+    #: output does not depend on it.
     jobs: MaybeInt = None
-    #: Address of a dask scheduler (tcp://host:8786) whose workers do the work instead.
+    #: Address of a dask scheduler (tcp://host:8786) whose workers process the frames instead.
     cluster: MaybeStr = None
-    #: Stop at the first frame that cannot be worked on, with exit code 1 and nothing written.
+    #: Stop at the first frame that cannot be processed, with exit code 1 and no output.
     strict: bool = False
-    #: Take over the frames that an unfinished run of the same command kept, and go on after them.
+    #: Continue an unfinished run of the same command after the frames it has processed.
     resume: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiscIdOptions:
-    """Where the IDs of discs come from."""
+    """Sources of the IDs of discs."""
 
-    #: A .circles file whose IDs are carried over to the rows of the same discs, levelled or not.
+    #: A .circles file whose IDs are transferred to rows of the same discs, levelled or not.
     ids_from: MaybePath = None
-    #: A map (map.csv of `slam map`): rows without an ID by --ids-from get the ID of the disc they
-    #: fall on,
+    #: A map (map.csv of `slam map`): rows without an ID from --ids-from get the ID of the map's
+    #: disc at their position (needs --path).
     ids_from_map: MaybePath = None
-    path: MaybePath = None  #: seen from the frame's pose in this path (path.csv of `slam map`).
+    path: MaybePath = None  #: The frames' poses in that map (path.csv of `slam map`).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,19 +116,19 @@ class Circles(DetectorFlags):
     Parameters
     ----------
     preset : str
-        Values that the other flags start from: `published` is the detector that made the data set's
-        rows (all of them and only those), `report` what the report prints of it.
+        Defaults of the other flags: `published` reproduces the data set's rows (all of them and
+        only those), `report` has the parameters that the report prints.
     """
 
     preset: DetectorPreset = "default"
-    #: Tilts of the frames (written by `detect lines`): positions are corrected for them.
+    #: Tilts of the frames (written by `detect lines`), for which positions are corrected.
     tilt: MaybePath = None
-    #: Find the radius of the discs in some of the images first; so says --radius-m auto, too.
+    #: Estimate the radius of the discs from some images first; the same as --radius-m auto.
     find_radius: bool = False
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    #: Folder for images with the outlines and qualities drawn in, once all is detected.
+    #: Folder for images with outlines and qualities drawn in, after detection.
     draw: MaybePath = None
-    #: Write the rows with their pixels and evidence as JSON as well; -: to standard output, alone.
+    #: Also write the rows as JSON, with pixels and evidence; -: to standard output only.
     json: MaybePath = None
     parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
@@ -143,21 +143,20 @@ class Lines(DetectorFlags):
     Parameters
     ----------
     preset : str
-        Values that the other flags start from: `published` gives the data set's own rows as far as
-        they are known, `report` is what the report prints of their detector.
+        Defaults of the other flags: `published` reproduces the data set's own rows as far as they
+        are known, `report` has the parameters that the report prints.
     """
 
     preset: DetectorPreset = "default"
-    #: The tilt file to write; by default the output's name with the ending .tilt.
+    #: The tilt file to write; by default the output's name with the extension .tilt.
     tilt: MaybePath = None
-    #: A .lines file whose IDs are carried over where the match is unambiguous.
+    #: A .lines file whose IDs are transferred where the match is unambiguous.
     ids_from: MaybePath = None
     #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
     join_threshold: MaybeFloat = None
-    #: Folder for images with the lines and their standard deviations drawn in, once all is
-    #: detected.
+    #: Folder for images with lines and their standard deviations drawn in, after detection.
     draw: MaybePath = None
-    #: Draw all tracks instead, the rejected ones with the reason; detects once more.
+    #: Draw all tracks instead, rejected ones with the reason; repeats the detection.
     rejected: bool = False
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
@@ -169,18 +168,18 @@ class Markers(DetectorFlags):
     Example: detect markers images/m/a --dictionary rawseeds, or:
     detect markers camera:0 --frames 100
 
-    Without a calibration, edges are taken to be straight in the images.
+    Without a calibration, edges are assumed to be straight in the images.
     """
 
-    #: Folder for images with the markers drawn in, once all are detected.
+    #: Folder for images with the markers drawn in, after detection.
     draw: MaybePath = None
-    rejected: bool = False  #: Draw what was rejected as well; detects once more.
+    rejected: bool = False  #: Also draw rejected candidates; repeats the detection.
     parameters: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
 class All(DetectorFlags):
-    """Detect verticals, tilt and discs of a run; --tilt corrects the discs' positions for it.
+    """Detect verticals, tilt and discs of a run, and correct the discs for the tilt.
 
     Example: detect all images/e --circles.polarity light, or:
     detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
@@ -192,15 +191,14 @@ class All(DetectorFlags):
         named after the video or bag and beside it.
     """
 
-    preset: Preset = "default"  #: Values that the other flags start from.
+    preset: Preset = "default"  #: Defaults of the other flags.
     ids: OmitArgPrefixes[DiscIdOptions] = field(default_factory=DiscIdOptions)
-    #: A .lines file whose IDs are carried over where the match is unambiguous.
+    #: A .lines file whose IDs are transferred where the match is unambiguous.
     line_ids_from: MaybePath = None
-    #: What levels the discs: `none`, the tilt of the single `frame`, or the `run`'s (a constant
-    #: lean, and the estimated deviation of each frame from it).
+    #: Tilt for which discs are corrected: `none`, that of the single `frame`, or that of the `run`
+    #: (a constant lean, and the estimated deviation of each frame from it).
     tilt: Levelling = "run"
-    #: Find the radius of the discs in some of the images first; so says --circles.radius-m auto,
-    #: too.
+    #: Estimate the radius of the discs from some images first, like --circles.radius-m auto.
     find_radius: bool = False
     circles: CircleSettings = field(default_factory=CircleSettings)
     lines: LineSettings = field(default_factory=LineSettings)
@@ -208,15 +206,15 @@ class All(DetectorFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class CompareOptions:
-    """Which detected and reference rows are the same landmark, and which rows count."""
+    """How detected and reference rows are matched, and which rows count."""
 
-    #: Compare discs on the floor: they are the same within this distance, metres. By default they
-    #: are compared in the image where there is a calibration, and within 0.1 m where there is none.
+    #: Match discs on the floor within this distance, metres. By default they are matched in the
+    #: image if there is a calibration, and within 0.1 m otherwise.
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
-    tolerance_deg: Positive = 0.5  #: Bearings of the same line differ by at most this,
-    sigmas: NotNegative = 2.0  #: or by this many standard deviations of the detected one.
-    #: Count only reference rows that have an ID. Detected rows that fit a reference row without one
-    #: are then neither right nor wrong: they are set aside.
+    tolerance_deg: Positive = 0.5  #: Largest difference of bearings of the same line,
+    sigmas: NotNegative = 2.0  #: or this many standard deviations of the detected one.
+    #: Count only reference rows that have an ID. Detected rows that match a reference row without
+    #: one are set aside, neither right nor wrong.
     only_identified: bool = False
 
     def __post_init__(self) -> None:
@@ -236,15 +234,15 @@ class Compare:
     reference: MaybePath = None
     #: Detected rows; by default detected.circles (detected.lines) in the run folder.
     detected: MaybePath = None
-    #: Discs (lines) that may be detected but need not be: rows on them are neither right nor wrong;
-    #: by default unlisted.circles (unlisted.lines) beside the reference, if it is there.
+    #: Discs (lines) that may be detected but need not be: rows that match them are neither right
+    #: nor wrong; by default unlisted.circles (unlisted.lines) beside the reference, if it exists.
     unlisted: MaybePath = None
-    #: Calibration, by default the one in the run folder: discs are compared in the image, each row
-    #: where it was seen. Without one, or with --gate-m, on the floor.
+    #: Calibration, by default the one in the run folder: discs are compared in the image, where
+    #: they were seen. Without one, or with --gate-m, they are compared on the floor.
     camera: MaybePath = None
     min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
     min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
-    json: MaybePath = None  #: Write the result as JSON; -: to standard output, alone.
+    json: MaybePath = None  #: Write the result as JSON; -: to standard output only.
     force: bool = False  #: Replace an existing JSON file.
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
@@ -253,8 +251,8 @@ class Compare:
 class RowFiles:
     """Selects the files of rows."""
 
-    #: Folder with detected.circles, detected.lines, detected.markers and detected.tilt, as far as
-    #: they exist; by default the run's.
+    #: Folder with those of detected.circles, detected.lines, detected.markers and detected.tilt
+    #: that exist; by default the run's.
     rows: MaybePath = None
     #: Reference rows of discs, by default map.circles in the run folder if it exists.
     reference: MaybePath = None
@@ -264,7 +262,7 @@ class RowFiles:
 
 @dataclass(frozen=True, kw_only=True)
 class SomeFramesFlags(RunFlags):
-    """Options of commands that may leave frames out."""
+    """Options of commands that may skip frames."""
 
     every: Annotated[int, whole(1)] = 1  #: Only every n-th frame.
 
@@ -274,7 +272,7 @@ class SomeFramesFlags(RunFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Draw(SomeFramesFlags):
-    """Draw rows from files into the images: PNG files, or a video. Nothing is detected again.
+    """Draw rows from files into the images, without detection: PNG files, or a video.
 
     Example: detect all images/e, then: detect draw images/e -o /tmp/drawn --every 10
 
@@ -285,13 +283,13 @@ class Draw(SomeFramesFlags):
     """
 
     video: MaybePath = None  #: Write an MP4 file as well, or instead.
-    fps: float = 10.0  #: Frames of the video per second.
+    fps: float = 10.0  #: Frames per second of the video.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(SomeFramesFlags):
-    """Frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
+    """Show frames, landmarks, tilt, path and map over time in Rerun (extra [view]).
 
     Example: detect all images/e, then: detect view images/e -o /tmp/e.rrd
 
@@ -311,7 +309,7 @@ class View(SomeFramesFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(RunFlags):
-    """One HTML page about a run: what was found, and how good it is against reference rows.
+    """Write an HTML page about a run: detections, and their comparison with reference rows.
 
     Example: detect all images/e, then: detect report images/e -o /tmp/e.html
 
@@ -323,40 +321,40 @@ class Report(RunFlags):
         Replace an existing page.
     """
 
-    worst: int = 5  #: How many of the worst frames are shown.
+    worst: int = 5  #: Number of worst frames to show.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explain:
-    """Why discs of an image are found, or not: each candidate, and the number that dropped it.
+    """Explain why discs of an image are found or not: each candidate, and what rejected it.
 
     Example: detect explain images/e/images/e.0000.jpg --at 377 85 -o /tmp/why.png
     """
 
     image: Positional[Path]  #: The image.
-    #: Pixel (u, v) of something that should have been found: only what is near it is explained.
+    #: Pixel (u, v) of something that should have been found; only candidates near it are explained.
     at: MaybePixel = None
-    #: Calibration; by default the one in the image's folder, or in the folder of that.
+    #: Calibration; by default the one in the image's folder, or in its parent.
     camera: MaybePath = None
     #: PNG file for a picture of the candidates, numbered as in the table.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     json: MaybePath = None  #: Write the candidates as JSON; -: to standard output.
     force: bool = False  #: Replace existing files.
-    settings: MaybePath = None  #: JSON file with the values that the other flags start from.
+    settings: MaybePath = None  #: JSON file with defaults of the other flags.
     parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demo:
-    """Detect discs, verticals and tilt of a small run, compare them with the truth, make a page.
+    """Detect discs, verticals and tilt of a small run, compare them with the truth, write a page.
 
     Example: detect demo -o /tmp/demo
 
-    The run is rendered: a robot's camera drives along a corridor, and where everything is is known.
+    The run is rendered: a robot drives along a corridor, and all true positions are known.
     """
 
-    #: Another run to use, with map.circles as the truth; by default images that come with the
+    #: Another run to use, with map.circles as the truth; by default images included in the
     #: program.
     run: MaybePath = None
     #: Folder for the rows and the page; by default redetect-demo in the working folder.
@@ -366,29 +364,29 @@ class Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class Tune(SomeFramesFlags):
-    """Try parameters over a grid against a reference file: precision and recall, knee marked.
+    """Evaluate parameters over a grid against reference rows: precision, recall and their knee.
 
     Example: detect tune images/e --vary evidence=-1:3:0.5 --every 8 -o /tmp/tuned
 
-    All combinations of the values of --vary are tried. With --serve, parameters are turned by hand
-    on a page instead, which needs no reference rows, and labels discs.
+    All combinations of the values of --vary are tried. With --serve, parameters are changed by hand
+    on a page instead, which needs no reference rows; discs can be labelled there.
 
     Parameters
     ----------
     output : Path
-        Folder for table.json and curve.png, or for what the page saves: tuned.json
+        Folder for table.json and curve.png, or for the files that the page saves: tuned.json
         (settings, for --settings) and labels.circles; by default `detected.tune` in the run folder.
     """
 
     #: Parameters of `detect circles` and their values: NAME=FROM:TO:STEP, both ends included, or
     #: NAME=VALUES with commas between them.
     vary: tuple[str, ...] = ()
-    serve: bool = False  #: Serve a page for turning the settings of discs, until Ctrl-C.
-    port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any that is free.
+    serve: bool = False  #: Serve a page for tuning the settings of discs, until Ctrl-C.
+    port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any free port.
     settings: MaybePath = None  #: JSON file with the values that are not varied.
     reference: MaybePath = None  #: Reference rows; by default map.circles in the run folder.
-    #: Processes that share the work, 1 for none beside this one; by default one for every 500
-    #: frames to process, at most as many as there are cores. What is written is the same.
+    #: Number of processes; by default one for every 500 frames to process, up to the number of
+    #: cores. The output does not depend on it.
     jobs: MaybeInt = None
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
 
@@ -407,8 +405,8 @@ class Export:
     #: csv, with a line of names and units; parquet (extra [parquet]); or mcap, messages of ROS 2
     #: (extra [bags]).
     to: Literal["csv", "parquet", "mcap"] = "csv"
-    #: The file to write; by default the file's name and the format's. The steps go beside it, as
-    #: .steps.csv or .steps.parquet; MCAP has all in one.
+    #: The file to write; by default the file's name with the format's extension. Steps are written
+    #: beside it, as .steps.csv or .steps.parquet; MCAP has everything in one file.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     #: Times of the frames, rows `prefix seconds`; by default <file>.times, or that of what was
     #: detected together (detected.times).

@@ -1,6 +1,6 @@
-"""Compiled solution of small positive definite systems, which says when they are not.
+"""Compiled solution of small positive definite systems, which detects indefinite ones.
 
-NumPy's own would have Numba look LAPACK up at the first call, which an interrupt must not meet.
+With NumPy's functions, Numba looks up LAPACK at the first call, which is not safe to interrupt.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
-#: A pivot less than this part of its diagonal entry is rounding.
+#: A pivot below this share of its diagonal entry counts as zero.
 _LEAST_PIVOT = 1e-13
 
 

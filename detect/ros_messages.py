@@ -1,9 +1,9 @@
 """Rows as standard messages of ROS 2, in the axes of REP 103: X forward, Y left, Z up.
 
-Discs, verticals and tilts are `geometry_msgs/PoseWithCovarianceStamped`, a message for each, and
-discs and verticals a `visualization_msgs/MarkerArray` for each image besides, in the same order,
-with their identifiers as text. Square markers are `visualization_msgs/ImageMarker`, and odometry is
-the transform from `odom` to `base_link` (REP 105). RViz and Foxglove show these as they are.
+Each disc, vertical and tilt is a `geometry_msgs/PoseWithCovarianceStamped`; discs and verticals of
+an image also are a `visualization_msgs/MarkerArray`, in the same order, with their identifiers as
+text. Square markers are `visualization_msgs/ImageMarker`, and odometry is the transform from `odom`
+to `base_link` (REP 105). RViz and Foxglove display these directly.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ TOPICS: dict[TableName, dict[str, str]] = {
     "markers": {"/redetect/markers": "visualization_msgs/msg/ImageMarker"},
     "tilts": {"/redetect/tilts/poses": _POSE},
 }
-#: Makes a message of a type from its fields; those that are not given are zero or empty.
+#: Makes a message of a type from its fields; missing ones are zero or empty.
 Make = Callable[..., Any]
-#: The values of a row's columns behind those of its frame.
+#: The values of a row's columns after those of its frame.
 Values = Sequence[Any]
 
-_DELETE_ALL = 3  # Action of a `Marker`: those shown before go.
+_DELETE_ALL = 3  # Action of a `Marker`: removes those shown before.
 # Kind of a `Marker` and its size (m), as a symbol of a disc, and of the bearing of a vertical.
 _CYLINDER_OR_ARROW = {"circles": (3, (0.2, 0.2, 0.01)), "lines": (0, (5.0, 0.02, 0.02))}
 _POLYGON = 3
@@ -48,9 +48,9 @@ def ros_messages(
 ) -> Iterator[tuple[int, str, Any]]:
     """Time (ns), topic and content of the messages of the rows of frames.
 
-    `make(type, **fields)` is a message; `frames` the time of each frame (ns) and its rows by table,
-    their values in the order of `redetect.landmarks.columns`; `frame_prefix` stands before the
-    names of all coordinate frames, as `robot_state_publisher` has it.
+    `make(type, **fields)` makes a message; `frames` are the time of each frame (ns) and its rows by
+    table, with values in the order of `redetect.landmarks.columns`; `frame_prefix` precedes the
+    names of all coordinate frames, as in `robot_state_publisher`.
     """
     place, heading = 0j, 0.0  # The robot in the frame `odom`: x + iy (m), rad
     for time_ns, tables in frames:
@@ -88,8 +88,8 @@ def header_of(make: Make, time_ns: int, frame_id: str) -> Any:
 
 
 def _pose(make: Make, table: TableName, row: Values) -> Any:
-    """A disc's place on the floor, a vertical's bearing, or the turn of the robot to the level."""
-    mean, covariance = np.zeros(6), np.zeros((6, 6))  # Place, rotation vector
+    """A disc's floor position, a vertical's bearing, or the rotation that levels the robot."""
+    mean, covariance = np.zeros(6), np.zeros((6, 6))  # Position, rotation vector
     if table == "lines":
         *_, alpha, _, _, sigma, _ = row
         mean[5], covariance[5, 5] = alpha, sigma**2
@@ -117,7 +117,7 @@ def _quaternion(make: Make, turn: Rotation) -> Any:
 
 
 def transform_of(make: Make, header: Any, child: str, place: ArrayLike, turn: Rotation) -> Any:
-    """A `tf2_msgs/TFMessage`: a frame's place and rotation in the frame of the header."""
+    """A `tf2_msgs/TFMessage`: a frame's position and rotation in the frame of the header."""
     transform = make(
         "geometry_msgs/msg/Transform",
         translation=_xyz(make, "Vector3", place),

@@ -1,14 +1,14 @@
 """The tilt of the frames of a run: a constant lean, and each frame's deviation from it.
 
-The verticals of one frame often have a common error: trunks, folds of a curtain, a board that
-leans. Those of a run determine how the camera leans relative to its calibration, and how far the
-robot tilts about that. The outlines of discs (`detect.discs.outline_tilt`) show a frame's
-deviation, too. The two constants differ where the calibration is not exact: that of the verticals
-is as wrong as the lens, that of the outlines as the height and the discs' radius. The truth is
-taken to be anywhere between them, and the mean is used. Each axis is an autoregression about a
-constant, measured with errors that last as long as their scene is in view (`smooth_axis`). The
-constants, the spread, and the factors by which errors are smaller or larger than a frame by itself
-can know maximise the likelihood: in one building all verticals are true, in another few.
+The verticals of one frame often have a common error: trunks, folds of a curtain, a leaning board.
+Those of a run determine the lean of the camera relative to its calibration, and the robot's tilt
+about that. The outlines of discs (`detect.discs.outline_tilt`) measure a frame's deviation, too.
+The two constants differ if the calibration is not exact: that of the verticals depends on errors of
+the lens, that of the outlines on errors of height and radius. The truth is assumed to be anywhere
+between them, and the mean is used. Each axis is an autoregressive process about a constant,
+measured with errors that last as long as their scene is visible (`smooth_axis`). The constants, the
+spread, and the factors between true and stated errors, which a single frame cannot determine, are
+estimated by maximum likelihood: in some buildings all verticals are true, in others few.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
-#: With fewer measured frames the errors cannot be separated from the tilt.
+#: Least number of measured frames; with fewer, errors cannot be separated from the tilt.
 LEAST_FRAMES = 20
-#: Priors of what is learned, and the standard deviations of their logarithms: the spread of the
-#: true tilt about its constant, a robot on an even floor (rad); how many frames a deviation lasts,
-#: a robot swings on its springs; the factors by which stated deviations of verticals and of
-#: outlines are off, which a run of few frames cannot know well.
+#: Priors of the estimated parameters, and the standard deviations of their logarithms: the spread
+#: of the true tilt about its constant, for an even floor (rad); the duration of a deviation, for a
+#: robot on springs (frames); the factors on the stated deviations of verticals and of outlines,
+#: which a run of few frames cannot determine well.
 _SPREAD_RAD, _LOG_SPREAD_SIGMA = math.radians(0.3), 0.3
 _FRAMES, _LOG_FRAMES_SIGMA = 2.3, 0.3
 _LOG_FACTOR_SIGMA = 0.5
-#: The constants are searched in this unit (rad).
+#: Unit of the constants in the optimisation (rad).
 _UNIT_RAD = math.radians(0.1)
 _SEARCH = {"gtol": 1e-2}
-#: Systematic error of any number of verticals: the lens's error common to all of them towards the
-#: image's border (rad). It is given, not estimated: a run shows its sum with the true lean.
+#: Systematic error common to all verticals: that of the lens towards the image border (rad). It is
+#: not estimated, since a run determines only its sum with the true lean.
 COMMON_RAD = math.radians(0.15)
-#: The same where the calibration is right in lens and height, and how far the constants of outlines
-#: and verticals are apart then, and otherwise (rad; `_share_exact`).
+#: The same if the calibration is exact in lens and height; standard deviation of the difference
+#: between the constants of outlines and verticals then, and otherwise (rad; `_share_exact`).
 _EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
-#: How far the outlines' pitch moves (rad) if the camera hangs higher, per share of its height.
+#: Derivative of the outlines' pitch (rad) by the camera's height, relative to that height.
 OUTLINE_PITCH_PER_HEIGHT = 0.45
-#: Share of the variance of a frame's error that lasts, and its correlation: a scene stays in view.
+#: Correlated share of the variance of a frame's error (a scene stays visible), and its correlation.
 LASTING_SHARE, LASTING = 0.5, 0.9
-#: How often, and how far, a frame shows a wrong tilt (rad): a consensus of lines that are no
-#: verticals.
+#: Share of frames with an outlier of the tilt, and its standard deviation (rad): a consensus of
+#: lines that are not vertical.
 STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
-#: How often, and how far, the robot tilts for a moment (rad): a wheel is on a sill or a cable.
+#: Share of frames with a momentary tilt (a wheel on a sill or a cable), and its size (rad).
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
 #: Least standard deviation of a frame's tilt (rad).
 _LEAST_RAD = math.radians(0.02)
 
 
 class FrameTilts(NamedTuple):
-    """Pitch and roll of frames (rad), NaN where there are none, and their variances (rad^2)."""
+    """Pitch and roll of frames (rad), NaN if missing, and their variances (rad^2)."""
 
     tilt: FloatArray  # (N, 2)
     variance: FloatArray  # (N, 2)
@@ -83,13 +83,13 @@ class RunTilt:
     lean: FloatArray  # (2,) the constants
     lean_sigma: FloatArray  # (2,) their standard deviations
     tilt: FloatArray  # (N, 2) of each frame
-    #: (N, 2) of them (rad^2), the constant's included; the axes are assumed to be independent
+    #: (N, 2) of them (rad^2), including the constant's; the axes are assumed to be independent
     variance: FloatArray
-    #: Of the camera's height, as a share of it, where its calibration does not state it.
+    #: Relative standard deviation of the camera's height, if the calibration has no covariance.
     height_sigma: float = 0.0
 
     def sentence(self) -> str:
-        """The constant lean, and that it was used."""
+        """A sentence on the constant lean."""
         pitch, roll = (
             f"{math.degrees(lean):.2f} +- {math.degrees(sigma):.2f}"
             for lean, sigma in zip(self.lean, self.lean_sigma)
@@ -105,12 +105,12 @@ def tilt_of_run(
     outlines: FrameTilts | None = None,
     common_variance: FloatArray | None = None,
 ) -> RunTilt | None:
-    """The tilt of a run from that of each frame, in their order.
+    """Estimate the tilt of a run from the tilts of its frames, in their order.
 
-    By the verticals of each frame and, optionally, by the outlines of its discs; None if fewer than
-    `LEAST_FRAMES` frames have a tilt by verticals. `common_variance`, (2,) rad^2, is that of the
-    error of pitch and roll that all frames share, if the calibration states it: then the lean is
-    that of the verticals. Without it, it follows from how far outlines and verticals agree.
+    The tilts are those from the verticals of each frame and, optionally, from the outlines of its
+    discs; None if fewer than `LEAST_FRAMES` frames have a tilt from verticals. `common_variance`,
+    (2,) rad^2, is that of the error of pitch and roll common to all frames, if the calibration
+    states it: then the lean is that of the verticals, otherwise it depends on the outlines, too.
     """
     if np.count_nonzero(verticals.known) < LEAST_FRAMES:
         return None
@@ -121,11 +121,11 @@ def tilt_of_run(
     found = _learned(series)
     apart = [one.apart for one in found]
     exact = _share_exact(apart)
-    # Of a calibration that states its covariance, verticals and height are as good as it says.
+    # If the calibration has a covariance, that covers the verticals and the height.
     between = np.nan_to_num(apart) if common_variance is None else np.zeros(2)
     lean, lean_variance = np.array([(one.lean, one.lean_variance) for one in found]).T
     tilt, of_deviation = _tilts(series, found)
-    # How far a frame's tilt follows the constant: where it is well measured, not at all.
+    # Weight of the constant in a frame's tilt: zero for a well measured frame.
     shifted, _ = _tilts(series, [one._replace(lean=one.lean + _UNIT_RAD) for one in found])
     share = np.clip((shifted - tilt) / _UNIT_RAD, 0.0, 1.0)
     if common_variance is None:
@@ -149,19 +149,19 @@ def _tilts(series: Sequence[_Series], found: Sequence[_Axis]) -> tuple[FloatArra
 
 
 class _Axis(NamedTuple):
-    """What is learned of an axis: constants (rad), spread (rad), factors of stated deviations."""
+    """Estimated parameters of an axis: constants, spread (rad), factors of stated deviations."""
 
     lean: float
     spread: float
     memory: float  # correlation of deviations from frame to frame
     verticals_scale: float
     outlines_scale: float
-    apart: float = math.nan  # by how much the outlines' constant differs from the verticals'
+    apart: float = math.nan  # the outlines' constant minus the verticals'
     lean_variance: float = math.nan
 
 
 class _Series(NamedTuple):
-    """What the frames show of an axis (rad, rad^2); NaN where nothing."""
+    """The measurements of an axis in all frames (rad, rad^2); NaN if missing."""
 
     verticals: FloatArray
     verticals_variance: FloatArray
@@ -169,10 +169,10 @@ class _Series(NamedTuple):
     outlines_variance: FloatArray
 
     def smoothed(self, axis: _Axis) -> tuple[float, FloatArray, FloatArray]:
-        """The log-likelihood of what is learned; deviations from the constant, their variances.
+        """The log-likelihood of the parameters; deviations from the constant, their variances.
 
-        Verticals and outlines have as much information as their weighted means, which are smoothed,
-        and their differences.
+        The weighted means of verticals and outlines, which are smoothed, and their differences
+        together contain all information.
         """
         variance = np.stack(
             [
@@ -198,7 +198,7 @@ class _Series(NamedTuple):
 
 
 def _log_density(difference: FloatArray, variance: FloatArray) -> float:
-    """Of differences of two measurements, either of which may be an outlier."""
+    """Log density of differences of two measurements, either of which may be an outlier."""
     log_good, log_bad = (
         math.log(share) - 0.5 * (np.log(spread) + difference**2 / spread)
         for share, spread in (
@@ -210,12 +210,12 @@ def _log_density(difference: FloatArray, variance: FloatArray) -> float:
 
 
 def _learned(series: Sequence[_Series]) -> list[_Axis]:
-    """What is learned of the axes: what has the largest likelihood.
+    """Maximum likelihood estimates of the axes' parameters.
 
-    The factors are known by how verticals and outlines differ; without these they are 1. That of
-    verticals is the same in all axes: what makes lines lean makes them lean in any direction.
+    The factors are determined by the differences of verticals and outlines; without these they are
+    1. That of verticals is common to all axes, since lines lean in any direction.
     """
-    from scipy.optimize import minimize  # takes as long as a hundred frames
+    from scipy.optimize import minimize  # importing takes as long as a hundred frames
 
     has_outlines = any(np.isfinite(axis.outlines).any() for axis in series)
     middle = [
@@ -225,7 +225,7 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
         )
         for axis in series
     ]
-    # Of the logarithm of the verticals' factor, then of what `axes_of` names of each axis.
+    # The logarithm of the verticals' factor, then each axis's parameters in the order of `axes_of`.
     of_axis = [math.inf, _LOG_SPREAD_SIGMA, _LOG_FRAMES_SIGMA, _LOG_FACTOR_SIGMA, math.inf]
     prior_sigma = np.array([_LOG_FACTOR_SIGMA] + of_axis * len(series))
     is_free = np.array(
@@ -247,7 +247,7 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
             )
         ]
 
-    @cache  # of the unknowns, most concern one axis only
+    @cache  # most unknowns affect one axis only
     def log_likelihood(number: int, axis: _Axis) -> float:
         return series[number].smoothed(axis)[0]
 
@@ -272,10 +272,10 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
 
 
 def _share_exact(apart: Sequence[float]) -> float:
-    """How probable it is that the calibration is exact, by how far the constants are apart.
+    """Probability that the calibration is exact, given the differences of the constants.
 
-    A wrong lens or height moves the constant that outlines show away from that of the verticals.
-    Where they agree, the calibration is most likely right; they do so by chance as well.
+    A wrong lens or height moves the constant of the outlines away from that of the verticals. If
+    they agree, the calibration is most likely exact, but they may also agree by chance.
     """
     if not np.isfinite(apart).all():
         return 0.0
@@ -290,7 +290,7 @@ def _share_exact(apart: Sequence[float]) -> float:
 
 @kernel()
 def _weighed(share: float, off: float, variance: float) -> float:
-    """A share of a normal density."""
+    """A normal density, times a share."""
     return share * math.exp(-0.5 * min(off * off / variance, 1000.0)) / math.sqrt(variance)
 
 
@@ -298,17 +298,17 @@ def _weighed(share: float, off: float, variance: float) -> float:
 def smooth_axis(
     deviation: FloatArray, sigma: FloatArray, spread: float, memory: float
 ) -> tuple[float, FloatArray, FloatArray]:
-    """True deviations of one angle from the run's constant lean, by all frames.
+    """Smooth the deviations of one angle from the run's constant lean over all frames.
 
-    The state is the deviation x and the lasting error u of the verticals in units of its standard
-    deviation; both are first-order autoregressions: wrong verticals (a tree, a curtain) stay in
-    view. A measurement is x + a u + white noise, or an outlier. The two filtered densities are
-    merged into the normal one of the same moments before the next frame. The final residual of a
-    frame's measurement may be an outlier or a jump of the robot; the mean and the
-    variance are those of the mixture.
+    The state is the deviation x and the correlated error u of the verticals in units of its
+    standard deviation; both are first-order autoregressive, since wrong verticals (a tree, a
+    curtain) stay visible. A measurement is x + a u + white noise, or an outlier. The two filtered
+    densities are merged into a Gaussian with the same moments before the next frame. The smoothed
+    residual of a frame's measurement may be an outlier or a jump of the robot; mean and variance
+    are those of the mixture.
 
-    Of (N,) measured angles less the lean (rad; NaN where there is none), their standard deviations
-    and that of x, and the correlation of x from frame to frame, returns the log-likelihood of the
+    From (N,) measured angles minus the lean (rad; NaN if missing), their standard deviations and
+    that of x, and the correlation of x from frame to frame, returns the log-likelihood of the
     measurements, and the (N,) means and variances of the deviations given all frames (rad, rad^2).
     """
     count = len(deviation)

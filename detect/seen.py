@@ -1,6 +1,6 @@
-"""Where in the image rows of discs were seen: through the tilt they were levelled by, and the lens.
+"""Maps rows of discs back into the image: undoes the levelling, then projects through the lens.
 
-Plain numpy: comparing files takes no compiler.
+Plain NumPy, so that comparing files does not load the compiler.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from redetect.plane import chain_steps
 
 Tilt = tuple[float, float]
 
-#: Discs that differ by no more than this in the image are the same, however small they are (px).
+#: Lower bound of the gate in the image, for small discs (px).
 LEAST_GATE_PX = 3.0
 _POINTS = 64
 
@@ -28,15 +28,15 @@ _POINTS = 64
 def image_positions(
     camera: Camera, floor_xy: ArrayLike, levelled_by: Tilt | None = None, raised_m: float = 0.0
 ) -> FloatArray:
-    """(..., 2) pixels where the camera saw places (..., 2) on the floor (m); NaN where not seen.
+    """(..., 2) pixels of positions (..., 2) on the floor (m); NaN where not visible.
 
-    `levelled_by` are pitch and roll (rad) that turned the positions level, and the camera is
+    `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
     `raised_m` higher than calibrated.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
     if levelled_by is not None:
-        # The rotation turns measured directions level; its transpose turns level ones back.
+        # The rotation levels measured directions; its transpose undoes that.
         points = points @ level_matrix(levelled_by)
     return camera.project_robot(points - np.array([0.0, 0.0, raised_m]))
 
@@ -44,11 +44,10 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level positions (m) of discs that the calibrated camera sees on the floor.
+    """Level the floor positions (m) that the calibrated camera measures.
 
-    Of positions (..., 2) that were computed without the tilt, levelled by pitch and roll (..., 2)
-    (rad), one for all or broadcast against them. NaN where the levelled ray does not meet the
-    floor.
+    Positions (..., 2) were computed without the tilt; pitch and roll (..., 2) (rad) are given once
+    for all or broadcast against them. NaN where the levelled ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)
@@ -60,15 +59,15 @@ def level_seen(
 
 
 def level_matrix(levelled_by: ArrayLike) -> FloatArray:
-    """(..., 3, 3) rotations exp([pitch, roll, 0]x) that turn measured directions level."""
+    """(..., 3, 3) rotations exp([pitch, roll, 0]x) that level measured directions."""
     tilt = np.asarray(levelled_by, dtype=np.float64)
     return rotation_of(np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1))
 
 
 def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
-    """The camera as it is mounted if it hangs higher and then leans by pitch and roll (rad).
+    """The camera mounted higher, then leaning by pitch and roll (rad).
 
-    These turn directions level, about the robot's origin on the floor. The covariance is left out.
+    These level directions, about the robot's origin on the floor. The covariance is dropped.
     """
     turn = level_matrix(lean)
     centre = camera.centre + np.array([0.0, 0.0, raised_m])
@@ -77,7 +76,7 @@ def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
 
 
 def circle_on_floor(centre_xy: ArrayLike, radius_m: float, points: int = _POINTS) -> FloatArray:
-    """(..., points, 2) places round circles on the floor (m)."""
+    """(..., points, 2) points on circles on the floor (m)."""
     angle = 2.0 * np.pi * np.arange(points) / points
     ring = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return np.asarray(np.asarray(centre_xy, dtype=np.float64)[..., None, :] + ring)
@@ -90,17 +89,17 @@ def summed_steps(steps: Iterable[Step]) -> FloatArray:
 
 @dataclass(frozen=True)
 class Sight:
-    """How rows of discs come back into the images, for each side by the tilt that levelled it."""
+    """Maps rows of discs into the image, reference and detected ones by the tilts of each."""
 
     camera: Camera
     radius_m: float = 0.10  # of the discs
-    #: Reference rows are level though they do not say by which tilt: by that of the detected rows.
+    #: Reference rows are level but do not state their tilt: that of the detected rows is used.
     reference_level: bool = False
     reference_by: Tilt | None = None
     detected_by: Tilt | None = None
 
     def of(self, reference: Frame | None, detected: Frame | None) -> Sight:
-        """The same for a frame with these rows."""
+        """The mapping for a frame with these rows."""
         detected_by = None if detected is None else detected.levelled_by
         reference_by = None if reference is None else reference.levelled_by
         if self.reference_level and reference_by is None:
@@ -108,11 +107,11 @@ class Sight:
         return replace(self, reference_by=reference_by, detected_by=detected_by)
 
     def reference_px(self, xy: FloatArray) -> FloatArray:
-        """(..., 2) pixels where positions (..., 2) of reference rows were seen."""
+        """(..., 2) pixels of positions (..., 2) of reference rows."""
         return image_positions(self.camera, xy, self.reference_by)
 
     def detected_px(self, xy: FloatArray) -> FloatArray:
-        """(..., 2) pixels where positions (..., 2) of detected rows were seen."""
+        """(..., 2) pixels of positions (..., 2) of detected rows."""
         return image_positions(self.camera, xy, self.detected_by)
 
     def levelled_alike(self, reference_xy: FloatArray) -> FloatArray:
@@ -126,7 +125,7 @@ class Sight:
         return np.where(np.isfinite(xy), xy, reference_xy)
 
     def gates(self, reference_xy: FloatArray) -> FloatArray:
-        """(N, 2) half the width and height of discs' images, at least `LEAST_GATE_PX`, pixels."""
+        """(N, 2) half widths and heights of imaged discs, at least `LEAST_GATE_PX`, pixels."""
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)

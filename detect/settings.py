@@ -23,10 +23,14 @@ from redetect.storage.bounds import (
     whole,
 )
 
+<<<<<<< HEAD
 #: Standard deviation of the pitch and the roll of a robot on an even floor, degrees.
 USUAL_TILT_DEG = 0.3
 
 #: Tilt by which positions are corrected.
+=======
+#: Tilt for which positions are corrected.
+>>>>>>> english
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
@@ -44,45 +48,51 @@ class CircleSettings:
     #: Radius of the outline outside the disc's edge, as a share of the disc's.
     outer_ring: Annotated[float, _OUTSIDE] = 1.4
     samples: Annotated[int, whole(3, 128)] = 16  #: Samples on each outline.
-    #: Samples are counted in pairs, an inner and an outer one, and at least this share of them must
-    #: be inside the image; 0: samples are counted singly.
+    #: Least share of sample pairs (an inner and an outer one) inside the image; 0: samples are
+    #: counted singly.
     pairs_inside: Share = 0.0
-    #: How far the samples of a pair that fall on the same pixel are moved, one inwards and one
-    #: outwards: the length on the floor of this many pixels down the image.
+    #: If the samples of a pair are on the same pixel, one is moved inwards and one outwards, by the
+    #: length on the floor of this many image rows.
     apart_px: NotNegative = 0.0
-    #: From one centre to the next along a row: this share of the distance between the outlines, in
-    #: pixels as long as one down the image, rounded up; 0: every pixel is a centre.
+    #: Distance of neighbouring centres in a row: this share of the distance between the outlines,
+    #: in image rows' length on the floor, rounded up to pixels; 0: every pixel is a centre.
     stride: NotNegative = 0.0
     #: Without a fit: least quality (between-class / total variance), 0 to 1.
     threshold: ShareAbove0 = 0.5
-    #: Centres keep this distance from the image's border, pixels.
+    #: Least distance of a centre from the image border, pixels.
     border_px: Annotated[int, whole(0)] = 6
-    #: Centres are so near that the floor moves at most this share of the radius per image row;
-    #: infinite: however far.
+    #: Limit of the distance: the floor moves at most this share of the radius per image row;
+    #: infinite: no limit.
     far_limit: Limit = 1.2
     polarity: Polarity = "any"  #: Which discs to detect: lighter than the floor, darker, or both.
-    #: Without a fit: the mean grey values of the outlines differ by more than this.
+    #: Without a fit: the difference of the outlines' mean grey values has to exceed this.
     least_contrast: NotNegative = 0.0
     #: Least contrast of a disc, in standard deviations of the image's noise (or in grey levels,
-    #: where the noise is less than one).
+    #: if the noise is less than one).
     noise_floor: NotNegative = 3.0
-    #: Of detections closer than this on the floor, in radii, only the best is reported; 0 reports
-    #: all.
+    #: Least distance of two detections on the floor, in radii: of closer ones only the best is
+    #: reported; 0 reports all.
     separation: NotNegative = 1.4
     #: Find discs by their rims, and fit their positions; otherwise they are the pixels of the
     #: highest quality, as published.
     refine: bool = True
-    #: Least evidence of a disc that is found by its rim, log-odds (`detect.discs.judgement`).
+    #: Least evidence of a disc found by its rim, log-odds (`detect.discs.judgement`).
     evidence: Annotated[float, FINITE] = -0.25
     #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
-    #: Error of a calibration that does not state its covariance, pixels: added to a refined
-    #: position's covariance by the commands. Calibrations commonly fit to 0.1-0.3 px.
+    #: Error of a calibration without a covariance, pixels: commands add it to the covariance of
+    #: refined positions. Calibrations commonly have residuals of 0.1-0.3 px.
     calibration_px: NotNegative = 0.15
+<<<<<<< HEAD
     #: Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
     #: refined position's covariance if the frame's tilt is unknown. By default 0.3, and as much as
     #: the camera leans, where a run shows that.
     tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
+=======
+    #: Standard deviation of the robot's pitch and roll, degrees: added to the covariance of refined
+    #: positions if the frame's tilt is unknown.
+    tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
+>>>>>>> english
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
@@ -105,17 +115,17 @@ class CircleSettings:
 
     @property
     def far_limit_m_per_px(self) -> float:
-        """How far the floor moves per image row at most, metres."""
+        """Largest step of the floor per image row, metres."""
         return self.far_limit * self.radius_m
 
     @property
     def separation_m(self) -> float:
-        """Of detections closer than this on the floor only the best is reported, metres."""
+        """Least distance of two detections on the floor, metres."""
         return self.separation * self.radius_m
 
     @property
     def least_pairs(self) -> int:
-        """Pairs of samples that must be inside the image; 0: samples are counted singly."""
+        """Least number of sample pairs inside the image; 0: samples are counted singly."""
         return math.ceil(self.pairs_inside * self.samples)
 
 
@@ -136,7 +146,7 @@ PUBLISHED = CircleSettings(
     calibration_px=0.0,
 )
 
-#: The parameters in the report on the data set: other outlines, every pixel, all local maxima.
+#: The parameters that the data set report prints: other outlines, every pixel, all local maxima.
 REPORT = CircleSettings(
     threshold=0.6,
     border_px=12,
@@ -161,39 +171,39 @@ class MarkerSettings:
     #: Dictionary of the markers: rawseeds, artoolkitplus12, artoolkitplus8, or an OpenCV dictionary
     #: (4x4_50 ... 7x7_1000, aruco_original, aruco_mip_36h12, apriltag_16h5 ...).
     dictionary: str = "rawseeds"
-    #: The markers to expect; none: all of the dictionary.
+    #: IDs of the expected markers; none: all of the dictionary.
     ids: Annotated[tuple[int, ...], whole(0)] = ()
-    #: Expected width of the markers in the image, pixels, right to a factor of about 2; 0: unknown,
+    #: Expected width of the markers in the image, pixels, within a factor of about 2; 0: unknown,
     #: several scales are tried.
     width_px: NotNegative = 0.0
     #: A pixel is dark if 1 - I1/I2 of the image I1 and its closing I2 exceeds this; each threshold
-    #: gives candidates of its own.
+    #: gives its own candidates.
     thresholds: Annotated[tuple[float, ...], PROBABILITY] = (0.5, 0.25, 0.12, 0.06, 0.03)
-    disc_widths: Positive = 0.5  #: Radius of the closing's disc in widths of the marker.
+    disc_widths: Positive = 0.5  #: Radius of the closing's disc in marker widths.
     #: Dark pixels are darker than the closing by at least this many standard deviations of the
     #: image's noise.
     dark_noise: NotNegative = 2.0
-    #: Narrowest marker to search (square root of its area), pixels, where no width is given.
+    #: Narrowest marker to search for (square root of its area), pixels, if no width is given.
     least_width_px: Annotated[float, _LEAST_WIDTH] = 9.0
     #: A candidate's area is within this factor of the expected width squared.
     area_factor: Annotated[float, _AREA_FACTOR] = 6.0
     #: Least number of white patches enclosed in a candidate.
     least_holes: Annotated[int, whole(0)] = 0
-    most_holes: Annotated[int, whole(0)] = 40  #: Greatest number of them.
-    #: Area of a candidate, its holes filled, over that of its convex hull.
+    most_holes: Annotated[int, whole(0)] = 40  #: Largest number of them.
+    #: Least area of a candidate, with holes filled, over that of its convex hull.
     least_solidity: Share = 0.75
-    #: Least area of a candidate's holes over its whole area, in parts of the dictionary's mean
+    #: Least area of a candidate's holes over its whole area, relative to the dictionary's mean
     #: white share (0.25 of 1/8 in the report).
     least_white: NotNegative = 0.0
-    most_white: NotNegative = 3.0  #: Greatest such area (3 of 1/8 in the report).
-    least_square: Share = 0.75  #: Area of the rough quadrangle over that of the convex hull.
+    most_white: NotNegative = 3.0  #: Largest such area (3 of 1/8 in the report).
+    least_square: Share = 0.75  #: Least area of the rough quadrangle over that of the convex hull.
     #: Least contrast of each edge, in standard deviations of the image's noise.
     least_contrast: NotNegative = 1.4
-    edge_balance: Share = 0.2  #: Least contrast of an edge, in parts of the strongest edge's.
+    edge_balance: Share = 0.2  #: Least contrast of an edge relative to the strongest edge.
     #: Largest mean absolute difference between a marker's cells, rescaled to 0 to 1, and the
     #: pattern.
     largest_distance: Share = 0.3
-    #: Least squared distance to the second best pattern less that to the best, in cells.
+    #: Least squared distance to the second best pattern minus that to the best, in cells.
     least_margin: NotNegative = 1.0
     #: Least share of the grey values' variance, noise aside, explained by the fitted marker.
     least_explained: Share = 0.9

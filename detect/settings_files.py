@@ -1,8 +1,8 @@
-"""Settings of detectors in files: what ran, to be run again or to be changed.
+"""Reads and writes settings of detectors, to repeat a run or to change it.
 
-The JSON file beside every result (`detected.log.json`) has the settings that it was detected with
-under ``settings``, one object for each kind: ``circles``, ``lines``, ``markers``. Files of settings
-are the same with nothing else in them; a kind that they lack, or a setting, is as it is by default.
+The JSON file beside every result (`detected.log.json`) contains its settings under ``settings``,
+one object for each kind: ``circles``, ``lines``, ``markers``. Settings files have the same form
+without other content; missing kinds and settings have their defaults.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class SettingsFile:
 
 
 def read_settings(path: Path) -> SettingsFile:
-    """Read settings from a JSON file, a log of detections or what `settings_text` gives.
+    """Read settings from a JSON file: a log of detections, or the output of `settings_text`.
 
     Raises
     ------
     DetectError
-        If it cannot be read, has no settings, or one that there is not or cannot be.
+        If it cannot be read, has no settings, or an unknown or invalid one.
     """
     try:
         with path.open("rb") as stream:
@@ -47,7 +47,7 @@ def read_settings(path: Path) -> SettingsFile:
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError:
-        raise DetectError(f"{path}: no JSON: expected settings, as in a .log.json") from None
+        raise DetectError(f"{path}: not JSON: expected settings, as in a .log.json") from None
     given = document.get("settings") if isinstance(document, dict) else None
     if not isinstance(given, dict):
         raise DetectError(f'{path}: no "settings": expected those of circles, lines or markers')
@@ -62,21 +62,21 @@ def read_settings(path: Path) -> SettingsFile:
 
 
 def checked_settings(name: str, values: Any, kind: type[Kind]) -> Kind:
-    """Settings from values of JSON; a DetectError if one is unknown, or cannot be."""
+    """Settings from JSON values; a DetectError if one is unknown or invalid."""
     if not isinstance(values, Mapping):
         raise DetectError(f"settings of {name}: expected names and values")
     return kind(**{key: setting_value(kind, key, value) for key, value in values.items()})
 
 
 def setting_value(kind: type, name: str, value: Any) -> Any:
-    """A value of JSON as that of a setting: a field of a dataclass.
+    """Convert a JSON value to that of a setting, a field of a dataclass.
 
-    Raises DetectError if there is no such field, or the value is of another type.
+    Raises DetectError if there is no such field, or the value has another type.
     """
     hints = get_type_hints(kind)
     if name not in hints:
         raise DetectError(
-            f"{name} is no parameter of {kind.__name__}: expected one of {', '.join(sorted(hints))}"
+            f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"
         )
     try:
         return _of_type(hints[name], value)
@@ -93,7 +93,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
 
 
 def _of_type(hint: Any, value: Any) -> Any:
-    """A value of JSON as one of a type; a TypeError if it is of another."""
+    """Convert a JSON value to a type; a TypeError if it has another one."""
     if get_origin(hint) is tuple and isinstance(value, list):
         inner = get_args(hint)
         each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
@@ -111,18 +111,18 @@ def _of_type(hint: Any, value: Any) -> Any:
 
 
 def word_value(kind: type, name: str, word: str) -> Any:
-    """A word of a command line or of a file's head as the value of a setting.
+    """Convert a word of a command line or of a file's head to the value of a setting.
 
-    Raises DetectError if it is none, or there is no such setting.
+    Raises DetectError if that fails, or there is no such setting.
     """
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
-    for number in (float, int):  # whole numbers are both
+    for number in (float, int):  # a float setting accepts whole numbers
         with suppress(ValueError):
             value = number(word)
     return setting_value(kind, name, value)
 
 
 def settings_text(**settings: CircleSettings | LineSettings | MarkerSettings) -> str:
-    """Content of a file of settings, by their kinds: circles, lines, markers."""
+    """Content of a settings file, by kind: circles, lines, markers."""
     content = {"settings": {kind: asdict(each) for kind, each in settings.items()}}
     return f"{json.dumps(content, indent=1)}\n"

@@ -1,12 +1,12 @@
-"""What the terminal shows of long work, and how it is interrupted from there.
+"""Messages and progress of long work on the terminal, and interrupts.
 
-Compilation of kernels and computation of tables are announced through the logger ``redetect``, so
-that a program that uses the detectors decides who hears it; the command line shows it on stderr.
+Compilation of kernels and computation of tables are announced through the logger ``redetect``,
+which other programs can configure; the command line shows it on stderr.
 
 Python raises an interrupt as an exception wherever it is executing. While a kernel is compiled, the
-exception may be swallowed: it is printed and ignored, or replaced by another one. So interrupts are
+exception may be lost: it is printed and ignored, or replaced by another one. So interrupts are
 recorded, and the record is checked after every frame. While processes are started or ended, an
-exception could leave a process half started: there an interrupt is deferred until that is done.
+exception could leave a process half started, so interrupts are deferred until that is done.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _waiting = threading.Event()
 
 @contextmanager
 def interrupts_call(note: Callable[..., object]) -> Iterator[None]:
-    """Have interrupts call something during a block; in threads but the main one, nothing does."""
+    """Let interrupts call a function during a block; without effect outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -44,7 +44,7 @@ def interrupts_call(note: Callable[..., object]) -> Iterator[None]:
 
 @contextmanager
 def interrupts_noted() -> Iterator[None]:
-    """Record interrupts during a block; whatever it raises after one becomes an interrupt."""
+    """Record interrupts during a block; any later exception in it becomes a KeyboardInterrupt."""
     _received.clear()
 
     def note(*_: object) -> NoReturn:
@@ -61,11 +61,11 @@ def interrupts_noted() -> Iterator[None]:
 
 @contextmanager
 def interrupts_deferred() -> Iterator[None]:
-    """Let interrupts wait until the end of a block, which is short, and raise them there.
+    """Defer interrupts to the end of a block, which should be short.
 
-    Processes started meanwhile inherit a blocked interrupt. That alone would not do: an interrupt
-    that this thread blocks is taken by another one, and raised in this one all the same. A block
-    that may take long calls `raise_if_interrupt_waits` now and then.
+    Processes started meanwhile inherit the blocked signal. Blocking alone is not sufficient: a
+    signal blocked in this thread is delivered to another one, and still raised in this one. Long
+    blocks call `raise_if_interrupt_waits` now and then.
     """
     before = signal.getsignal(signal.SIGINT)
     handled = threading.current_thread() is threading.main_thread() and callable(before)
@@ -92,7 +92,7 @@ def raise_if_interrupted() -> None:
 
 
 def raise_if_interrupt_waits() -> None:
-    """Raise an interrupt that is deferred, if there is one."""
+    """Raise a deferred interrupt, if there is one."""
     if _waiting.is_set() or signal.SIGINT in signal.sigpending():
         raise KeyboardInterrupt
 
@@ -118,12 +118,12 @@ def say_compiling() -> None:
 
 
 def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
-    """Have something called before this process compiles a kernel, until the result is called.
+    """Call a function before this process compiles a kernel; the result of this ends that.
 
-    If it raises, the kernel is not compiled.
+    If the function raises, the kernel is not compiled.
 
-    The compiler makes many objects and keeps most of them. Meanwhile Python does not search them
-    for cycles again and again, which would take a tenth of the time.
+    The compiler creates many objects and keeps most of them. Garbage collection is off meanwhile,
+    since it would take a tenth of the time.
     """
     from numba.core import event
 
@@ -150,10 +150,10 @@ _SHOWN_FAILURES = 10
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
-    """A progress bar with the rate, on a terminal; yields what to call after every frame.
+    """A progress bar with the rate, on a terminal; yields a function to call after every frame.
 
-    Calling it raises an interrupt that was lost (see `detect.terminal`). The bar appears with the
-    first frame: until then, workers may have something to say.
+    That function raises an interrupt that was lost (see `detect.terminal`). The bar appears with
+    the first frame, since workers may print messages until then.
     """
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted
@@ -170,7 +170,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
 
     def advance() -> None:
         raise_if_interrupted()
-        progress.start()  # nothing happens if it has
+        progress.start()  # no effect if already started
         speed = progress.tasks[0].finished_speed or progress.tasks[0].speed
         progress.update(task, advance=1, rate=f"{speed:.1f} images/s" if speed else "")
 
@@ -187,5 +187,5 @@ def report_failures(count: int, first: Sequence[str]) -> int:
     shown = [f"  {line}" for line in first[:_SHOWN_FAILURES]]
     if count > _SHOWN_FAILURES:
         shown.append(f"  and {count - _SHOWN_FAILURES} more")
-    print(f"{count} frames could not be worked on:", *shown, sep="\n", file=sys.stderr)
+    print(f"{count} frames could not be processed:", *shown, sep="\n", file=sys.stderr)
     return EXIT_FRAMES_FAILED

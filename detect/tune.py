@@ -47,7 +47,7 @@ def perform(options: Tune) -> int:
     output = run.output("tune") if options.output is None else options.output
     frames = SomeFrames(run.frames, every=options.every)
     if options.serve:
-        from detect.tuning_page import TuningSession, serve  # a server is needed for nothing else
+        from detect.tuning_page import TuningSession, serve  # nothing else needs a server
 
         session = TuningSession(run, list(frames), base, output, options.force)
         return serve(session, options.port)
@@ -104,16 +104,16 @@ def _name_and_values(word: str) -> tuple[str, str]:
 
 
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:
-    """The values of a parameter that are to be tried, each once.
+    """The values of a parameter to try, each once.
 
-    `text` is FROM:TO:STEP, both ends included, or values with commas between them; errors as those
-    of `word_value`.
+    `text` is FROM:TO:STEP, both ends included, or comma-separated values; errors as those of
+    `word_value`.
     """
     words = text.split(",")
     if ":" in text:
         expected = f"{name} is {text!r}: expected FROM:TO:STEP with a step above 0, TO not below"
         try:
-            # Decimal numbers: 0.3 and twice 0.1 are 0.5, and its digits are those of a file.
+            # Decimal numbers, so that 0.3 plus twice 0.1 is 0.5, with the digits of a file.
             first, last, step = (Decimal(part.strip()) for part in text.split(":"))
             if not (last - first).is_finite() or step <= 0 or not 0 <= (last - first) / step <= 1e5:
                 raise ValueError
@@ -127,7 +127,7 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises
-    DetectError if nothing is varied, or as `parameter_values` does.
+    DetectError if nothing is varied, and as `parameter_values` does.
     """
     if not varied:
         raise DetectError(
@@ -137,7 +137,7 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
 
 
-# Largest number of points that are labelled.
+# Largest number of labelled points.
 _MOST_NAMED = 12
 
 
@@ -152,7 +152,7 @@ def tune_run(
     """Detect discs in frames of a run with each setting, and compare them.
 
     `frames` come with their reference rows; `on_progress` is called after every frame of every
-    setting. Yields the comparison of each setting, and why frames could not be worked on: they
+    setting. Yields the comparison of each setting, and why frames could not be processed: these
     count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
@@ -173,7 +173,7 @@ def tune_run(
 
 
 def figures_of(result: DiscComparison) -> dict[str, Any]:
-    """What a table has of a comparison; `matched` are the reference rows that were found."""
+    """A comparison's figures for the table; `matched` are the reference rows that were found."""
     figures = {
         "reference": result.reference,
         "detected": result.detected,
@@ -198,13 +198,13 @@ def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) indices of settings that none beats in recall or precision without losing in the other.
+    """(M,) indices of the settings on the Pareto front of recall and precision.
 
-    By rising recall; of equals the first. Recalls and precisions (N,) are NaN where there are none.
+    By increasing recall; of equals the first. Recalls and precisions (N,) are NaN if undefined.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
-    # By falling recall, then falling precision: points no better than before are dominated.
+    # By decreasing recall, then precision: points no better than those before are dominated.
     order = known[np.lexsort((known, -p[known], -r[known]))]
     before = np.maximum.accumulate(np.concatenate([[-np.inf], p[order]]))[:-1]
     return order[p[order] > before][::-1]
@@ -215,8 +215,8 @@ def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
 
     That is the point of the front farthest beyond the chord between the front's ends, both axes
     scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
-    Haystack, 2011). Where no point is beyond it, there is no knee, and the point with the greatest
-    harmonic mean of recall and precision is used instead.
+    Haystack, 2011). If no point is beyond the chord, there is no knee, and the point with the
+    largest harmonic mean of recall and precision is used instead.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     front = pareto_front(r, p)
@@ -257,7 +257,7 @@ def curve_picture(records: Sequence[dict[str, Any]], varied: Iterable[str], titl
 
 
 def _rates(records: Sequence[dict[str, Any]]) -> tuple[FloatArray, FloatArray]:
-    """(N,) recall and precision, NaN where there is none."""
+    """(N,) recall and precision, NaN if undefined."""
     rates = [(each["recall"], each["precision"]) for each in records]
     recall, precision = np.array(rates, np.float64).reshape(-1, 2).T
     return recall, precision

@@ -1,9 +1,9 @@
-"""A page to turn knobs: an image of a run, its discs under the settings of the moment, and why.
+"""A page for tuning: an image of a run, its discs with the current settings, and explanations.
 
-``detect tune RUN --serve`` starts a server of the standard library for one person's browser on the
-same machine. It listens on the loopback alone, and answers only who knows the token in the page's
-address and asks for this machine by name: no other user, and no other page in the browser, gets
-anything. What is detected is what every other command would detect.
+``detect tune RUN --serve`` starts a server of the standard library for one browser on the same
+machine. It listens on the loopback interface only, and answers only requests with the token of the
+page's address and this machine's name as host: other users, and other pages in the browser, get no
+access. Detections are the same as those of all other commands.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ from redetect.storage.messages import OneLineError
 SETTINGS_NAME, LABELS_NAME = "tuned.json", "labels.circles"
 #: Longest request: some hundred settings, and labels of every frame.
 _LONGEST_BYTES = 1 << 22
-#: Points of an outline, and half axes of an ellipse in standard deviations.
+#: Number of points of an outline, and semi-axes of an ellipse in standard deviations.
 _OUTLINE, _SIGMAS = 32, 3.0
 _LABELS_HEAD = "Discs with identifiers given by hand, on the page of `detect tune --serve`."
 
 
 @dataclass
 class TuningSession:
-    """What the page shows and saves; its methods may be called by several threads."""
+    """Data that the page shows and saves; methods may be called by several threads."""
 
     run: Run
     frames: Sequence[RunFrame]
@@ -66,7 +66,7 @@ class TuningSession:
         return read_image(self.frames[number], self.run.camera)
 
     def described(self) -> dict[str, Any]:
-        """What the page has to know of the run."""
+        """Description of the run for the page."""
         camera = self.run.camera
         return {
             "name": self.run.name,
@@ -79,7 +79,7 @@ class TuningSession:
         }
 
     def detect(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The discs of a frame under some settings, and the candidates that are none."""
+        """The discs of a frame with some settings, and the rejected candidates."""
         settings = checked_settings("circles", values, CircleSettings)
         plan = FramePlan(self.run.camera, circles=settings, levelling="none")
         (frame,) = detect_batch([FrameTask(self.frames[number])], plan)
@@ -113,7 +113,7 @@ class TuningSession:
         return [[float(u), float(v)] for u, v in places if math.isfinite(u)]
 
     def save(self, values: Mapping[str, Any], labels: Mapping[str, Any]) -> list[str]:
-        """Write the settings, and the labels of frames by their numbers; what was written."""
+        """Write the settings, and the labels of frames by number; returns messages."""
         settings = checked_settings("circles", values, CircleSettings)
         contents = {SETTINGS_NAME: settings_text(circles=settings).encode()}
         labelled = {int(number): [_label(one) for one in some] for number, some in labels.items()}
@@ -126,7 +126,7 @@ class TuningSession:
             self.output.mkdir(parents=True, exist_ok=True)
             for name, content in contents.items():
                 path = self.output / name
-                # What the page itself wrote it writes again as often as it is asked to.
+                # Files written by the page itself may be replaced any time.
                 if path.exists() and path not in self._saved and not self.force:
                     raise OutputExistsError(path)
                 write_bytes(path, content, overwrite=True)
@@ -135,7 +135,7 @@ class TuningSession:
 
 
 def _label(values: Mapping[str, Any]) -> CircleLandmark:
-    """The row of a disc with the identifier that a person gave it."""
+    """The row of a disc with an identifier assigned by hand."""
     try:
         numbers = {name: float(value) for name, value in values.items() if name != "id"}
         return CircleLandmark(**numbers, ids=(int(values["id"]),))
@@ -167,10 +167,10 @@ class TuningServer(ThreadingHTTPServer):
 class _Handler(BaseHTTPRequestHandler):
     server: TuningServer
     protocol_version = "HTTP/1.1"
-    timeout = 60  # of a connection on which nothing comes
+    timeout = 60  # of an idle connection, seconds
 
     def log_message(self, *_: Any) -> None:
-        """The terminal is for what the person has to know."""
+        """Keep requests off the terminal."""
 
     def do_GET(self) -> None:
         """The page, or the image of a frame."""
@@ -212,14 +212,14 @@ class _Handler(BaseHTTPRequestHandler):
         number = int(word)
         if not 0 <= number < len(self.server.session.frames):
             raise DetectError(
-                f"{number} is no frame: expected 0 to {len(self.server.session.frames) - 1}"
+                f"no frame {number}: expected 0 to {len(self.server.session.frames) - 1}"
             )
         return number
 
     def _allowed(self, token: str) -> bool:
-        """Whether the request has the token, and asks for this machine by its own name.
+        """Whether the request has the token, and this machine's own name as host.
 
-        Another page can make a name of its own point here; then the browser says that name.
+        Another page can make its own host name point here; then the request has that name.
         """
         host = self.headers.get("Host", "").rpartition(":")[0]
         known = hmac.compare_digest(token.encode(), self.server.token.encode())

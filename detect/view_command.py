@@ -1,4 +1,4 @@
-"""The command ``detect view``: drawn frames, and the floor, over time, for Rerun."""
+"""The command ``detect view``: frames with landmarks, and the floor, over time, in Rerun."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from redetect.landmarks.map_file import read_map, read_path
 from redetect.storage import demand_place, write_bytes
 
 _EDGE, _LINE, _MAP = (255, 170, 0), (60, 220, 60), (80, 140, 220)
-# Times of this and more are assumed to be UNIX time: no recording is three years long.
+# Times from this value on are assumed to be UNIX time: no recording is three years long.
 _EARLIEST_DATE_S = 1e8
 
 
@@ -74,12 +74,12 @@ def perform(options: View) -> int:
         recording.disconnect()
         if options.output is not None:
             write_bytes(options.output, raw.read_bytes(), overwrite=options.force)
-            print(f"{options.output}: open it by: rerun {options.output}")
+            print(f"{options.output}: open it with: rerun {options.output}")
     return report_failures(len(failures), failures)
 
 
 def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """The robot's poses, and the places of the map's landmarks."""
+    """The robot's poses, and the positions of the map's landmarks."""
     poses = summed_steps(steps)
     if options.path is not None:
         poses = read_path(options.path).poses
@@ -95,13 +95,13 @@ def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, Floa
 
 
 def _clock(time_s: float) -> dict[str, float]:
-    """A frame's time as Rerun wants it: a date where it can be one, else seconds since a start."""
+    """A frame's time for Rerun: a date if possible, else seconds since a start."""
     return {"timestamp" if time_s >= _EARLIEST_DATE_S else "duration": time_s}
 
 
 def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius_m: float) -> None:
     x, y, theta = pose.tolist()
-    # As a quaternion: with an axis, Rerun 0.23 needs a NumPy that it does not demand.
+    # As a quaternion: with an axis, Rerun 0.23 needs a newer NumPy than it requires.
     turn = [0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta)]
     recording.log("world/robot", rr.Transform3D(translation=[x, y, 0.0], quaternion=turn))
     # Forward is -Y.
@@ -122,13 +122,13 @@ def _show(recording: Any) -> None:
         recording.spawn()
     except RuntimeError:
         raise DetectError(
-            "Rerun's viewer cannot be started: expected the program `rerun` on the PATH, which the "
-            "package rerun-sdk brings; or name a recording to write by -o and open it elsewhere"
+            "Rerun's viewer cannot be started: expected the program `rerun` of the package "
+            "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
         ) from None
 
 
 def _rerun() -> Any:
-    """The package of Rerun, which sends nothing home from here."""
+    """The package of Rerun, with its telemetry disabled."""
     os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
     with imported_for("detect view needs the package rerun-sdk", "view"):
         import rerun

@@ -108,4 +108,4 @@ def test_a_viewer_that_is_not_there_is_told(
     monkeypatch.setattr(rerun.RecordingStream, "spawn", nowhere)
     shutil.copy("ids/map.circles", "calibrated/detected.circles")
     assert main(["view", "calibrated"]) == 1
-    assert "name a recording to write by -o" in capsys.readouterr().err
+    assert "write a recording with -o" in capsys.readouterr().err

@@ -1,11 +1,11 @@
 """Compares detected discs, or lines, with reference rows of the same run.
 
-Whether the same disc is seen is one question; where on the floor each side puts it is a second one,
-answered twice: as the rows are, and levelled alike, by the tilt that levelled the detected ones.
+Discs are paired in the image, where they were seen, or on the floor; lines by bearing. Differences
+of paired discs on the floor are given twice: as the rows are, and after levelling both by the tilt
+that levelled the detected ones.
 
-Discs are paired in the image, each where it was seen, or on the floor; lines by bearing. A detected
-line can represent several that were joined: unpaired reference lines within its sigma are found,
-too.
+A detected line can represent several that were joined: unpaired reference lines within its sigma
+count as found, too.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from redetect.storage.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
 _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
-# Files hold six digits: a smaller sigma is no statement about a bearing.
+# Files have six digits: a smaller sigma is meaningless.
 LEAST_SIGMA_RAD = 1e-12
 
 
@@ -70,8 +70,8 @@ def compare_with_file(
 ) -> Comparison:
     """Compare discs, or lines, with those of a reference file.
 
-    The rest as in `compare_frames`; look-alikes, and by default unlisted ones, are those in the
-    reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
+    Other parameters as in `compare_frames`; look-alikes, and by default unlisted rows, are those in
+    the reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
     """
     names = names or (str(reference), "detected")
     wanted = read_frames(reference)
@@ -106,13 +106,13 @@ def compare_frames(
     reference, detected : iterable of Frame
     options : CompareOptions, optional
     sight : Sight, optional
-        How rows come back into the images; without it, they are compared on the floor.
+        Maps rows into the images; without it, they are compared on the floor.
     unlisted : iterable of Frame, optional
-        Discs that may be detected but need not be: rows on them are neither right nor wrong.
+        Discs that may be detected but need not be: rows matching them are neither right nor wrong.
     lookalikes : iterable of Frame, optional
-        Rows on what looks like a disc are extra, and counted apart.
+        Known look-alikes of discs: rows that match them are extra, and counted separately.
     names : (str, str)
-        What messages call the two sets.
+        Names of the two sets in messages.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def compare_frames(
     match = partial(match_runs, "circles", wanted, found, options, names, unlisted=unlisted)
     common = match(sight)
     if sight is not None and not sight.reference_level:
-        # A file need not say that its rows are level: then they are in the images where these are.
+        # A file need not state that its rows are level: then the matches in the images decide.
         level_sight = replace(sight, reference_level=True)
         as_level = match(level_sight)
         if _image_cost(as_level["frames"]) < _image_cost(common["frames"]):
@@ -164,7 +164,7 @@ def compare_frames(
 
 
 def _image_cost(matches: Iterable[FrameMatch]) -> float:
-    """Squared distances of matched discs in the images, in gates, and what was not matched."""
+    """Sum of squared distances of matched discs in the images, in gates, and unmatched rows."""
     costs = [
         len(m.missed) + np.fmin((apart_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
     ]
@@ -172,13 +172,13 @@ def _image_cost(matches: Iterable[FrameMatch]) -> float:
 
 
 def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
-    """How many positions are farther away than all of those that are known."""
+    """Number of positions that are farther away than all known ones."""
     farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
     return int((np.linalg.norm(xy, axis=1) > farthest).sum())
 
 
 def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatArray:
-    """(M, 2) where discs of the reference are on the floor if levelled as the detected ones."""
+    """(M, 2) floor positions of reference discs, levelled as the detected ones are."""
     xy = circle_arrays(reference).xy
     return xy if view is None else view.levelled_alike(xy)
 
@@ -246,7 +246,7 @@ def _distance_bin(
 def _on_lookalikes(
     matches: Sequence[FrameMatch], lookalikes: Iterable[Frame] | None, options: CompareOptions
 ) -> int | None:
-    """How many extra rows are on look-alikes; None where these are not known."""
+    """Number of extra rows on look-alikes; None if these are not known."""
     if lookalikes is None:
         return None
     known = {image_name(frame.step.prefix): frame.circles for frame in lookalikes}
@@ -259,12 +259,12 @@ def _on_lookalikes(
 
 #: Of discs that are compared on the floor, where nothing else is said (m).
 FLOOR_GATE_M = 0.10
-# Equally good pairs of lines must not depend on the file's order.
+# Breaks ties between pairs of lines, so that the result does not depend on the file's order.
 _line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
 
 
 def frames_by_image(frames: Iterable[Frame], name: str) -> dict[str, Frame]:
-    """Frames by the names of their images; CompareError calls the run `name` if one has two."""
+    """Frames by the names of their images; a CompareError naming the run if an image has two."""
     by_image: dict[str, Frame] = {}
     for frame in frames:
         image = image_name(frame.step.prefix)
@@ -285,7 +285,7 @@ def match_runs(
 ) -> dict[str, Any]:
     """Match the rows of two runs, image by image: the fields of a `Comparison`.
 
-    Images are in the order of the reference; those that only one run has do not count.
+    Images are in the order of the reference; those in only one run are ignored.
     """
     images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
@@ -326,9 +326,9 @@ def match_frame(
 ) -> FrameMatch:
     """Match the discs or the lines of one image one to one.
 
-    `frames` are those of the reference, of the detected rows and of what is unlisted; one that is
-    None has no rows. Detected rows that fit an unlisted disc or line (or a reference row without
-    ID, if these do not count), and no reference row that counts, are set aside.
+    `frames` are those of the reference, of the detected and of the unlisted rows; None means no
+    rows. Detected rows that match an unlisted disc or line (or a reference row without ID, if these
+    do not count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if kind == "circles":
@@ -375,7 +375,7 @@ def pair_discs(
 ) -> Association:
     """Pair discs of one frame one to one: as many as possible, with least squared distances.
 
-    In the image where there is a view, unless the options ask for the floor.
+    They are paired in the image if there is a view, unless the options demand the floor.
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and options.gate_m is None:
@@ -403,7 +403,7 @@ def pair_lines(
 
 
 def apart_px(match: FrameMatch) -> FloatArray:
-    """(M,) distances of matched discs in the image; NaN where one is not seen."""
+    """(M,) distances of matched discs in the image; NaN if one is not visible."""
     view = match.view
     assert view is not None
     first, second = (circle_arrays(rows).xy for rows in (match.wanted, match.matched))
@@ -416,5 +416,5 @@ def numbers(rows: Sequence[Any], name: str) -> FloatArray:
 
 
 def _turns(reference: Sequence[LineLandmark], detected: Sequence[LineLandmark]) -> FloatArray:
-    """(N, M) bearings of detected lines less those of reference lines (rad)."""
+    """(N, M) bearings of detected lines minus those of reference lines (rad)."""
     return wrap_angle(numbers(detected, "alpha") - numbers(reference, "alpha")[:, np.newaxis])

@@ -28,7 +28,7 @@ def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     result = comparison_of(command)
     if isinstance(result, DiscComparison) and not (result.in_image or command.matching.gate_m):
-        print("no calibration: positions are compared on the floor; --camera names one")
+        print("no calibration: positions are compared on the floor; give one by --camera")
     Console().print(comparison_tables(result))
     if command.json is not None:
         write_bytes(command.json, result.to_json().encode(), overwrite=command.force)
@@ -39,19 +39,19 @@ def perform(command: Compare) -> int:
     ):
         if least is not None and (value is None or value < least):
             shown = "unknown" if value is None else f"{value:.4f}"
-            print(f"{name} is {shown}: at least {least:g} demanded", file=sys.stderr)
+            print(f"{name} is {shown}: expected at least {least:g}", file=sys.stderr)
             code = EXIT_ERROR
     return code
 
 
 def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
-    """The comparison that a command asks for; with a camera, if it isn't named by its file."""
+    """The comparison for a command; `camera` replaces the file that the command names."""
     kind: Kind = "lines" if command.lines else "circles"
     reference = command.reference or command.run / f"map.{kind}"
     detected = command.detected or command.run / f"detected.{kind}"
     for path, advice in (
         (reference, "give the reference rows with --reference"),
-        (detected, f"`detect {kind}` writes it, --detected names another"),
+        (detected, f"`detect {kind}` writes it, or give another with --detected"),
     ):
         if not path.exists():
             raise DetectError(f"{path}: no such landmark file: {advice}")
@@ -74,7 +74,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
 
 
 class FigureTable(NamedTuple):
-    """Figures as words in rows, for a terminal or a page."""
+    """A table of formatted figures, for a terminal or a page."""
 
     caption: str
     head: tuple[str, ...]
@@ -103,7 +103,7 @@ def comparison_tables(comparison: Comparison) -> Group:
 
 
 def summary_rows(c: Comparison) -> dict[str, str]:
-    """Every figure that is a number or a word, by its name in the JSON; no options."""
+    """All figures that are numbers or words, by their names in the JSON, without options."""
     rows = {}
     for name, value in c.figures().items():
         if name == "options":
@@ -116,7 +116,7 @@ def summary_rows(c: Comparison) -> dict[str, str]:
 
 
 def _shown(figure: Any) -> str | None:
-    """A figure in words, names of frames as their number; None for a table."""
+    """A formatted figure, for a list of frames their number; None for a table."""
     if isinstance(figure, list):
         if figure and isinstance(figure[0], dict):
             return None

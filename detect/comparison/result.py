@@ -19,23 +19,23 @@ from redetect.landmarks import is_positive_definite, squared_mahalanobis
 
 Kind = Literal["circles", "lines"]
 
-#: How many of the worst frames are listed.
+#: Number of worst frames to list.
 WORST_FRAMES = 10
 
 
 class FrameMatch(NamedTuple):
-    """Which rows of one frame belong together, all discs or all lines."""
+    """Matching rows of one frame, all discs or all lines."""
 
     name: str  # of the image
-    view: Sight | None  # how discs come back into it; None: compared on the floor
-    detected: Sequence[Any]  # all of these rows
-    wanted: list[Any]  # reference rows that are matched, and the detected row of each:
+    view: Sight | None  # maps discs into it; None: compared on the floor
+    detected: Sequence[Any]  # all detected rows
+    wanted: list[Any]  # matched reference rows, and the detected row of each:
     matched: list[Any]  # no row is in two pairs
-    joined: list[Any]  # reference rows that a matched line represents, too
+    joined: list[Any]  # further reference rows that a matched line represents
     missed: list[Any]
     extra: list[Any]
-    set_aside: list[Any]  # detected rows that fit something that does not count
-    #: Of any pair: distance on the floor, both rows levelled alike (m), or difference in bearing
+    set_aside: list[Any]  # detected rows that match something that does not count
+    #: Over all pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
     #: (deg).
     largest_error: float | None
 
@@ -70,8 +70,8 @@ class FloorDifference:
 class DistanceBin:
     """Discs at a range of forward distances (m), open at an end that is None.
 
-    Differences are of matched discs on the floor, as their rows are and levelled alike; the latter
-    are None where all rows are levelled alike to begin with.
+    Differences are those of matched discs on the floor, as the rows are and levelled alike; the
+    latter are None if all rows are levelled alike already.
     """
 
     from_m: float | None
@@ -99,12 +99,12 @@ class DiscPairs:
     reference_xy: FloatArray  # (N, 2)
     as_written: FloatArray  # (N, 2) detected minus reference positions
     offset: FloatArray  # (N, 2) the same, both levelled alike: the errors
-    covariance: FloatArray  # (N, 2, 2) what errors are measured in
-    away: FloatArray  # (N, 2) unit vectors along which the camera sees them
+    covariance: FloatArray  # (N, 2, 2) for normalised errors
+    away: FloatArray  # (N, 2) unit vectors of the viewing directions
 
     @property
     def levelled_apart(self) -> bool:
-        """Whether some rows are not levelled alike as they are written."""
+        """Whether some rows are not levelled alike in the files."""
         return not np.array_equal(self.as_written, self.offset)
 
 
@@ -121,12 +121,12 @@ class LinePairs:
 class Comparison(ABC):
     """How a run's detected rows compare with reference rows.
 
-    Figures are None where there are no rows to compute them from. Rows are counted as in
-    `FrameMatch`; `found` ones were matched or joined. Recall and precision are the shares of the
-    reference rows that were found, and of the detected rows that were matched.
+    Figures are None if there are no rows to compute them from. Rows are counted as in `FrameMatch`;
+    `found` rows were matched or joined. Recall is the share of reference rows that were found,
+    precision the share of detected rows that were matched.
     """
 
-    what: ClassVar[str]  # that is compared
+    what: ClassVar[str]  # the landmarks that are compared
     unit: ClassVar[str]  # of `FrameMatch.largest_error`
     counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
 
@@ -150,7 +150,7 @@ class Comparison(ABC):
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
     def sentences(self) -> tuple[str, ...]:
-        """Four of them: found and missed, what else is there, errors, covariances."""
+        """Four sentences: found and missed rows, extra rows, errors, covariances."""
         found = (
             f"{self.found} of {self.reference} {self.what} of the reference are found, "
             f"{self.missed} missed, in {len(self.frames)} frames."
@@ -167,18 +167,18 @@ class Comparison(ABC):
         return found, extra, self._errors(), _agreement(self.normalised_error)
 
     def _beyond(self) -> str:
-        """More on extra rows where look-alikes are not known."""
+        """More on extra rows if look-alikes are not known."""
         return " (look-alikes are not known)"
 
     @abstractmethod
     def _errors(self) -> str:
-        """How large errors are."""
+        """A sentence on the errors."""
 
     def figures(self) -> dict[str, Any]:
-        """All figures by name, for JSON: the same names in the same order.
+        """All figures by name, for JSON: always the same names in the same order.
 
-        Lengths are in metres, angles in degrees. Of the frames, the worst are listed, and those
-        that only one file has.
+        Lengths are in metres, angles in degrees. The worst frames are listed, and frames that are
+        in only one file.
         """
         figures = {f.name: getattr(self, f.name) for f in fields(self)}
         figures |= {
@@ -204,7 +204,7 @@ class Comparison(ABC):
         return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
 
     def worst_frames(self, count: int) -> list[FrameMatch]:
-        """The frames with most missed and extra rows; of equals, with the largest error first."""
+        """The frames with most missed and extra rows; ties are broken by the largest error."""
 
         def order(match: FrameMatch) -> tuple[float, float, str]:
             wrong = len(match.missed) + len(match.extra)
@@ -222,13 +222,13 @@ class DiscComparison(Comparison):
     error_median_m: float | None
     error_95_m: float | None
     bins: tuple[DistanceBin, ...]
-    extra_beyond: int  # extra rows that are farther away than all that are on a reference row
+    extra_beyond: int  # extra rows farther away than all matched ones
     in_image: bool
     image_median_px: float | None
     image_95_px: float | None
-    reference_levelled: int  # frames whose rows are levelled by a tilt
+    reference_levelled: int  # number of reference frames with rows levelled by a tilt
     detected_levelled: int
-    reference_level: bool  # its other rows are level, too: it says so, or they fit the images so
+    reference_level: bool  # whether its other rows are level, too, as stated or by the images
     pairs: DiscPairs = field(repr=False)
 
     def _beyond(self) -> str:
@@ -247,7 +247,7 @@ class DiscComparison(Comparison):
 
 @dataclass(frozen=True)
 class LineComparison(Comparison):
-    """How a run's detected lines compare with reference rows: differences without sign."""
+    """How a run's detected lines compare with reference rows: absolute differences."""
 
     what, unit = "verticals", "deg"
     counts = ("matched", "joined", "missed", "extra")
@@ -273,10 +273,10 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def _agreement(error: NormalisedError) -> str:
-    """Whether errors are as large as covariances say."""
+    """A sentence on whether errors agree with the covariances."""
     if error.per_dof is None:
-        return "There are no errors to hold against the stated covariances."
-    figure = f"the squared error is {error.per_dof:.2f} of what they state"
+        return "There are no errors to compare with the stated covariances."
+    figure = f"the mean squared normalised error is {error.per_dof:.2f}"
     if 0.67 <= error.per_dof <= 1.5:
         return f"The errors agree with the stated covariances: {figure}."
     size = "small" if error.per_dof > 1.5 else "large"
@@ -305,7 +305,7 @@ def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedEr
 
 
 def floor_difference(offset: FloatArray, away: FloatArray) -> FloorDifference:
-    """Figures of differences (N, 2) on the floor (m), seen along unit vectors `away` (N, 2)."""
+    """Figures of differences (N, 2) on the floor (m), with unit viewing vectors `away` (N, 2)."""
     size = np.asarray(np.linalg.norm(offset, axis=1))
     return FloorDifference(
         pairs=len(offset),

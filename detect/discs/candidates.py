@@ -1,4 +1,4 @@
-"""Candidates for discs: the best of the centres of a good quality that are near to each other."""
+"""Non-maximum suppression: keeps the best of centres that are close to each other."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from redetect.compiled import kernel
 
 
 def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
-    """(H, W) pixels of a map of at least `threshold` that none of their 8 neighbours exceeds.
+    """(H, W) mask of pixels of at least `threshold` that none of their 8 neighbours exceeds.
 
-    Connected pixels of equal quality are one maximum, at the one nearest to their centroid: a
-    plateau is neither lost nor found twice. A quality of 0 is none.
+    Connected pixels of equal quality are one maximum, at the pixel nearest to their centroid: a
+    plateau is neither lost nor found twice. Pixels of quality 0 are never maxima.
     """
     around = np.ones((3, 3), np.uint8)
     quality = np.where((quality >= threshold) & (quality > 0.0), quality, 0.0)
     highest = (quality > 0.0) & (quality >= cv2.dilate(quality, around))
     while True:
-        # Of a plateau that touches something higher, pixel by pixel all are lost.
+        # A plateau that touches a higher pixel is removed, pixel by pixel.
         lost = cv2.dilate(np.where(highest, 0.0, quality), around)
         if not np.any(highest & (lost >= quality)):
             break
@@ -40,9 +40,9 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
 
 
 def suppress_neighbours(floor_xy: FloatArray, score: FloatArray, separation: float) -> BoolArray:
-    """(N,) which of floor positions (N, 2) to keep so that no two are closer than `separation` (m).
+    """(N,) mask of floor positions (N, 2) to keep so that no two are closer than `separation` (m).
 
-    The best by score stay; of equal ones the first.
+    Those with the highest scores are kept; of equal scores the first.
     """
     order = np.argsort(-score, kind="stable")
     kept = np.zeros(len(score), np.bool_)
@@ -52,7 +52,7 @@ def suppress_neighbours(floor_xy: FloatArray, score: FloatArray, separation: flo
 
 @kernel()
 def apart(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
-    """Those of some positions, in this order, that are not nearer than this to one kept before."""
+    """Indices, in this order, of positions at least `separation` away from all kept before."""
     kept, count = np.empty(len(order), np.int64), 0
     x, y = np.empty(len(order)), np.empty(len(order))
     for i in order:
@@ -71,10 +71,10 @@ def alone_published(
     pixels: IntArray, quality: FloatArray, floor_xy: Float32Array,
     separation: float,
 ) -> BoolArray:  # fmt: skip
-    """(N,) which centres, in scan order, have none of a higher quality nearby.
+    """(N,) mask of centres, in scan order, without a centre of higher quality nearby.
 
-    Of centres of the same quality, the first stays that has none nearby that stays. Nearby is
-    nearer than `separation` (m) on the floor, which pixels see at `floor_xy` (H, W, 2).
+    A centre is dropped, too, if an earlier one of equal quality nearby is kept. Nearby means closer
+    than `separation` (m) on the floor; `floor_xy` (H, W, 2) is the floor position of each pixel.
     """
     kept = np.ones(len(quality), np.bool_)
     x, y = np.empty(len(quality)), np.empty(len(quality))

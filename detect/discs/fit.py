@@ -1,30 +1,30 @@
-"""Where a disc is exactly: the fit of a disc through the camera to the grey values.
+"""Fits a disc, seen through the camera, to the grey values of an image.
 
-A blurred disc is fitted to the pixels about it in one of two ways. As a whole, on a background with
-a slope and saddle terms (x^2 - y^2 and x y), which let light fall off without imitating a disc:
+A blurred disc is fitted to the pixels around it in one of two ways. As a whole, on a background
+with slope and saddle terms (x^2 - y^2 and x y): uneven light, which cannot imitate a disc:
 
     grey = outside + slope . (x, y) + saddle + contrast * W(x, y, radius, blur)
 
-Or by parts, for what hides, stains or lights a disc in part pulls at the fit of the whole: in each
-of 16 sectors s the pixels about the edge have grey levels of their own,
+Or by parts, since partial occlusion, stains and uneven light bias the fit of the whole: each of 16
+sectors s has grey levels of its own for the pixels about the edge,
 
     grey = outside_s + contrast_s * W(x, y, radius, blur) + ramp_s * (r - radius) * grey
 
-and light may change round the disc as it likes, and rise or fall across the edge. W is the share of
-the disc that a pixel sees (`detect.discs.model`). Everything but W is linear and eliminated in
-every Gauss-Newton step (G. H. Golub and V. Pereyra, SIAM J. Numerical Analysis 10, 1973). What
-remains are the normal equations of centre, radius, and the blur along either axis of the image, for
-movement blurs along one. Radius and logarithms of the blur are normally distributed beforehand.
+so light may vary freely around the disc, and rise or fall across the edge. W is the share of the
+disc that a pixel sees (`detect.discs.model`). All parameters but those of W are linear and are
+eliminated in every Gauss-Newton step (G. H. Golub and V. Pereyra, SIAM J. Numerical Analysis 10,
+1973). The normal equations of centre, radius, and the blur along either image axis remain (motion
+blurs along one of them). Radius and the logarithms of the blur have Gaussian priors.
 
-A sector counts less if the model does not explain it, and if it shows the edge elsewhere than the
-others do: something else's edge. In those that count, pixels count less that the model does not
-explain: a cable's, or a stain's. These weights are Tukey's biweights, found anew in every step
-(A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
+A sector has a lower weight if the model does not explain it, or if its edge is offset from that of
+the others and so belongs to another object. Within the remaining sectors, pixels with large
+residuals (a cable, a stain) have lower weights. The weights are Tukey's biweights, recomputed in
+every step (A. E. Beaton and J. W. Tukey, Technometrics 16, 1974).
 
-The errors of neighbouring pixels are not independent where the model does not fit. For the whole
-disc the correlation of its residuals says how much fewer they count. By parts, those of sectors
-apart from each other nearly are independent: the covariance is that of the noise and that of the
-jackknife, leaving out neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989).
+Errors of neighbouring pixels are correlated where the model does not fit. For the whole disc, the
+correlation of the residuals gives the effective number of pixels. By parts, sectors far from each
+other are nearly independent: the covariance is that of the noise plus that of the jackknife that
+leaves out neighbouring sectors in turn (H. R. Kuensch, Annals of Statistics 17, 1989).
 """
 
 from __future__ import annotations
@@ -66,57 +66,57 @@ from detect.discs.rim import median
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Terms of the normal equations: light that is the same for all pixels, that of each sector, the
-#: disc; last the grey values. The fit by parts begins with `OUTSIDE`.
+#: Terms of the normal equations: light common to all pixels, light of each sector, the disc, and
+#: last the grey values. The fit by parts begins with `_OUTSIDE`.
 _SADDLE, _SADDLE_XY, _SLOPE_Y = range(3)
 _OUTSIDE, _SLOPE, _CONTRAST, _BLUR_1, _BLUR_2, _RADIUS, _X, _Y, _GREY = range(3, 12)
 _TERMS = 12
 
-#: Steps of the fit; the first ones leave no sector out, for the start may be off.
+#: Steps of the fit; the first ones reject no sector, since the start may be off.
 _STEPS, _EARLY = 12, 1
-#: A shorter step is the last, nominal radii.
+#: The iteration stops after a shorter step, nominal radii.
 _ARRIVED = 5e-3
 #: Longest step, nominal radii (and log blur).
 _LONGEST, _LONGEST_BLUR = 0.2, 0.7
-#: The fit by parts ends at most this far from where it starts, radii.
+#: Largest offset of a fit by parts from its start, radii.
 _MOST_OFF = 0.3
-#: Limits of what a fit may come to; the blur in pixels, the radius in nominal ones.
+#: Bounds of the blur, pixels, and of the radius, nominal radii.
 _LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
 _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
-#: A flat disc's blur may grow from the one its pixels were gathered for by this factor, and pixels.
+#: Bound of a flat disc's blur: this factor of the blur for which pixels were gathered, plus pixels.
 _MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
-#: The usual blur in pixels, and the standard deviation of its logarithm.
+#: Prior of the blur, pixels, and the standard deviation of its logarithm.
 _BLUR_PX, _BLUR_SIGMA = 0.6, 0.7
-#: Grey values are rounded: noise is never below this.
+#: Lower bound of the noise, since grey values are rounded.
 _LEAST_NOISE = 0.3
-#: Least pixels of a sector, spread of the shares in it, and contrast relative to the median.
+#: Lower bounds of a sector: pixels, spread of its shares, contrast relative to the median.
 _LEAST_PIXELS, _LEAST_SPREAD, _LEAST_CONTRAST = 6.0, 0.15, 0.4
 #: Standard deviation of the ramp of the light across the edge, relative, per radius.
 _RAMP_SIGMA = 0.5
-#: Least number of sectors, and the weight from which one counts.
+#: Least number of sectors, and the weight from which a sector counts.
 _LEAST_SECTORS, _COUNTS = 5, 0.1
-#: An edge this many deviations off the others has no weight; the least deviation, pixels.
+#: Offset of an edge at which its weight is 0, deviations; lower bound of the deviation, pixels.
 _FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
-#: Before that, one this many deviations off has half the weight.
+#: Offset of an edge at which its weight is one half, in the early steps, deviations.
 _FAR_EARLY = 2.0
-#: A pixel that is this many deviations off what its sector shows has no weight; and which share
-#: this leaves of the variance of normally distributed errors.
+#: Residual of a pixel at which its weight is 0, deviations; the share of the variance of Gaussian
+#: errors that the weights leave.
 _FAR_PIXEL, _SHARE_LEFT = 4.0, 0.77
-#: What it counts nevertheless, for its residual to be known.
+#: Lower bound of a pixel's weight, so that its residual can be recovered.
 _LEAST_TRUST = F32(1e-3)
-#: Sectors that are left out at a time for the covariance, for neighbours err alike; and by how much
-#: the variance is larger than what that gives.
+#: Number of neighbouring sectors that the jackknife leaves out at a time, since their errors are
+#: correlated; inflation of its variance.
 _STRETCH, _INFLATION = 3, 1.6
 
 _MIDDLES = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
 _COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
 
-#: What the fits of one image work in, from one to the next. What is left there does not matter.
+#: Working space of fits, reused from one to the next. Its contents need not be initialised.
 WORK = np.dtype([("patch", PATCH), ("rows", np.float32, (_TERMS, CAPACITY))])
 
 
 class Scene(NamedTuple):
-    """An image, and how discs are placed in it."""
+    """An image and what its fits need."""
 
     image: GreyImage
     floor_xy: Float32Array
@@ -127,7 +127,7 @@ class Scene(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where a fit starts; lengths in metres."""
+    """Initial values of a fit; lengths in metres."""
 
     x: float
     y: float
@@ -139,27 +139,27 @@ class FitSettings(NamedTuple):
     """How a disc is fitted."""
 
     by_parts: bool
-    radius: float  # about which that of the disc lies, metres,
-    radius_sigma: float  # and the standard deviation, relative
+    radius: float  # prior, metres
+    radius_sigma: float  # relative standard deviation of the prior
     reach: Reach
 
 
 class Fit(NamedTuple):
     """A fitted disc; lengths in metres."""
 
-    arrived: bool  #: If not, the covariance is infinite and the rest means nothing.
+    arrived: bool  #: Whether it converged; if not, the covariance is infinite, the rest undefined.
     x: float
     y: float
     radius: float
     blur: float  #: Along u, pixels.
-    blur_bound: float  #: The most blur that the patch allowed.
+    blur_bound: float  #: Largest blur that the patch allowed.
     contrast: float  #: Grey level inside minus outside (by parts: of the first sector).
     #: Share of the variance about the background that the disc explains (of the first sector).
     explained: float
     cov_xx: float
     cov_xy: float
     cov_yy: float
-    #: One over the variance of the radius, as far as the grey values tell it.
+    #: Inverse variance of the radius from the grey values alone, without the prior.
     radius_information: float
 
 
@@ -176,21 +176,20 @@ class Edge(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """What is known of the light in each of G groups of pixels: of all, or of each sector."""
+    """Estimated light in each of G groups of pixels: all pixels, or the sectors."""
 
-    contrast: FloatArray  #: (G,) grey levels; 0 where there is no edge to be seen.
+    contrast: FloatArray  #: (G,) grey levels; 0 if no edge is visible.
     variance: FloatArray  #: (G,) of the residuals.
     explained: FloatArray  #: (G,) share of the variance that the disc explains.
-    off_px: FloatArray  #: (G,) how far outside the circle the edge is.
-    weight: FloatArray  #: (G,) per variance.
+    off_px: FloatArray  #: (G,) offset of the edge outwards from the circle, pixels.
+    weight: FloatArray  #: (G,) divided by the variance.
 
 
 @kernel()
 def eliminate(matrices: FloatArray, k: int) -> None:
-    """Eliminate unknown k from the later ones of normal equations, of which the lower half is used.
+    """Eliminate unknown k from the rows after it of S normal equations (T, T, S), lower halves.
 
-    `matrices` are (T, T, S), S of them at a time. What is left of the products is that of what the
-    eliminated unknowns leave of all others; an unknown that nothing depends on leaves all.
+    This leaves the Schur complement. An unknown that no observation depends on changes nothing.
     """
     terms, _, count = matrices.shape
     per_pivot = np.empty(count)
@@ -263,7 +262,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         xx, xy, yy = area * noise[0], area * noise[1], area * noise[2]
     information *= (noise[0] + noise[2]) / (xx + yy)
     near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
-    if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # sectors in a row fix no centre
+    if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # adjacent sectors alone fix no centre
         return _NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
     unit = settings.radius**2
@@ -294,7 +293,7 @@ def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate,
 
 @kernel(forceinline=True)
 def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
-    """A blur (along u, pixels) along the axes of a patch of that shape."""
+    """A blur (along u, pixels), converted to the axes of a patch of the given shape."""
     return Blur(blur * ratio, blur) if shape == CHORDS_ALONG_V else Blur(blur, blur * ratio)
 
 
@@ -302,7 +301,7 @@ def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
 def _write_rows(
     patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: Float32Array
 ) -> None:
-    """The derivatives by all unknowns, and the grey values (above `level`), for n pixels."""
+    """Write the derivatives by all unknowns, and the grey values (above `level`), of n pixels."""
     shares = patch.shares
     x0, y0, r0, black = F32(edge.x), F32(edge.y), F32(edge.radius), F32(-level)
     for i in range(n):
@@ -312,7 +311,7 @@ def _write_rows(
         rows[_SADDLE_XY, i] = weight * x * y
         rows[_SLOPE_Y, i] = weight * y
         rows[_OUTSIDE, i] = weight
-        # Light that changes across the edge changes what either side gives back of it.
+        # Illumination that changes across the edge scales the grey values of both sides.
         ramp = (math.sqrt(x * x + y * y) - r0) * (grey - black)
         rows[_SLOPE, i] = weight * (ramp if by_parts else x)
         rows[_CONTRAST, i] = weight * shares[SHARE, i]
@@ -326,9 +325,9 @@ def _write_rows(
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArray) -> None:
-    """Sums of products of rows in each sector, lower halves, from the first term on."""
+    """Sums of products of rows in each sector, lower halves, from term `first` on."""
     for s in range(SECTORS):
-        # Three by three at a time: each value that is loaded is used three times.
+        # Blocks of three by three, so that each loaded value is used three times.
         for a in range(first, _TERMS, 3):
             for b in range(first, a + 1, 3):
                 s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = F32(0.0)
@@ -345,7 +344,7 @@ def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArr
 
 @kernel()
 def _sum_of(products: FloatArray) -> FloatArray:
-    """(T, T, 1) of all sectors."""
+    """(T, T, 1) sum over all sectors."""
     total = np.zeros((_TERMS, _TERMS, 1))
     for a in range(_TERMS):
         for b in range(a + 1):
@@ -359,7 +358,7 @@ def _eliminate_levels(
     grouped: FloatArray, levels: Levels, by_parts: bool,
     per_pixel: tuple[float, float, float, float], noise: float,
 ) -> None:  # fmt: skip
-    """Eliminate the light of each group; its contrast, residuals, and where its edge is."""
+    """Eliminate the light of each group; estimate its contrast, residuals and edge offset."""
     groups = grouped.shape[2]
     pixels = grouped[_OUTSIDE, _OUTSIDE].copy()
     if by_parts:
@@ -386,7 +385,7 @@ def _eliminate_levels(
             off = grouped[_GREY, _RADIUS, s] / (contrast * grouped[_RADIUS, _RADIUS, s])
             levels.off_px[s] = off / math.hypot(per_u, per_v)
         else:
-            freedom = pixels[s] - (_GREY - 1)  # what is expected of both blurs counts as one more
+            freedom = pixels[s] - (_GREY - 1)  # the priors of both blurs count as one more pixel
             levels.contrast[s] = contrast if freedom >= 4.0 else 0.0
             levels.variance[s] = max(residual / max(freedom, 1.0), noise * noise)
             levels.weight[s] = 1.0 / levels.variance[s]
@@ -394,7 +393,7 @@ def _eliminate_levels(
 
 @kernel(inline="always")
 def _weigh(levels: Levels, early: bool, noise: float) -> int:
-    """Weigh the sectors; returns how many count."""
+    """Weight the sectors; returns how many count."""
     contrast, variance, off_px = levels.contrast, levels.variance, levels.off_px
     chosen, some = np.zeros(SECTORS, np.bool_), np.empty(SECTORS)
     total = 0.0
@@ -432,7 +431,7 @@ def _trust(
     patch: Any, rows: Float32Array, ends: IntArray, grouped: FloatArray,
     levels: Levels, noise: float,
 ) -> None:  # fmt: skip
-    """Weigh the pixels of the sectors that count by what the fit leaves of each."""
+    """Weight the pixels of the sectors that count by their residuals."""
     usual = max(_median_of(levels.variance, levels.weight > 0.0), noise * noise)
     per_limit = F32(1.0 / (_FAR_PIXEL**2 * usual))
     for s in range(SECTORS):
@@ -465,7 +464,7 @@ def _median_of(values: FloatArray, chosen: BoolArray) -> float:
 
 @kernel(inline="always")
 def _scale(grouped: FloatArray, levels: Levels) -> None:
-    """Weigh what groups say of the disc: derivatives are by the shares, so times the contrast."""
+    """Weight the groups' equations of the disc; by the chain rule, times the contrast."""
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
             for s in range(grouped.shape[2]):
@@ -478,7 +477,7 @@ def _scale(grouped: FloatArray, levels: Levels) -> None:
 def _add_up(
     grouped: FloatArray, edge: Edge, usual: Edge, radius_sigma: float, normal: FloatArray
 ) -> None:
-    """The normal equations of the step of the edge, of all groups and what is expected of it."""
+    """The normal equations of the edge's step: the sum of all groups, plus the priors."""
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
             normal[a, b, 0] = np.sum(grouped[a, b])
@@ -493,7 +492,7 @@ def _add_up(
 
 @kernel()
 def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
-    """Solve normal equations (T, T, 1), which are overwritten, for all unknowns from the first."""
+    """Solve normal equations (T, T, 1), which are overwritten, for the unknowns from `first` on."""
     for k in range(first, _GREY):
         eliminate(normal, k)
     for k in range(_Y, first - 1, -1):
@@ -530,7 +529,7 @@ def _scaled(blur: float, step: float, most: float) -> float:
 
 @kernel(inline="always")
 def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
-    """Covariance (xx, xy, yy) of the centre where everything else is eliminated."""
+    """Covariance (xx, xy, yy) of the centre after all other unknowns are eliminated."""
     xx, xy, yy = normal[_X, _X, s], normal[_Y, _X, s], normal[_Y, _Y, s]
     per_area = 1.0 / (xx * yy - xy * xy)
     return per_area * yy, -per_area * xy, per_area * xx
@@ -538,7 +537,7 @@ def _inverse(normal: FloatArray, s: int) -> tuple[float, float, float]:
 
 @kernel(inline="always")
 def _radius_information(normal: FloatArray) -> float:
-    """One over the variance of the radius, by normal equations of it and the centre."""
+    """Inverse variance of the radius, from the normal equations of radius and centre."""
     xx, xy, yy = normal[_X, _X, 0], normal[_Y, _X, 0], normal[_Y, _Y, 0]
     x, y = normal[_X, _RADIUS, 0], normal[_Y, _RADIUS, 0]
     by_centre = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
@@ -555,11 +554,11 @@ def _correlated_area_of(patch: Any, rows: Float32Array, n: int, products: FloatA
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _correlated_area(patch: Any, rows: Float32Array, n: int, unknowns: FloatArray) -> float:
-    """How many pixels go with one independent residual, from the correlation of neighbours.
+    """Number of pixels per independent residual, from the correlation of neighbours.
 
-    White noise gives 1. Where the model does not fit (texture, reflections, a disc that is none)
-    the residuals are correlated, and their number overstates their information: for a first-order
-    process of correlation c by (1 + c) / (1 - c) in either direction.
+    White noise gives 1. Where the model does not fit (texture, reflections, not a disc), residuals
+    are correlated and overstate their information: for a first-order process of correlation c by
+    the factor (1 + c) / (1 - c) in either direction.
     """
     residual = rows[_GREY, :n].copy()
     for k in range(_GREY):
@@ -585,7 +584,7 @@ def _correlated_area(patch: Any, rows: Float32Array, n: int, unknowns: FloatArra
 def _covariance_by_parts(
     products: FloatArray, levels: Levels, normal: FloatArray, noise: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Covariance (xx, xy, yy) of the centre: the noise's, and by leaving out sectors in turn."""
+    """Covariance (xx, xy, yy) of the centre: that of the noise plus that of the jackknife."""
     left_out = np.empty((_TERMS, _TERMS, SECTORS))
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
@@ -612,12 +611,12 @@ def _covariance_by_parts(
     return scale * xx + noise[0], scale * xy + noise[1], scale * yy + noise[2]
 
 
-#: Memory that is new for every image has to be fetched first.
+#: One working space per thread: memory allocated anew for every image would cause page faults.
 _kept = threading.local()
 
 
 def working_space() -> NDArray[Any]:
-    """(1,) `WORK`: what the calling thread's fits work in."""
+    """(1,) `WORK`: the working space of the calling thread's fits."""
     space: NDArray[Any] | None = getattr(_kept, "space", None)
     if space is None:
         space = np.zeros(1, WORK)
@@ -626,5 +625,5 @@ def working_space() -> NDArray[Any]:
 
 
 def least_noise(noise: float) -> float:
-    """Noise of a scene: grey values are rounded."""
+    """Noise of a scene, at least that of rounded grey values."""
     return max(noise, _LEAST_NOISE)

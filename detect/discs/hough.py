@@ -1,16 +1,16 @@
-"""Candidates by the edges of the image: a Hough transform for discs of known size on the floor.
+"""Candidates from edges: a Hough transform for discs of known size on the floor.
 
-At the rim of a light disc the gradient of the grey value, taken on the floor, points to the centre,
-one radius away. With A the derivative of the floor position X by the pixel, B = abs(det A) A^-T,
-and g the gradient in the image, the centre is
+At the rim of a light disc the gradient of the grey value, mapped to the floor, points to the
+centre, one radius away. With A the derivative of the floor position X by the pixel,
+B = abs(det A) A^-T, and g the gradient in the image, the centre is
 
     X + r n,  n = B g / norm(B g),
 
-and X - r n for a dark disc. Every pixel with a strong gradient votes for one centre, by the share
-of the rim that it sees, norm(B g) / norm(g) of 2 pi r; so whatever hides or lights a part of a disc
-takes its own share of the votes and no more. Votes are counted in cells (`lut.votes`). A score is
-that of three by three cells, relative to the mean of all cells as far ahead, where texture and
-distance make all scores higher.
+and X - r n for a dark disc. Every pixel with a strong gradient votes for one centre, weighted by
+the share of the rim that it covers, norm(B g) / norm(g) of 2 pi r; so an occluded or unevenly lit
+part of a disc costs only its own share of the votes. Votes are counted in cells (`lut.votes`). The
+score is the sum over three by three cells, relative to the mean of all cells at the same distance,
+since texture and distance raise all scores.
 
 Source: C. Kimme, D. Ballard and J. Sklansky, Finding Circles by an Array of Accumulators,
 CACM 18 (1975).
@@ -28,30 +28,30 @@ from lut import VoteTable
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Added to the mean votes of the cells as far ahead: where these are empty, few votes are none.
+#: Added to the mean votes at a distance, so that a few votes among empty cells score low.
 _BACKGROUND = 0.3
-#: Least score of a candidate; of those below a clear one, how many an image may have, and how many
-#: are compared with their neighbours; and how many peaks there may be in all.
+#: Lowest score of a candidate, and of a clear one. Limits: doubtful candidates of an image,
+#: candidates that are compared with their neighbours, peaks.
 _LEAST_SCORE, _CLEAR_SCORE = 1.7, 3.0
 _MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 200, 600, 4000
-#: Nearer to a better candidate than this is none, radii: what touches a disc may be one, too.
+#: Least distance from a better candidate, radii; less than 2, for discs may touch.
 _APART = 0.6
-#: Sobel's kernel multiplies a step per pixel by this.
+#: The Sobel kernel scales a gradient per pixel by this.
 _SOBEL_GAIN = 8.0
 
 
 class HoughCandidates(NamedTuple):
-    """Places that may be centres of discs, the best first."""
+    """Possible centres of discs, the best first."""
 
     floor_xy: FloatArray  # (N, 2) metres
     score: FloatArray  # (N,)
-    sign: FloatArray  # (N,) 1 of light discs, -1 of dark ones
+    sign: FloatArray  # (N,) 1 for light discs, -1 for dark ones
 
 
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Centres of discs of one radius by the votes of the edges.
+    """Find possible centres of discs of one radius from the votes of edges.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def hough_candidates(
 def count_votes(
     image: GreyImage, table: VoteTable, radius: FloatArray, least_step: float
 ) -> Float32Array:
-    """(S, M, columns) votes for each cell, shares of a rim, for S radii: of dark discs negative."""
+    """(S, M, columns) votes of each cell, shares of a rim, for S radii (negative: dark discs)."""
     votes = np.zeros((len(radius), len(table.ahead), table.columns), np.float32)
     width = table.pixel.shape[1]
     across, ahead = np.empty(len(radius), np.float32), np.empty(len(radius), np.float32)
@@ -129,12 +129,12 @@ def count_votes(
 
 @kernel(fastmath={"reassoc", "nsz"})
 def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
-    """Places (across, ahead) and scores of cells that no neighbour exceeds."""
+    """Positions (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     score = np.zeros((rows, columns), np.float32)
     column = np.empty(columns, np.float32)
     for i in range(1, rows - 1):
-        # One cell more to either side; sliced row by row, so that several are added at a time.
+        # One more cell on either side; sliced row by row, so that the additions are vectorised.
         left, right = table.first[i] - 1, table.last[i] + 1
         before, same = votes[i - 1, left:right], votes[i, left:right]
         after = votes[i + 1, left:right]
@@ -153,7 +153,7 @@ def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArra
             value = score[i, j]
             if value < _LEAST_SCORE or n == _MOST_PEAKS:
                 continue
-            # Of equal cells the last one.
+            # Of equal cells, the last one.
             before, same, after = score[i - 1], score[i], score[i + 1]
             highest = max(same[j - 1], before[j - 1], before[j], before[j + 1])
             if highest > value or max(same[j + 1], after[j - 1], after[j], after[j + 1]) >= value:

@@ -1,7 +1,7 @@
-"""IDs of known discs, carried over to detected ones.
+"""Transfers the IDs of known discs to detected ones.
 
-Both ways rows and discs are matched where they belong together before all others: each is the
-other's nearest by the Mahalanobis distance, again and again until none is left within the gate.
+Rows and discs are matched greedily, nearest pairs first by the Mahalanobis distance, until no pair
+is left within the gate.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def ids_of_rows(
     covariance: FloatArray | None = None,
     slack_m: float = 0.0,
 ) -> list[tuple[int, ...]]:
-    """The IDs of the rows of the same discs in the same frame; () for discs without a row.
+    """IDs of discs, from rows of the same discs in the same frame; () for discs without a row.
 
-    Discs (N, 2) are compared without a correction for the tilt if the rows are without one: then
-    both are the same pixels, whatever the tilt, and the discs' own covariance does not count.
-    `slack_m` is the standard deviation of what no covariance includes, in every direction.
+    If the rows are not corrected for the tilt, the discs (N, 2) must not be either: then both refer
+    to the same pixels, whatever the tilt, and the discs' own covariance is not used. `slack_m` is
+    the standard deviation, per axis, of errors that no covariance includes.
     """
     own = np.zeros((len(xy), 2, 2)) if covariance is None else covariance
     known = circle_arrays(rows)
@@ -39,9 +39,9 @@ def ids_of_rows(
 def matched(
     xy: FloatArray, covariance: FloatArray, known_xy: FloatArray, known_covariance: FloatArray
 ) -> IntArray:
-    """(N,) which of M known places each of N places is; -1 where none is within the gate.
+    """(N,) indices of the known positions that match N positions; -1 if none is within the gate.
 
-    Of places (N, 2), (M, 2) with covariances, each is used once at most, the nearest pairs first.
+    Of positions (N, 2), (M, 2) with covariances, each is matched at most once, nearest pairs first.
     """
     found = np.full(len(xy), -1)
     if not len(xy) or not len(known_xy):

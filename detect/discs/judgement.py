@@ -1,10 +1,10 @@
-"""Which candidates are discs: a glance at each, then its rim, by networks trained on known truth.
+"""Decides which candidates are discs: a glance, then the rim, by networks trained on known truth.
 
-Candidates are those of the Hough transform (`detect.discs.hough`). Most are dropped at a glance at
-few grey values. Round the others the rim is followed (`detect.discs.rim`): glare or a sun patch
-beside a disc, a cable across it or a door's edge before it leave the rest of its rim on a circle of
-the right size. A small network (`detect.discs.rim_network`) then decides by the grey values about
-it and by the rim.
+The candidates come from the Hough transform (`detect.discs.hough`). Most are rejected at a glance
+at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare or a sun
+patch beside a disc, a cable across it or a door's edge in front of it, the rest of its rim still is
+on a circle of the right size. A small network (`detect.discs.rim_network`) then decides from the
+grey values around the candidate and from the rim.
 """
 
 from __future__ import annotations
@@ -40,52 +40,51 @@ from detect.discs.rim_network import (
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Where grey values count as of the disc and of the floor, nominal radii.
+#: Distances at which grey values are taken for the disc and for the floor, nominal radii.
 _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
-#: Directions of a glance (a part of the rim's), where its samples are, and which are inside and
-#: outside; the least share of directions in which the disc differs from the floor.
+#: Directions of a glance (a subset of the rim's), the distances of its samples, which of them are
+#: inside and outside, and the least share of directions in which the disc differs from the floor.
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.3
-#: Least log-odds of a glance.
+#: Threshold of the log-odds of a glance.
 _LEAST_GLANCE = 0.0
-#: Least share of the rim that is on a circle.
+#: Least share of the rim that has to be on a circle.
 LEAST_RIM = 0.3
-#: Radius of a rim that fits best, relative to the nominal one.
+#: Most likely radius of a rim, relative to the nominal one.
 RIM_RADIUS = 0.98
-#: A rim that is hopeless or looks better than this by the log-odds is not followed from its own
-#: middle.
+#: A rim is traced again, from its own centre, unless it is hopeless or its log-odds exceed this.
 _CERTAIN = 2.5
-#: Followed again it may lose this share and is still the better one.
+#: The second trace may lose this share of the rim and still be preferred.
 _SLACK = 0.07
-#: Nearer to another rim than this share of the radius it is the same.
+#: Two rims closer than this share of the radius are the same.
 _SAME = 0.1
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
 class Judgement(NamedTuple):
-    """N candidates and what became of them; step and later mean something for judged rims."""
+    """N candidates and their fates; `step` and later fields are valid for judged rims only."""
 
     fate: NDArray[np.int8]  #: (N,) indices of `FATES`
     value: FloatArray  #: (N,) the number that decided: log-odds, or a share of the rim
-    sign: FloatArray  #: (N,) 1 of light discs, -1 of dark ones
+    sign: FloatArray  #: (N,) 1 for light discs, -1 for dark ones
     features: FloatArray  #: (N, len(FEATURES))
-    agreeing: FloatArray  #: (N,) share of the rim that is on a circle,
-    radius: FloatArray  #: (N,) and the radius of that, metres
-    #: (N, 2) centre of the rim, metres; where it was not followed, of the candidate
+    agreeing: FloatArray  #: (N,) share of the rim that is on a circle
+    radius: FloatArray  #: (N,) radius of that circle, metres
+    #: (N, 2) centre of the rim, metres; of the candidate if the rim was not traced
     floor_xy: FloatArray
-    seen_from: FloatArray  #: (N, 2) where the rim was followed from, metres,
-    #: (N, 2) and the difference to the centre of the rim that is found from the other start
+    seen_from: FloatArray  #: (N, 2) point from which the rim was traced, metres
+    #: (N, 2) difference between the centres found from the two starts, metres
     doubt: FloatArray
     step: FloatArray  #: (N,) of the grey value at the rim, inside minus outside
-    floor_grey: FloatArray  #: (N,) mean grey value of the floor round it
-    quality: FloatArray  #: (N,) Otsu's, of the disc and that floor
-    log_odds: FloatArray  #: (N,) that it is a disc
+    floor_grey: FloatArray  #: (N,) mean grey value of the floor around it
+    quality: FloatArray  #: (N,) Otsu's quality of the disc against that floor
+    log_odds: FloatArray  #: (N,) that the candidate is a disc
 
     def where(self, chosen: NDArray[Any]) -> Judgement:
-        """Some of the candidates, by indices or a mask."""
+        """The candidates that indices or a mask select."""
         return Judgement(*(values[chosen] for values in self))
 
 
@@ -94,8 +93,7 @@ NO_CANDIDATES = Judgement._make(
      *np.empty((3, 0, 2)), *np.empty((4, 0))]
 )  # fmt: skip
 
-#: What became of a candidate, in the order of the stages: the first did not pass the second, and so
-#: on; the last was judged by its rim.
+#: Fates of candidates: the stage that rejected it, in order; the last was judged by its rim.
 FATES: tuple[Literal["steps", "glance", "rim", "same rim", "judged"], ...] = (
     "steps", "glance", "rim", "same rim", "judged",
 )  # fmt: skip
@@ -120,7 +118,7 @@ def judge(
     nominal : float
         Radius of discs, metres.
     least_step : float
-        Of the grey value at a rim.
+        Lowest step of the grey value at a rim.
     camera_numbers : (K,) float64
         `camera.kernels.camera_numbers`.
     networks : Networks
@@ -155,7 +153,7 @@ def judge(
         seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
         odds, noted = _look(seen, rim, score[0], sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
-            # From its own middle a rim is seen best, but that may lead to another circle.
+            # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, seen, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 seen_again = profiles(image, camera_numbers, again.x, again.y, nominal)
@@ -181,7 +179,7 @@ def judge(
 
 @kernel()
 def _is_known(judged: FloatArray, rim: Rim, sign: float, radius: float) -> bool:
-    """Whether a rim is one of those (x, y, sign)."""
+    """Whether a rim is one of `judged`, rows (x, y, sign)."""
     near = _SAME * radius
     for k in range(len(judged)):
         off_x, off_y = judged[k, 0] - rim.x, judged[k, 1] - rim.y
@@ -206,9 +204,9 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 def glance(
     image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> tuple[FloatArray, FloatArray]:
-    """The nearest grey values along some directions, without perspective within the disc.
+    """Nearest-pixel grey values along some directions, ignoring perspective within the disc.
 
-    Parameters and results are as of `detect.discs.rim.profiles`, with fewer directions and steps.
+    Parameters and results as for `detect.discs.rim.profiles`, with fewer directions and steps.
     """
     grey, scale = np.empty((GLANCED, len(GLANCED_AT))), np.empty(GLANCED)
     u0, v0 = project_floor_point(camera_numbers, x, y)
@@ -231,13 +229,13 @@ def glance(
 
 @kernel()
 def pairs_of_steps(grey: FloatArray) -> FloatArray:
-    """Profiles as the network sees them: means of two steps each."""
+    """Profiles as the network sees them: means of pairs of steps."""
     return 0.5 * (grey[:, ::2] + grey[:, 1::2])
 
 
 @kernel()
 def _contrast(grey: FloatArray, sign: float, least_step: float) -> float:
-    """Median step over those directions that step enough; 0 where these are too few."""
+    """Median step over the directions with a sufficient step; 0 if these are too few."""
     steps = np.empty(GLANCED)
     for inner in _INNER:
         count = 0
@@ -269,9 +267,9 @@ def _quality(grey: FloatArray) -> tuple[float, float]:
 def _look(
     seen: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
 ) -> tuple[float, FloatArray]:
-    """Log-odds that a rim, seen from its middle, is a disc's; and its features.
+    """Log-odds that a rim, seen from its centre, is a disc's; and its features.
 
-    Each feature is bounded, for a single one is never to decide.
+    Each feature is bounded, so that no single one decides.
     """
     noted = np.empty(len(FEATURES))
     off = abs(math.log(min(max(rim.radius / seen.radius, 0.3), 3.0) / RIM_RADIUS))

@@ -1,32 +1,32 @@
-"""What share of a disc's contrast a pixel sees: a disc blurred by optics and pixel.
+"""The share of a disc's contrast that a pixel sees, for a disc blurred by optics and pixel.
 
-There are two formulas for it, `edge_shares` and `chord_shares`.
+There are two formulas, `edge_shares` and `chord_shares`.
 
-Both see the floor as it is around each pixel: where it is, and by which steps it moves from pixel
-to pixel (`detect.discs.patch.PATCH`), in nominal radii. The blur is a Gaussian along the image's
-axes, of the optics' variance plus that of a pixel (1/12). The shares W and their derivatives by
-log blur along either axis, radius, x and y go into the six rows of the patch's `shares`.
+Both approximate the floor locally at each pixel, by its position and its steps from pixel to pixel
+(`detect.discs.patch.PATCH`), in nominal radii. The blur is a Gaussian along the image axes, with
+the optics' variance plus that of a pixel (1/12). The shares W and their derivatives by log blur
+along either axis, radius, x and y are written into the six rows of the patch's `shares`.
 
-`edge_shares` is for discs that are large against the blur. Across its edge such a disc is a blurred
-step, moved and bent a little by the edge's curvature. With z the distance from the edge and t the
-blur over the radius, both in the metric in which the blur is round,
+`edge_shares` is for discs that are large compared to the blur. Across its edge such a disc is a
+blurred step, slightly shifted and bent by the edge's curvature. With z the distance from the edge
+and t the blur over the radius, both in the metric in which the blur is round,
 
     W(z, t) = Phi(-g),    g = z + t (1/2 + t Q(z, t)),
 
-for a Gaussian blur moves an edge of curvature 1/R by sigma^2 / (2 R) towards its centre. Q is a
-polynomial, fitted once to the exact profile (a noncentral chi-square distribution of two degrees of
+since a Gaussian blur moves an edge of curvature 1/R by sigma^2 / (2 R) towards its centre. Q is a
+polynomial fitted to the exact profile (a noncentral chi-square distribution with two degrees of
 freedom) over ``|z|`` <= `Z_LIMIT` and t <= `T_LIMIT`; the largest error of W is 0.0011.
 
-`chord_shares` is for discs that are seen so flat that the blur reaches across them. They are made
-of chords along the steeper image axis, s of them across:
+`chord_shares` is for discs that appear so flat that the blur reaches across them. They are composed
+of chords along the steeper image axis, at the distances s from the centre:
 
     W = integral k((s - s0) / h) / h  [Phi(top(s) / sigma) - Phi(bottom(s) / sigma)] ds
 
 Along the chords the blur is exact; across, it is the kernel k(t) = 15/16 (1 - t^2)^2 of the same
 variance, h = sqrt(7) sigma. The integral is a Gauss-Legendre quadrature at four angles theta, for
-s = R sin(theta): in the angle the disc's tips are smooth.
+s = R sin(theta): as a function of the angle, the disc's tips are smooth.
 
-All is single precision without branches, so that the compiler works on several pixels at a time.
+All code is in single precision and without branches, so that the compiler vectorises it.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ import numpy as np
 
 from redetect.compiled import kernel
 
-#: Single precision. Numba knows it as the type, the type checker as a function.
+#: Single precision. For Numba it is the type, for the type checker a function.
 F32: Callable[[Any], Any] = np.float32
-#: What the compiler may do in the kernels of discs: another order of sums, products into sums. Not
-#: that nothing is NaN or infinite.
+#: Optimisations allowed in the kernels of discs: reordered sums, fused products. Not allowed is the
+#: assumption that no value is NaN or infinite.
 FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 
-#: Rows of a patch's `shares`: of the disc, and derivatives (of the blur, by its logarithm).
+#: Rows of a patch's `shares`: the share and its derivatives (for the blur, by its logarithm).
 SHARE, BY_BLUR_1, BY_BLUR_2, BY_RADIUS, BY_X, BY_Y = range(6)
 
 PIXEL_VARIANCE = 1.0 / 12.0
@@ -73,7 +73,7 @@ _TINY = F32(1e-12)
 _PER_32 = F32(0.5 / 32.0)
 _E2, _E3, _E4, _E5 = F32(1 / 2), F32(1 / 6), F32(1 / 24), F32(1 / 120)
 _PER_ROOT_2PI = F32(1.0 / math.sqrt(2.0 * math.pi))
-#: Where the normal distribution ends, deviations.
+#: Deviations beyond which the normal distribution is cut off.
 _FAR = F32(5.0)
 # Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
 _TAIL = F32(0.2316419)
@@ -107,14 +107,14 @@ def normal(x: float) -> tuple[float, float]:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def arcsine(x: float) -> float:
-    """Within 7e-5; what lies beyond -1 and 1 is cut off."""
+    """Arcsine, within 7e-5; x is clipped to -1 and 1."""
     a = min(abs(x), _1)
     angle: float = _HALF_PI - math.sqrt(_1 - a) * (_A0 + a * (_A1 + a * (_A2 + a * _A3)))
     signed: float = angle if x > _0 else -angle
     return signed
 
 
-#: The reach of the polynomial Q, and its coefficients: rows are powers of z, columns powers of t.
+#: Domain of the polynomial Q, and its coefficients: rows are powers of z, columns powers of t.
 Z_LIMIT, T_LIMIT = 4.0, 0.4
 BEND = (
     (-1.764051e-01, 9.261172e-01, -9.298910e-01),
@@ -130,17 +130,17 @@ BEND = (
 )  # fmt: skip
 _3, _4, _5 = F32(3.0), F32(4.0), F32(5.0)
 _Z_LIMIT, _T_LIMIT = F32(Z_LIMIT), F32(T_LIMIT)
-#: The polynomial ends where the disc does: at z = -1 / t is the centre.
+#: The domain is cut off at the disc's centre, z = -1 / t.
 _Z_PER_T = F32((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
 _ASIDE = F32(1e-6)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
-    """W by the profile of a curved edge, for the first n pixels.
+    """W from the profile of a curved edge, for the first n pixels.
 
-    With G the deviation of the blur across the edge, on the floor, and D that of its area, an edge
-    of radius R has the curvature t = D^2 / (R G^3) in units of the blur.
+    With G the standard deviation of the blur across the edge, on the floor, and D^2 the area of the
+    blur's ellipse, an edge of radius R has the curvature t = D^2 / (R G^3) in units of the blur.
     """
     shares = patch.shares
     x0, y0, r0 = F32(disc.x), F32(disc.y), F32(disc.radius)
@@ -151,7 +151,7 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     optics_2 = F32(blur.second * blur.second) / variance_2
     area = variance_1 * variance_2
     for i in range(n):
-        # At the centre itself any direction will do, but one there must be.
+        # At the centre any direction will do, but there must be one.
         x = patch.x[i] - x0 + _ASIDE
         y = patch.y[i] - y0
         r = math.sqrt(x * x + y * y)
@@ -207,21 +207,21 @@ _SMALLEST = F32(1e-6)
 class _Pixel(NamedTuple):
     """A pixel among the chords."""
 
-    along: float  # its place, in steps of the first axis from the disc's centre along the chords,
-    across: float  # and in radii across them
-    slant: float  # how far it moves along them while it moves across by one radius
+    along: float  # position along the chords, from the disc's centre, in steps of the first axis
+    across: float  # position across them, radii
+    slant: float  # movement along the chords for a movement of one radius across them
     reach: float  # of the kernel across, radii
-    per_length: float  # steps of the first axis for one radius,
-    growth: float  # and by what share each is longer than the one before
+    per_length: float  # steps of the first axis per radius
+    growth: float  # relative growth of these steps from one to the next
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _chord(
     theta: float, weight: float, radius: float, per_sigma: float, pixel: _Pixel
 ) -> tuple[float, float, float, float, float, float]:
-    """What one chord adds to W, and to its derivatives.
+    """The contribution of one chord to W and its derivatives.
 
-    By log blur along the chords and across them, by the place along them and across, by radius.
+    Derivatives are by log blur along the chords and across, position along and across, radius.
     """
     square = theta * theta
     sine = theta * (_1 + square * (_S3 + square * (_S5 + square * (_S7 + square * _S9))))
@@ -257,7 +257,7 @@ def _chord(
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def chord_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
-    """W by the blurred chords along the patch's first axis, for the first n pixels."""
+    """W from the blurred chords along the patch's first axis, for the first n pixels."""
     shares = patch.shares
     x0, y0, r0 = F32(disc.x), F32(disc.y), F32(disc.radius)
     per_r0 = _1 / r0

@@ -1,17 +1,17 @@
-"""The tilt of the floor that the outlines of discs show.
+"""Estimates the robot's tilt from the outlines of discs.
 
-A disc of known radius r on a level floor looks like a circle there. On a robot that tilts, what the
-calibrated camera takes for the floor is another plane, on which the outline is an ellipse:
+Projected to the floor of a level camera, the outline of a disc of known radius r is a circle. If
+the robot tilts, the calibrated floor is another plane, on which the outline is an ellipse:
 
     | A(c; t) (p - c) | = r,
 
-where p is a point of the outline as the calibrated floor has it, c the centre, t = (pitch, roll)
-the rotation that turns measured directions level, and A the derivative of levelling at c. Each disc
-whose rim is in view (`detect.discs.rim`) gives an estimate of t by least squares in pixels; the
-robust mean over the discs of a frame is its tilt. Neighbouring points of a rim err together, paper
-is not flat, and floors are uneven: both are stated, for a disc and for a frame.
+where p is a point of the outline on the calibrated floor, c the centre, t = (pitch, roll) the
+rotation that levels measured directions, and A the derivative of levelling at c. Each disc whose
+rim is visible (`detect.discs.rim`) gives an estimate of t by least squares in pixels; the robust
+mean over the discs of a frame is its tilt. Errors of neighbouring rim points are correlated, paper
+is not flat, and floors are uneven: constants below add these errors for a disc and for a frame.
 
-Distances to a plane from the outline of a circle on it: D. Forsyth et al., Invariant Descriptors
+The pose of a plane from the outline of a circle on it: D. Forsyth et al., Invariant Descriptors
 for 3D Object Recognition and Pose, PAMI 13 (1991).
 """
 
@@ -30,20 +30,20 @@ from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
-#: Directions in which the rim must lie on the ellipse.
+#: Least number of directions in which the rim is on the ellipse.
 LEAST_DIRECTIONS = 24
-#: The ellipse's shortest half axis must be as long, pixels.
+#: Least semi-minor axis of the ellipse, pixels.
 LEAST_AXIS_PX = 1.2
 #: Least contrast, grey levels.
 LEAST_CONTRAST = 8.0
-#: Standard deviation of a point of a rim, pixels, and how many points err together.
+#: Standard deviation of a rim point, pixels, and number of neighbours with a common error.
 POINT_SIGMA_PX, TOGETHER = 0.25, 4.0
-#: What tilts of single discs, and of the floor under all of a frame's, deviate from the robot's.
+#: Standard deviation of a single disc's tilt, and of the floor's below all discs of a frame.
 DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 
 _STEP_RAD = 1e-4
 _ITERATIONS = 7
-#: Degrees of freedom of Student's density of discs' tilts.
+#: Degrees of freedom of Student's t distribution of the discs' tilts.
 _FREEDOM = 4.0
 
 
@@ -51,7 +51,7 @@ _FREEDOM = 4.0
 def _derivative_of_levelling(
     rotation: FloatArray, centre: FloatArray, x: float, y: float
 ) -> tuple[float, float, float, float]:
-    """d(levelled x, y) / d(x, y) of a point of the calibrated floor, row by row."""
+    """d(levelled x, y) / d(x, y) of a point on the calibrated floor, row by row."""
     dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
     down = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
     along = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
@@ -68,7 +68,7 @@ def _derivative_of_levelling(
 
 @kernel()
 def _contrast(grey: FloatArray) -> float:
-    """Grey levels within half a radius minus those beyond one and a third."""
+    """Mean grey level within half a radius minus that beyond one and a third."""
     return float(np.nanmean(grey[:, :4]) - np.nanmean(grey[:, -8:]))
 
 
@@ -81,15 +81,15 @@ def fit_outline(
     y: float,
     radius: float,
 ) -> tuple[bool, float, float, float, float, float]:
-    """The tilt of one disc of about the middle (x, y) by (N, 2) points of its outline.
+    """Estimate the tilt of one disc near (x, y) from (N, 2) points of its outline.
 
     Points are on the calibrated floor, relative to (x, y), metres; NaN where the outline is not
-    seen. Each has the scale of the image along its direction; `centre` is the camera's. Returns
-    whether enough of the outline is on the ellipse, pitch and roll (rad), and by the points alone
-    the variance of the pitch, the covariance, and the variance of the roll.
+    visible. `px_per_m` is the scale of the image in each direction, `centre` the camera's. Returns
+    whether enough of the outline is on the ellipse, pitch and roll (rad), and, from the points
+    alone, the variance of the pitch, the covariance, and the variance of the roll.
     """
     count = len(point_xy)
-    unknowns = np.zeros(4)  # of the centre, metres; pitch, roll
+    unknowns = np.zeros(4)  # centre, metres; pitch, roll
     weight, residual, row = np.zeros(count), np.zeros(count), np.zeros((count, 4))
     for k in range(count):
         weight[k] = 0.0 if math.isnan(point_xy[k, 0]) else 1.0
@@ -119,7 +119,7 @@ def fit_outline(
             row[k, 2] = (lengths[1] - lengths[2]) / (2.0 * _STEP_RAD) * px_per_m[k]
             row[k, 3] = (lengths[3] - lengths[4]) / (2.0 * _STEP_RAD) * px_per_m[k]
         if iteration > 1:
-            # The first steps go from a level floor to the tilted one, with all points.
+            # The first steps, from a level floor to the tilted one, use all points.
             used = 0
             for k in range(count):
                 if weight[k] > 0.0:
@@ -163,7 +163,7 @@ def fit_outline(
 
 @kernel()
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of (N, 2) discs' tilts by Student's density, and its covariance."""
+    """Mean of (N, 2) discs' tilts under Student's t distribution, and its covariance."""
     count = len(tilt)
     mean, of_mean, information = np.empty(2), np.empty((2, 2)), np.empty((count, 2, 2))
     for i in range(2):
@@ -195,7 +195,7 @@ def _tilts_of_discs(
     radius: float,
     height_ratio: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Tilts of the discs that show one, and their covariances."""
+    """Tilts of the discs for which the estimate succeeds, and their covariances."""
     tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
     used = 0
     point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
@@ -216,7 +216,7 @@ def _tilts_of_discs(
             px_per_m[m] = seen.pixels_per_radius[m] / radius
         if count < LEAST_DIRECTIONS:
             continue
-        # What a higher camera sees is larger than the calibrated floor has it.
+        # If the camera is higher than calibrated, discs are larger than they seem.
         found, pitch, roll, cpp, cpr, crr = fit_outline(
             point_xy, px_per_m, centre, x, y, radius / height_ratio
         )
@@ -231,10 +231,10 @@ def _tilts_of_discs(
 def tilt_of_outlines(
     image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
 ) -> FrameTilt | None:
-    """The tilt that the outlines of the discs in an image show; None if no rim is in view.
+    """Estimate the tilt from the outlines of the discs in an image; None if no rim is visible.
 
-    Discs were seen at `floor_xy` (N, 2), nothing levelled; the camera is higher than calibrated by
-    `raised_m`. The tilt's prefix is empty.
+    `floor_xy` (N, 2) are the positions of the discs, not levelled; the camera is higher than
+    calibrated by `raised_m`. The tilt's prefix is empty.
     """
     height_ratio = 1.0 + raised_m / float(camera.centre[2])
     tilts, covariances = _tilts_of_discs(

@@ -1,10 +1,10 @@
-"""The pixels to which a disc is fitted, with the floor that they see and their grey values.
+"""Selects the pixels to which a disc is fitted, with their floor positions and grey values.
 
-Pixels count if they are within some radii of the disc where a fit starts, or within some pixels or
-deviations of the blur of its edge. All of them are taken; of large discs all of those at the edge,
-which locate it, and some of the others, which give the grey levels. How far a pixel is from the
-edge is known to first order, with the floor's steps at the candidate: ``|r - R| r / |J^T p|``
-pixels for a place p on the floor, r = ``|p|``, and the steps J.
+Pixels are used if they are within some radii of the initial disc, or within some pixels or standard
+deviations of the blur of its edge. All of them are taken for small discs; for large ones, all at
+the edge, which locate the disc, and a subset of the others, which give the grey levels. A pixel's
+distance from the edge is approximated to first order, with the floor's steps J at the candidate:
+``|r - R| r / |J^T p|`` pixels for a floor position p, r = ``|p|``.
 """
 
 from __future__ import annotations
@@ -23,91 +23,89 @@ from detect.discs.model import (
 from redetect.array_types import Float32Array, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Most pixels of a patch. No power of two: arrays that far apart would share lines of the cache.
+#: Most pixels of a patch. No power of two, so that its arrays do not compete for cache lines.
 CAPACITY = 4000
 
 _VALUES = (np.float32, CAPACITY)
-#: A patch. A structure, so that the compiler knows that its arrays do not overlap.
+#: A patch: one structure, so that the compiler knows that its arrays do not overlap.
 PATCH = np.dtype(
     [
         # Index of each pixel in the image.
         ("pixel", np.uint32, CAPACITY),
-        # 0 of pixels that only fill up a sector, 1 of all others.
+        # 0 for padding of a sector, 1 for all other pixels.
         ("weight", *_VALUES),
-        # Square root of the weight by which each counts in a fit by parts.
+        # Square root of each pixel's robust weight in a fit by parts.
         ("trust", *_VALUES),
         # Grey value, relative to that of the candidate.
         ("grey", *_VALUES),
-        # Place on the floor relative to the candidate, in nominal radii, and how far that moves by
-        # one step along the first axis and along the second: u and v, or the steeper one and the
-        # other.
+        # Floor position relative to the candidate, in nominal radii, and its steps along the first
+        # and the second axis: u and v, or the axis of the chords first.
         *((name, *_VALUES) for name in ("x", "y", "x1", "y1", "x2", "y2")),
-        # By what share steps along the first axis grow from each to the next.
+        # Relative growth of steps along the first axis from one to the next.
         ("growth", np.float32),
         # See `detect.discs.model`.
         ("shares", np.float32, (6, CAPACITY)),
         ("sector", np.int32, CAPACITY),
-        # Working space, of one row of the image: how it is taken, and places on the floor.
+        # Working space for one image row: how its pixels are taken, and their floor positions.
         ("taken", np.int32, CAPACITY),
         *((name, *_VALUES) for name in ("row_x", "row_y")),
     ]
 )  # fmt: skip
 
-#: Sectors of a disc and what is about it, and where those of a quadrant meet.
+#: Number of sectors around a disc's centre, and tangents of the angles that separate them.
 SECTORS = 16
 _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
-#: Where pixels are sorted by sector, each is filled up to a multiple of this number.
+#: Sectors are padded to a multiple of this number of pixels.
 _SECTOR_WHOLE = 8
 
-#: By which formula discs are seen, and along which axis their chords run: see `detect.discs.model`.
+#: Formula of the shares, and the axis of the chords: see `detect.discs.model`.
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 
-#: A disc is seen flat if the edge of its flattest end is more curved than this, in units of the
-#: blur, or its smaller half axis less than this number of deviations of the blur.
+#: A disc appears flat if its edge is more curved than this at a tip, in units of the blur, or its
+#: semi-minor axis is shorter than this number of standard deviations of the blur.
 _MOST_CURVED = 0.25
 _LEAST_HALF_AXIS = 4.0
-#: What is called the edge: this many deviations of the blur on either side.
+#: Half width of the edge, standard deviations of the blur.
 _EDGE_BLURS = 2.0
-#: Of windows of more pixels than this, some are taken off the edge.
+#: In windows of more pixels than this, those off the edge are subsampled.
 _DENSE_WINDOW = 2048
 _NEVER, _SOMETIMES, _ALWAYS = range(3)
-#: Share of the distance between pixels that are taken by which they shift from row to row: one that
-#: never repeats soon.
+#: Shift of the subsampled pixels from row to row, as a share of their spacing; it repeats rarely.
 _SHIFT = 0.381966
 
 
 class Reach(NamedTuple):
-    """Which pixels are fitted."""
+    """Which pixels are fitted: those that any of the first three limits includes."""
 
-    radii: float  #: All within this many radii of the start,
-    px: float  #: and those this near to the disc's edge, pixels,
-    blurs: float  #: or this many standard deviations of the blur;
-    nearest: float  #: but none nearer than this, radii,
-    farthest: float  #: nor farther.
+    radii: float  #: Distance from the initial centre, radii.
+    px: float  #: Distance from the edge, pixels.
+    blurs: float  #: Distance from the edge, standard deviations of the blur.
+    nearest: float  #: Lower limit of the distance from the centre, radii.
+    farthest: float  #: Upper limit of that.
 
 
 class Candidate(NamedTuple):
-    """Where a disc may be."""
+    """Possible position of a disc."""
 
     u: int
     v: int
     radius: float  #: Nominal, metres.
-    blur: float  #: About how blurred it is (along u), pixels.
+    blur: float  #: Approximate blur along u, pixels.
 
 
 class View(NamedTuple):
-    """How a candidate is seen."""
+    """The appearance of a candidate."""
 
-    shape: int  #: `EDGE`, or along which axis its chords run.
+    shape: int  #: `EDGE`, or the axis of its chords.
     u_per_radius: float
-    v_per_radius: float  #: How many pixels one radius can be at most; 0 where no floor is seen.
-    #: By how much the floor moves from pixel to pixel: x, y by u, and by v; radii.
+    v_per_radius: float  #: Largest extent of one radius, pixels; 0 if no floor is visible.
+    #: Floor steps from pixel to pixel: of x, y by u, and by v; radii.
     steps: tuple[float, float, float, float]
 
 
 @kernel(forceinline=True)
 def floor_steps(floor_xy: Float32Array, u0: int, v0: int) -> tuple[float, float, float, float]:
-    """By how much the floor moves from pixel to pixel: x, y by u, and by v."""
+    """Floor steps from pixel to pixel: of x, y by u, and by v, as central differences."""
     height, width = floor_xy.shape[:2]
     u = min(max(u0, 1), width - 2)
     v = min(max(v0, 1), height - 2)
@@ -121,7 +119,7 @@ def floor_steps(floor_xy: Float32Array, u0: int, v0: int) -> tuple[float, float,
 
 @kernel(forceinline=True)
 def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio: float) -> View:
-    """How a candidate of a radius relative to the nominal one is seen.
+    """The appearance of a candidate whose radius is `relative` times the nominal one.
 
     `ratio` is the blur along v over that along u, in pixels.
     """
@@ -133,7 +131,7 @@ def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio
         return View(EDGE, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
     along_u = math.hypot(xv, yv) / area
     along_v = math.hypot(xu, yu) / area
-    # In the metric in which the blur is round, the ellipse has the half axes a and b.
+    # In the metric in which the blur is round, the ellipse has the semi-axes a and b.
     variance_u = candidate.blur * candidate.blur + PIXEL_VARIANCE
     variance_v = candidate.blur * candidate.blur * ratio * ratio + PIXEL_VARIANCE
     uu = variance_u * (xu * xu + yu * yu)
@@ -159,12 +157,12 @@ def gather(
     start: Disc,
     patch: Any,
 ) -> tuple[int, IntArray]:
-    """Fill a patch (`PATCH`) with the pixels round a candidate; none where it sees no floor.
+    """Fill a patch (`PATCH`) with the pixels around a candidate; none if no floor is visible.
 
-    Pixels see the floor at `floor_xy` (H, W, 2), metres. `blur_ratio` is the blur along v over that
-    along u, in pixels: 0.5 in single fields of interlaced frames. The fit begins at `start`.
-    Returns the shape (`EDGE`, or along which axis chords run), and (SECTORS + 1,) where in the
-    patch each sector begins, and the last ends.
+    `floor_xy` (H, W, 2) are the pixels' floor positions, metres. `blur_ratio` is the blur along v
+    over that along u, in pixels: 0.5 in single fields of interlaced frames. `start` is the initial
+    disc. Returns the shape (`EDGE`, or the axis of the chords), and (SECTORS + 1,) indices in the
+    patch at which each sector begins, and the last ends.
     """
     ends = np.zeros(SECTORS + 1, np.int64)
     view = view_of(floor_xy, candidate, start.radius, blur_ratio)
@@ -177,7 +175,7 @@ def gather(
 
 @kernel(forceinline=True)
 def sector_of(x: float, y: float) -> Any:
-    """(int32) In which sector a place is, relative to the disc's centre: from x to y."""
+    """(int32) Sector of a position relative to the disc's centre, counted from x towards y."""
     ax, ay = abs(x), abs(y)
     k: Any = np.int32(ay > _TAN_1 * ax) + np.int32(ay > ax) + np.int32(ay > _TAN_3 * ax)
     k = np.int32(7) - k if x < F32(0.0) else k
@@ -194,9 +192,9 @@ def _sort_by_sector(
     patch: Any,
     ends: IntArray,
 ) -> None:
-    """Sort pixels by sector, and leave out those that are too near or too far.
+    """Sort pixels by sector, and drop those that are too near to the centre or too far from it.
 
-    Sectors are filled up to whole numbers of pixels with more of the same, of no weight.
+    Sectors are padded with copies of their first pixel, of weight 0.
     """
     floor, pixel = floor_xy.reshape(-1, 2), patch.pixel[:count].copy()
     x0 = F32(floor_xy[candidate.v, candidate.u, 0] + candidate.radius * start.x)
@@ -235,7 +233,7 @@ def _choose(
     view: View,
     patch: Any,
 ) -> int:
-    """Which pixels are within reach; returns their number."""
+    """Write the indices of the pixels within reach into the patch; returns their number."""
     height, width = floor_xy.shape[:2]
     u0, v0 = candidate.u, candidate.v
     most = 1.08 * reach.radii
@@ -250,7 +248,7 @@ def _choose(
     shift = max(1, int(_SHIFT * every + 0.5))
     floor = floor_xy.reshape(-1, 2)
     pixel, taken, row_x, row_y = patch.pixel, patch.taken, patch.row_x, patch.row_y
-    # Places relative to the start, in its radii.
+    # Positions relative to the start, in its radii.
     x0 = F32(floor_xy[v0, u0, 0] + candidate.radius * start.x)
     y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
     per_radius = F32(1.0 / (candidate.radius * start.radius))
@@ -278,7 +276,7 @@ def _choose(
 def _take(
     length: int, blur: float, blur_ratio: float, reach: Reach, view: View, patch: Any
 ) -> None:
-    """How the pixels of a row are taken: at the edge all, of the others within reach some."""
+    """Decide which pixels of a row are taken: all at the edge, a subset of others within reach."""
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
@@ -302,7 +300,7 @@ def _take(
             | (off_2 <= reach_px * (gu + gv))
             | (off_2 <= reach_u * gu + reach_v * gv)
         )
-        # At the candidate itself, where all is zero, there is no edge.
+        # At the candidate itself, where all terms are zero, there is no edge.
         edge = off_2 < edge_u * gu + edge_v * gv
         taken = _SOMETIMES if within else _NEVER
         patch.taken[k] = _ALWAYS if within & edge else taken
@@ -317,7 +315,7 @@ def _describe(
     count: int,
     patch: Any,
 ) -> None:
-    """The floor and the grey values at the pixels chosen."""
+    """Write floor positions, steps and grey values of the chosen pixels into the patch."""
     grey, floor = image.reshape(-1), floor_xy.reshape(-1, 2)
     width = image.shape[1]
     first, second = (width, 1) if shape == CHORDS_ALONG_V else (1, width)

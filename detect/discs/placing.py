@@ -1,11 +1,11 @@
-"""Where discs are: the fit of the whole disc, the fit by parts, or the points of its rim.
+"""Positions of discs: from a fit of the whole disc, a fit by parts, or the points of the rim.
 
-A disc that is wholly in view is fitted as a whole. One that something hides, stains or lights in
-part is fitted by its edge, sector by sector (`detect.discs.fit`), as is a whole one that the fit
-does not explain well: the more certain place counts. Where too few sectors agree on one disc, the
-points of the rim give the place (`detect.discs.rim`). A rim in part may be that of more than one
-circle: the squared distance of another one that is nearly as likely is in the covariance. Of a
-part, radius and place trade off: what the other discs of the image say of the radius is used.
+A fully visible disc is fitted as a whole. A disc that is partly occluded, stained or unevenly lit
+is fitted by its edge, sector by sector (`detect.discs.fit`). So is a fully visible one that the
+first fit does not explain well; the more certain position is kept. If too few sectors agree, the
+points of the rim give the position (`detect.discs.rim`). A partial rim may belong to more than one
+circle: the squared distance to another plausible one is added to the covariance. Since a part of a
+disc hardly separates radius from position, the other discs of the image provide the radius.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from redetect.compiled import kernel
 if TYPE_CHECKING:
     from detect.discs.judgement import Judgement
 
-#: Pixels of a whole disc, and of its edge.
+#: Pixels that the fit of a whole disc uses, and those of the fit by parts.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
 EDGE_ALONE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
-#: Standard deviation of a radius, relative: of a disc whose place does not depend on it; of all
-#: discs, about the nominal one; of one about the others, usually and at most.
+#: Relative standard deviations of radii: prior of a whole disc's fit; mean radius of all discs
+#: against the nominal one; one disc against the mean, prior and maximum.
 RADIUS_SIGMA, _CALIBRATED_SIGMA = 0.08, 0.02
 _USUAL_SCATTER, _MOST_SCATTER = 0.01, 0.03
-#: Steps of the robust mean of radii; it starts at their median if there are so many.
+#: Steps of the robust mean of radii, and the number of radii from which it starts at their median.
 _SIZE_STEPS, _LEAST_OTHERS = 4, 3
-#: Share of the variance that a fit explains where nothing but a disc and noise is there.
+#: Share of the variance that a fit explains if there is nothing but a disc and noise.
 _WELL_EXPLAINED = 0.97
-#: From this share of the variance on that it explains, the fit of the whole disc gives the place:
-#: where this share of the rim is in view, and where less is.
+#: Share of the rim from which it is complete; share of the variance that the fit of the whole disc
+#: has to explain with a complete rim, and with less of it.
 _WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.97
-#: A whole disc's fit is final if it explains this much of the variance.
+#: The fit of a whole disc is final if it explains this share of the variance.
 _EXPLAINS_ALL = 0.99
-#: A blur that reached this share of the most that a patch allows is fitted again in a wider one.
+#: If the blur reaches this share of a patch's bound, the fit is repeated in a wider patch.
 _AT_BOUND, _MOST_REFITS = 0.98, 2
-#: Blur where nothing is known of it, pixels.
+#: Initial blur, pixels.
 _BLUR_PX = 1.0
 #: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
 
 
 class Place(NamedTuple):
-    """Where a disc is, metres, and the covariance of that."""
+    """Position of a disc, metres, and its covariance."""
 
     x: float
     y: float
@@ -59,7 +59,7 @@ class Place(NamedTuple):
 
 
 class Size(NamedTuple):
-    """What is known of a disc's radius, metres."""
+    """Prior of a disc's radius, metres."""
 
     radius: float
     sigma: float
@@ -67,13 +67,13 @@ class Size(NamedTuple):
 
 @kernel()
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
-    """Place N discs by fits: those that are wholly in view, then the others, of about their size.
+    """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
     Parameters
     ----------
     scene : Scene
     discs : Judgement
-        Of N discs.
+        N discs.
     work : WORK
         Working space (`detect.discs.fit`).
 
@@ -91,7 +91,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
     for k, fit in enumerate(whole):
         if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
             radii[k] = _radius_seen(fit, Size(scene.radius, RADIUS_SIGMA * scene.radius))
-    # Those that are hidden in part say something of the size too, and are then fitted once more.
+    # Partly hidden discs contribute to the size, too, and are then fitted once more.
     parts, radii_of_whole = list(whole), radii.copy()
     for k, fit in enumerate(whole):
         if not _explains(fit, discs, k):
@@ -127,7 +127,7 @@ def _start_at(fit: Fit) -> Start:
 
 @kernel(inline="always")
 def _radius_seen(fit: Fit, expected: Size) -> tuple[float, float]:
-    """Radius of a fitted disc, metres, and one over its variance, less what was expected of it."""
+    """Radius of a fitted disc, metres, and its inverse variance, both with the prior removed."""
     information = fit.radius_information
     if not information > 0.0:
         return 0.0, 0.0
@@ -160,14 +160,14 @@ def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
 
 @kernel(inline="always")
 def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
-    """Fit the whole disc of a rim."""
+    """Fit disc k as a whole."""
     settings = FitSettings(False, scene.radius, RADIUS_SIGMA, WHOLE)
     start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX)
     fit = fit_disc(scene, start, settings, work)
     for _ in range(_MOST_REFITS):
         if not fit.arrived or fit.blur <= _AT_BOUND * fit.blur_bound:
             break
-        # Too blurred for its patch: once more, in a wider one.
+        # Too blurred for its patch: fit again in a wider one.
         start = Start(fit.x, fit.y, fit.radius, fit.blur_bound)
         fit = fit_disc(scene, start, settings, work)
     return fit
@@ -175,7 +175,7 @@ def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
 
 @kernel(inline="always")
 def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
-    """Whether the fit of a whole disc explains what is seen."""
+    """Whether the fit of a whole disc explains the image."""
     least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
     same_sign = fit.contrast * discs.step[k] > 0.0
     return bool(fit.arrived and fit.explained >= least and same_sign)
@@ -185,7 +185,7 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 def _place_by_rim(
     scene: Scene, discs: Judgement, k: int, before: Fit, size: Size, work: Any
 ) -> Place:
-    """Place a disc by its sectors, or where they differ by the points of its rim."""
+    """Locate a disc by its sectors or, if these disagree, by the points of its rim."""
     start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], size.radius, _BLUR_PX)
     if before.arrived:
         start = _start_at(before)
@@ -210,14 +210,13 @@ def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
 
 @kernel()
 def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
-    """How large a disc is, by what is seen of the others of its image.
+    """Estimate the radius of disc k from the other discs of its image.
 
-    All seem larger or smaller where the camera hangs lower or higher than calibrated, and each by
-    itself does a little. The radius of a part of a disc trades with its place, so it has to be
-    known otherwise: as the robust mean of the others, with the scatter about that.
+    If the camera is lower or higher than calibrated, all discs appear larger or smaller; single
+    discs vary a little. A part of a disc hardly separates radius from position, so the radius has
+    to be known otherwise: as the robust mean of the others', with their scatter about it.
 
-    `radii` (N, 2) are those of each disc, metres, and one over their variance, 0 where nothing is
-    known; k is the disc.
+    `radii` (N, 2) are each disc's radius, metres, and its inverse variance, 0 if unknown.
     """
     radius, variance, count = np.empty(len(radii)), np.empty(len(radii)), 0
     for i in range(len(radii)):
@@ -229,7 +228,7 @@ def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
     usual, scatter = _USUAL_SCATTER**2, _USUAL_SCATTER**2
     certainty = 0.0
     for _ in range(_SIZE_STEPS):
-        # The nominal radius counts as a disc, and the usual scatter as that of two.
+        # The nominal radius counts as one disc, the usual scatter as that of two.
         certainty = 1.0 / _CALIBRATED_SIGMA**2
         total, squares = certainty, 2.0 * usual
         for i in range(count):

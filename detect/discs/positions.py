@@ -1,10 +1,10 @@
 """Covariances of fitted positions on the floor.
 
 With J = d(x, y) / d(u, v), the floor's Jacobian at a position (the inverse of the projection's, by
-central differences), a position has the covariance of its fit, plus p J J^T for a systematic error
-in the image, plus what the tilt of the robot may do: turned about its origin on the floor, by w_X
-and w_Y, it gives a position (x, y) the height x w_Y - y w_X, which moves the position along the
-line of sight, by its offset from the camera over the camera's height.
+central differences), the covariance is that of the fit, plus p J J^T for a systematic error in the
+image, plus the effect of the robot's unknown tilt: a rotation by w_X and w_Y about the origin on
+the floor raises a position (x, y) by x w_Y - y w_X, which moves it along the line of sight, by its
+horizontal offset from the camera over the camera's height.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
-#: Of the central differences of the projection, metres.
+#: Step of the central differences of the projection, metres.
 _STEP_M = 1e-5
-#: The published covariance: this deviation in every direction, and two pixels squared.
+#: The published covariance: this standard deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M, PUBLISHED_PIXEL_VARIANCE = 0.04, 2.0
 
 
@@ -25,7 +25,7 @@ PUBLISHED_FLOOR_M, PUBLISHED_PIXEL_VARIANCE = 0.04, 2.0
 def _add_pixels(
     numbers: FloatArray, x: float, y: float, pixel_variance: float, covariance: FloatArray
 ) -> None:
-    """Add the covariance of the pixel that sees (x, y) to one on the floor: p J J^T."""
+    """Add the covariance of a pixel, mapped to the floor at (x, y), to a covariance: p J J^T."""
     h = _STEP_M
     u1, v1 = project_floor_point(numbers, x + h, y)
     u0, v0 = project_floor_point(numbers, x - h, y)
@@ -43,10 +43,10 @@ def _add_pixels(
 def pixel_positions(
     camera_numbers: FloatArray, floor_xy: FloatArray, pixels: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where (N, 2) pixels (u, v) see the floor, (N, 2), and the published (N, 2, 2) covariances.
+    """Floor positions (N, 2) of (N, 2) pixels (u, v), and the published (N, 2, 2) covariances.
 
-    `camera_numbers` are those of `camera.kernels`, and `floor_xy` is what every pixel sees, (H, W,
-    2).
+    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2) is the floor position of every
+    pixel.
     """
     position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
     for k in range(len(pixels)):
@@ -68,14 +68,14 @@ def refined_covariances(
 ) -> FloatArray:
     """(N, 2, 2) covariances of the fits, plus a systematic error in pixels and the camera's tilt.
 
-    `camera_numbers` are those of `camera.kernels`; the variances are of any direction, square
-    pixels and square radians.
+    `camera_numbers` as in `camera.kernels`; the variances are per axis, square pixels and square
+    radians.
     """
     result = fitted.copy()
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
         _add_pixels(camera_numbers, x, y, pixel_variance, result[k])
-        # A product of a column, and a row (-y, x) whose square is x^2 + y^2.
+        # An outer product of a column and a row (-y, x), whose square is x^2 + y^2.
         sight = np.array([(x - centre[0]) / centre[2], (y - centre[1]) / centre[2]])
         for i in range(2):
             for j in range(2):

@@ -1,4 +1,4 @@
-"""The quality of centres: how well two outlines on the floor part the grey values.
+"""The quality of centres: how well two outlines on the floor separate the grey values.
 
 A disc centred at a pixel has an inner outline within its edge and an outer one beyond it
 (`lut.outlines`). Taken as two classes, their grey values have Otsu's quality (N. Otsu, A Threshold
@@ -11,16 +11,16 @@ image,
     quality    = difference^2 / (n_inner n_outer spread)
     contrast   = difference / (n_inner n_outer)
 
-All of these are whole numbers, so the only rounding is that of the final division.
+All of these are integers, so the only rounding is that of the final division.
 
-Most centres are ruled out by a part of their samples, as many of either outline: if these are a
-share f of all, what the classes leave unexplained of all is at least f times what they do of these,
-1 - q >= f (1 - q_f). Proof: let these have the contrast d and the variance s within the classes,
-the rest e and 0. All have at least f s + f (1 - f) ((d - e) / 2)^2 within the classes then, and
-((f d + (1 - f) e) / 2)^2 between them. The former's share of both is least at e = d + 4 s / d, and
+Most centres are ruled out by a subset of their samples with equally many of either outline: if the
+subset is a share f of all samples and has the quality q_f, then 1 - q >= f (1 - q_f). Proof: let
+the subset have the contrast d and the within-class variance s, the rest e and 0. Then all samples
+have a within-class variance of at least f s + f (1 - f) ((d - e) / 2)^2, and the between-class
+variance ((f d + (1 - f) e) / 2)^2. The former's share of the total is least at e = d + 4 s / d, and
 is f (1 - q_f) there. (Samples outside the image make f larger.) Neighbouring centres share such
-samples (`lut.CentreGroups`), and the columns of a group are summed side by side. A grey value and
-its square are added at once, as x 2^20 + x^2: of up to 16 pixels both sums have room in 32 bits.
+subsets (`lut.CentreGroups`), and the columns of a group are summed side by side. A grey value and
+its square are added at once, as x 2^20 + x^2: both sums of up to 16 pixels fit into 32 bits.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from lut import GROUP_COLUMNS, GROUP_SAMPLES, CentreGroups, DiscTable
 from redetect.array_types import ByteArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-# Unsigned: an index that is none of those counted from the end.
+# Unsigned, so that no code for negative indices is generated.
 _U64, _U32, _I32, _F32 = np.uint64, np.uint32, np.int32, np.float32
 _SAMPLES, _COLUMNS = _U64(GROUP_SAMPLES), _U64(GROUP_COLUMNS)
-#: Where the sum of grey values begins in one with that of their squares, and what masks the latter.
+#: In a joint sum of grey values and their squares: first bit of the former, mask of the latter.
 _SHIFT, _SQUARES = _U32(20), _U32((1 << 20) - 1)
-#: Single precision is enough to rule out, if a little less is asked for than was meant.
+#: Slack of the thresholds, so that rounding in single precision never rules out a good centre.
 _ROUNDING = 1e-6
 
 
 class Limits(NamedTuple):
-    """Which centres are found."""
+    """Limits of the centres that are found."""
 
-    quality: float  # at least, and above 0,
-    part_quality: float = 0.0  # in the samples that a group shares at least this,
-    contrast: float = 0.0  # and more than this, grey levels, of either sign
-    sign: int = 0  # 1 for those lighter than what is around them, -1 for darker ones, 0 for both
+    quality: float  # minimum; 0 itself is excluded
+    part_quality: float = 0.0  # minimum in the samples that a group shares
+    contrast: float = 0.0  # has to be exceeded, grey levels, by its absolute value
+    sign: int = 0  # 1 for centres lighter than their surroundings, -1 for darker ones, 0 for both
 
 
 class Centres(NamedTuple):
@@ -58,17 +58,17 @@ class Centres(NamedTuple):
 
     pixels: IntArray  # (N, 2) pixels (u, v)
     quality: FloatArray  # (N,)
-    contrast: Float32Array  # (N,) of the inner outline to the outer, grey levels
+    contrast: Float32Array  # (N,) mean of the inner outline minus that of the outer, grey levels
 
 
 def least_part_quality(quality: float, samples: int) -> float:
-    """Quality that the samples of a group must have if all of both outlines have `quality`."""
+    """Lower bound of the quality of a group's samples if all samples have `quality`."""
     return 1.0 - (1.0 - quality) * samples / GROUP_SAMPLES
 
 
 @kernel(forceinline=True)
 def _with_squares(grey: ByteArray, first: int, end: int) -> NDArray[np.uint32]:
-    """Of some pixels, x 2^20 + x^2; uninitialised before and after them."""
+    """Terms x 2^20 + x^2 of some pixels; uninitialised before and after them."""
     both = np.empty(len(grey), np.uint32)
     for i in range(_U64(first), _U64(end)):
         x = _U32(grey[i])
@@ -80,7 +80,7 @@ def _with_squares(grey: ByteArray, first: int, end: int) -> NDArray[np.uint32]:
 def _columns_left(
     both: NDArray[np.uint32], samples: NDArray[np.uint32], g: int, least_quality: np.float32
 ) -> np.int32:
-    """Which columns of a group the samples that they share do not rule out, a bit each."""
+    """Columns of a group that their shared samples do not rule out, one bit each."""
     left = _I32(0)
     for column in range(_COLUMNS):
         inner = outer = _U32(0)
@@ -101,8 +101,8 @@ def _quality_of(
     grey: ByteArray, samples: NDArray[np.uint32], i: int, outside: int
 ) -> tuple[float, float]:
     """Quality and contrast of a centre."""
-    # Whole numbers all, and exact: but sums of floats stay in order, one sample after the other,
-    # which is faster than vectors put together from single samples.
+    # All sums are integers, hence exact. As floats they are not reordered by the compiler, which is
+    # faster than gathering single samples into vectors.
     a = b = squares = 0.0
     n_inner = n_outer = 0
     for k in range(_U64(samples.shape[1])):
@@ -125,17 +125,17 @@ def find_centres(
     grey: ByteArray, outside: int, pixels: NDArray[np.int32],
     samples: NDArray[np.uint32], groups: CentreGroups, limits: Limits,
 ) -> Centres:  # fmt: skip
-    """The centres of a `lut.DiscTable` within some limits.
+    """Find the centres of a `lut.DiscTable` within some limits.
 
-    `grey` is the image in scan order, H W pixels, and anything after it up to `GROUP_COLUMNS`
-    pixels; `outside` is H W.
+    `grey` is the image in scan order, H W pixels, padded to at least `GROUP_COLUMNS` pixels;
+    `outside` is H W.
     """
     least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
     both = _with_squares(grey, groups.begin, groups.end)
     left_of = np.empty(len(groups.samples), np.int32)
     for g in range(_U64(len(left_of))):
         left_of[g] = _columns_left(both, groups.samples, g, least_part)
-    # Those that are left are collected first: the next one's samples are fetched meanwhile then.
+    # The remaining centres are collected first, so that fetching of their samples overlaps.
     group = np.flatnonzero(left_of)
     centre = np.empty(len(group) * GROUP_COLUMNS, np.int64)
     most = 0
@@ -161,7 +161,7 @@ def find_centres(
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
-    """The centres of a table that are within some limits.
+    """Find the centres of a table within some limits.
 
     Parameters
     ----------
@@ -190,9 +190,9 @@ def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
 def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, Float32Array]:
     """(H, W) Otsu's quality of the outlines around every centre of a table, and their contrast.
 
-    The quality is the between-class variance of their grey values over the total one, 0 where the
-    table has no centre; the contrast the mean grey value of the inner outline minus that of the
-    outer. Raises FrameError if the image does not belong to the table.
+    The quality is the between-class variance of the grey values over the total variance, 0 where
+    the table has no centre; the contrast is the mean grey value of the inner outline minus that of
+    the outer. Raises FrameError if the image does not belong to the table.
     """
     centres = centres_of(image, table, Limits(quality=0.0))
     u, v = centres.pixels.T

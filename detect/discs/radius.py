@@ -1,9 +1,9 @@
-"""The radius of the discs in some images: that at which the evidence of all of them is largest.
+"""Estimates the radius of the discs in some images by maximising their total evidence.
 
-Discs are searched at radii that grow by a constant factor, first at every second one, then beside
-the best of these; a parabola through the logarithms of the best three radii gives the peak.
-Evidence is a log-odds (`detect.discs.judgement`), in which the radius of each rim has a part, so
-that its sum over the discs is a likelihood of the radius.
+Discs are searched for at radii that grow by a constant factor, first at every second one, then
+beside the best of these; a parabola over the logarithms of the best three radii gives the peak.
+The evidence is a log-odds (`detect.discs.judgement`) that depends on the radius of each rim, so its
+sum over the discs is a likelihood of the radius.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from detect.settings import CircleSettings
 from lut import build_vote_table
 from redetect.array_types import GreyImage
 
-#: Radii that are tried, metres, and the factor from one to the next.
+#: Range of the radii tried, metres, and the factor from one to the next.
 SMALLEST_M, LARGEST_M = 0.02, 0.5
 FACTOR = 1.1
-#: Discs that must be found at the best of them.
+#: Least number of discs at the best radius.
 LEAST_DISCS = 3
 
 
 class RadiusEstimate(NamedTuple):
-    """A radius, its standard deviation (metres), and how many discs showed it."""
+    """A radius, its standard deviation (metres), and the number of discs used."""
 
     radius_m: float
     sigma_m: float
@@ -39,9 +39,9 @@ class RadiusEstimate(NamedTuple):
 def find_radius(
     images: Sequence[GreyImage], camera: Camera, settings: CircleSettings
 ) -> RadiusEstimate | None:
-    """Find the radius of the discs in some images, whatever that in the settings is.
+    """Find the radius of the discs in some images; the radius in the settings is ignored.
 
-    None where fewer than `LEAST_DISCS` discs are found at any radius.
+    None if fewer than `LEAST_DISCS` discs are found at any radius.
     """
     count = math.ceil(math.log(LARGEST_M / SMALLEST_M) / math.log(FACTOR))
     radii = SMALLEST_M * FACTOR ** np.arange(count + 1)
@@ -72,6 +72,6 @@ def find_radius(
         before, here, after = evidence[best - 1 : best + 2]
         shift = 0.5 * (after - before) / (2.0 * here - before - after)
     radius_m = float(radii[best] * FACTOR**shift)
-    # A camera that leans otherwise than calibrated sees discs some percent larger or smaller.
+    # If the camera's tilt is not as calibrated, discs look some percent larger or smaller.
     sigma_m = 0.5 * radius_m * math.log(FACTOR)
     return RadiusEstimate(radius_m, sigma_m, int(discs[best]))

@@ -1,17 +1,17 @@
-"""The rim of a disc, direction by direction: how much of one circle of the right size is in view.
+"""The rim of a disc, direction by direction: how much of a circle of the right size is visible.
 
-The fit of a whole disc (`detect.discs.fit`) explains every grey value near it, so that a
-door's edge before the disc, a cable across it or a sheet of paper beside it speaks against the
-disc. A person follows the rim instead: where it is in view it lies on one circle of known size, and
-elsewhere something hides it. So does this module. From the middle of a candidate the grey value is
-followed outwards on the floor in `DIRECTIONS` directions. In each, the rim is where the grey value
-changes most from the disc's to the floor's. A circle is fitted to these points by least squares,
-those that are not on it are left out, and the fit is repeated until the points on it stay the same
-(from several starts, for what hides the disc has moved the middle).
+The fit of a whole disc (`detect.discs.fit`) has to explain every grey value near it, so a door's
+edge in front of the disc, a cable across it or a sheet of paper beside it counts as evidence
+against the disc. A person follows the rim instead: where it is visible it lies on one circle of
+known size, elsewhere something hides it. This module does the same. From the centre of a candidate,
+grey values are sampled outwards on the floor in `DIRECTIONS` directions. In each, the rim is where
+the grey value changes most from the disc's to the floor's. A circle is fitted to these points by
+least squares, outliers are removed, and the fit is repeated until the set of inliers stays the same
+(from several starts, because occlusion shifts the centre of the candidate).
 
-The source of the idea is the circle that a minority of points cannot move: M. A. Fischler and
-R. C. Bolles, Random Sample Consensus, CACM 24 (1981). Points are few and starts are near, so that
-fixed starts serve as well as random samples, and give the same answer every time.
+The idea of a circle that a minority of points cannot move comes from M. A. Fischler and
+R. C. Bolles, Random Sample Consensus, CACM 24 (1981). Points are few and the starts are close, so
+fixed starts work as well as random samples, and are deterministic.
 """
 
 from __future__ import annotations
@@ -25,52 +25,51 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Directions from the middle of a candidate.
+#: Directions from the centre of a candidate.
 DIRECTIONS = 32
 #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 STEPS = 32
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
-#: A step of the grey value counts from this share of the disc's contrast on.
+#: Least step of the grey value, as a share of the disc's contrast.
 LEAST_STEP = 0.35
-#: A point is on the circle within this share of the radius, and this many pixels.
+#: Tolerance of a point on the circle: a share of the radius plus a number of pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
-#: Of the radius about the nominal one, relative, to find the circle (the calibrated height may be
-#: off by some percent), and to place it: of a short arc, place and radius trade off.
+#: Relative standard deviation of the prior on the radius: for finding the circle (the calibrated
+#: height may be off by some percent), and for placing it (a short arc does not fix the radius).
 RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
-#: Fewer points than this make no circle.
+#: Least number of points on a circle.
 LEAST_POINTS = 6
-#: A circle is placed by this number of points at least; steps of it, and how many deviations off
-#: the others a point may be.
+#: Least number of points for placing a circle; its steps, and the deviations that make an outlier.
 LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
-#: So many neighbouring points err alike.
+#: Number of neighbouring points with a common error.
 _ALIKE = 1.5
-#: How far the starts of the circle are from the candidate, nominal radii; the first is at it.
+#: Distance of the circle's starts from the candidate, nominal radii; the first is the candidate.
 _START = 0.3
 _STARTS = 9
 _START_X, _START_Y = (
     np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
     for of in (np.cos, np.sin)
 )
-#: Points that a circle must have more for each squared deviation of its radius.
+#: Penalty, in points, for each squared deviation of the radius.
 _POINTS_PER_SIGMA = 0.5
-#: By how much the logarithm of the odds of a circle grows with each point on it.
+#: Log-odds that each point on a circle adds to it.
 _PER_POINT = 0.5
-#: Steps from each start, and the longest of them, nominal radii.
+#: Number of steps from each start, and the longest step, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
-#: A step that is shorter than this, to the same points, is the last, nominal radii.
+#: Iteration stops at a shorter step with the same inliers, nominal radii.
 _ARRIVED = 1e-4
-#: With this share of the points on it, no other circle has more.
+#: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
 _1 = np.uint64(1)
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
-#: Weights of a parabola's beginning, middle and end at the steps.
+#: Weights of a parabola's start, middle and end at the steps.
 _SHARES = np.linspace(NEAREST, FARTHEST, STEPS) / FARTHEST
 _BEGIN, _MIDDLE, _END = (
     (1.0 - _SHARES) * (1.0 - 2.0 * _SHARES),
@@ -82,8 +81,8 @@ _BEGIN, _MIDDLE, _END = (
 class Rim(NamedTuple):
     """The rim of a candidate; lengths are in nominal radii."""
 
-    agreeing: float  #: Share of all directions in which the rim lies on the circle.
-    #: Stretches of two and more neighbouring directions in which it is not on the circle.
+    agreeing: float  #: Share of all directions in which the rim is on the circle.
+    #: Gaps: runs of two or more neighbouring directions in which it is not.
     runs: int
     scatter: float  #: Root mean square distance of the points on the circle from it, in tolerances.
     step: float  #: Mean step of the grey value on the circle (grey levels, inside minus outside).
@@ -94,15 +93,15 @@ class Rim(NamedTuple):
     cov_xy: float
     cov_yy: float
     radius_px: float  #: Geometric mean of the radius over the directions, pixels.
-    #: Towards another circle that the rim may be: its square adds to any covariance, metres.
+    #: Offset to another plausible circle, metres: its square has to be added to the covariance.
     doubt_x: float
     doubt_y: float
 
 
 class Profiles(NamedTuple):
-    """Grey values along the directions from a point of the floor."""
+    """Grey values along the directions from a point on the floor."""
 
-    x: float  #: Where the directions begin, metres.
+    x: float  #: The point, metres.
     y: float
     radius: float  #: Nominal radius, metres.
     grey: FloatArray  #: (DIRECTIONS, STEPS) NaN outside the image.
@@ -114,16 +113,16 @@ class Profiles(NamedTuple):
 def profiles(
     image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> Profiles:
-    """Grey values along the directions from a point (x, y) of the floor, metres.
+    """Grey values along the directions from a point (x, y) on the floor, metres.
 
-    The radius is the nominal one, the camera's numbers are `camera.kernels.camera_numbers`.
+    `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
     u0, v0 = project_floor_point(camera_numbers, x, y)
     half = 0.5 * FARTHEST
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
-        # The image of a direction is a parabola to well below a tenth of a pixel.
+        # A parabola approximates the image of a direction to well below a tenth of a pixel.
         dx, dy = radius * COS[k], radius * SIN[k]
         u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
         u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
@@ -133,7 +132,7 @@ def profiles(
             v = _BEGIN[m] * v0 + _MIDDLE[m] * v1 + _END[m] * v2
             grey[k, m] = math.nan
             if 0.0 <= u < right and 0.0 <= v < bottom:
-                # Unsigned: an index that is none of those counted from the end.
+                # Unsigned, so that no code for negative indices is generated.
                 i, j = np.uint64(u), np.uint64(v)
                 a, b = np.float32(u - i), np.float32(v - j)
                 upper = image[j, i] + a * (np.float32(image[j, i + _1]) - image[j, i])
@@ -145,9 +144,9 @@ def profiles(
 
 @kernel()
 def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
-    """Where along each direction the grey value changes most from the disc's to the floor's.
+    """Find where the grey value changes most from the disc's to the floor's in each direction.
 
-    Returns (DIRECTIONS,) distances from the middle, nominal radii, NaN where no step reaches
+    Returns (DIRECTIONS,) distances from the centre, nominal radii, NaN if no step reaches
     `LEAST_STEP` of the contrast (grey levels inside minus outside), and the steps there.
     """
     distance, step = np.empty(DIRECTIONS), np.zeros(DIRECTIONS)
@@ -182,7 +181,7 @@ def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]
 
 
 class Circle(NamedTuple):
-    """A circle about a candidate, nominal radii."""
+    """A circle relative to a candidate, nominal radii."""
 
     x: float
     y: float
@@ -196,13 +195,13 @@ class Circle(NamedTuple):
 def fit_circle(
     x: FloatArray, y: FloatArray, weight: FloatArray, circle: Circle, radius_sigma: float
 ) -> Circle:
-    """One Gauss-Newton step of centre and radius to weighed points, from a circle near to them.
+    """One Gauss-Newton step of centre and radius to weighted points, from a circle near them.
 
-    Points that are not to be fitted have the weight 0; the radius is 1 within `radius_sigma`.
+    Points to be ignored have weight 0; the radius has the prior 1 +- `radius_sigma`.
     """
     s_x = s_y = s_w = s_xx = s_xy = s_yy = 0.0
     r_x = r_y = r_w = 0.0
-    # All alike, without branches: so several are worked on at a time.
+    # No branches, so that the loop is vectorised.
     for k in range(np.uint64(len(x))):
         dx = x[k] - circle.x
         dy = y[k] - circle.y
@@ -255,9 +254,9 @@ def _choose(
     wide: float,
     chosen: FloatArray,
 ) -> tuple[int, bool]:
-    """Weights of the points on a circle, 0 of others; how many are on it, and whether others were.
+    """Write the inliers' weights, 0 for outliers, into `chosen`; their number, and any change.
 
-    Points with the weight 0 are nowhere.
+    Points with weight 0 are missing.
     """
     count = 0
     changed = 0
@@ -276,12 +275,12 @@ def _choose(
 def best_circle(
     x: FloatArray, y: FloatArray, weight: FloatArray, tolerance: FloatArray, best_chosen: FloatArray
 ) -> tuple[Circle, int, tuple[float, float]]:
-    """The circle that most of some points are on, how many these are, and a doubt.
+    """The circle with most inliers, their number, and the offset to another plausible circle.
 
-    Of (DIRECTIONS,) points about the candidate, nominal radii, those without a weight are none, and
-    those nearer to a circle than their tolerance are on it; `best_chosen` gets the weights of the
-    points on the best one, 0 of the others. The doubt leads towards another circle that points may
-    be of: its square adds to the covariance of the centre.
+    The points (DIRECTIONS,) are relative to the candidate, nominal radii; those with weight 0 are
+    missing. Inliers are closer to the circle than their tolerance; `best_chosen` receives the
+    weights of the best circle's inliers, 0 for the others. The square of the offset has to be added
+    to the covariance of the centre.
     """
     points = 0
     for k in range(DIRECTIONS):
@@ -302,7 +301,7 @@ def best_circle(
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
             if i > 2 and not changed and moved < _ARRIVED:
                 break
-        # Of a circle of another size more points are asked for, as the prior has it.
+        # By the prior on the radius, a circle of another size needs more points.
         score = count - _POINTS_PER_SIGMA * ((circle.radius - 1.0) / RADIUS_SIGMA) ** 2
         if count >= LEAST_POINTS:
             ends[start, 0], ends[start, 1], scores[start] = circle.x, circle.y, score
@@ -311,10 +310,10 @@ def best_circle(
             best = circle
             for k in range(DIRECTIONS):
                 best_chosen[k] = chosen[k]
-            # What has more points than this shares most of them: it is the same circle.
+            # A circle with more points than this would share most of them: it is the same one.
             if score >= _CERTAINLY_BEST * points:
                 break
-    # Of the other circles that were come to, the one that adds most.
+    # Of the circles found from other starts, the one that adds most.
     doubt = 0.0, 0.0
     for start in range(_STARTS):
         odds = math.exp(_PER_POINT * (scores[start] - best_score))
@@ -329,9 +328,9 @@ def best_circle(
 def follow_rim(
     image: GreyImage, camera_numbers: FloatArray, seen: Profiles, contrast: float
 ) -> Rim:
-    """Follow the rim of a candidate, `seen` from about its middle; nothing agrees without a circle.
+    """Trace the rim of a candidate, `seen` from about its centre; `agreeing` is 0 without a circle.
 
-    The contrast is about how much lighter the disc is than the floor, grey levels.
+    `contrast` is approximately that of the disc to the floor, grey levels.
     """
     x, y, radius, scale = seen.x, seen.y, seen.radius, seen.pixels_per_radius
     distance, step = rim_points(seen, contrast)
@@ -365,7 +364,7 @@ def follow_rim(
             mean += step[k]
     runs = 0
     for k in range(DIRECTIONS):
-        # A stretch begins after a direction that agrees, and has two that do not.
+        # A gap follows a direction that agrees, and has at least two that do not.
         last, following = (k - 1) % DIRECTIONS, (k + 1) % DIRECTIONS
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
         runs += 1 if hidden and chosen[last] > 0.0 else 0
@@ -383,10 +382,10 @@ def follow_rim(
 
 @kernel()
 def _placed(x: FloatArray, y: FloatArray, chosen: FloatArray, circle: Circle) -> Circle:
-    """The circle by the inner points of each stretch.
+    """Refit the circle to the inner points of each visible arc.
 
-    Where a stretch ends, the edge of what hides the rest of the rim pulls at the rim's own. Points
-    far off the others by their median deviation are left out.
+    At the ends of an arc, the edge of the occluding object biases the rim's points. Outliers by the
+    median absolute deviation are left out.
     """
     trusted, count = np.zeros(DIRECTIONS), 0
     for k in range(DIRECTIONS):
@@ -417,7 +416,7 @@ def _placed(x: FloatArray, y: FloatArray, chosen: FloatArray, circle: Circle) ->
 
 @kernel()
 def median(values: FloatArray) -> float:
-    """Median of some values, which are sorted. (NumPy's takes much longer to compile.)"""
+    """Median of some values, which are sorted in place. (NumPy's takes much longer to compile.)"""
     count = len(values)
     for i in range(1, count):
         value = values[i]

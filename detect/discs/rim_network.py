@@ -1,18 +1,18 @@
-"""Log-odds that a rim is a disc's, by the grey values about it: a small convolutional network.
+"""Log-odds that a rim is a disc's, from the grey values around it: a small convolutional network.
 
-Far away a disc is some ten pixels wide and three to six rows high. Whether it is one, a person sees
-by the picture as a whole: where the floor goes on behind a cable, how glare fades. The network sees
-grey values sampled in some directions from the middle and at some distances, so that perspective
-and the size of the disc in the image are taken out already. It goes round the circle of directions
-twice (convolutions over three neighbours, the first of which sees whole profiles), keeps the mean,
-the greatest and the least of each channel, and weighs these together with some features of the rim:
+A distant disc is some ten pixels wide and three to six rows high. A person recognises it by the
+picture as a whole: the floor continues behind a cable, glare fades. The network's input are grey
+values sampled at several directions and distances from the centre, so that perspective and the size
+of the disc in the image are removed already. It applies two convolutions over three neighbours
+around the circle of directions (the first of which sees whole profiles), pools the mean, maximum
+and minimum of each channel, and weighs these together with some features of the rim:
 
     a = relu(W1 * x + b1), b = relu(W2 * a + b2), c = relu(W3 [mean b, max b, min b, scale] + b3)
     log-odds = w4 [c, features] + b4
 
-A turn of the disc turns a and b and changes nothing else. Networks that were trained from several
-seeds are averaged; where the first is certain, the others are not asked. There are two sorts of
-them: one glances at every candidate, the other decides about those whose rim was followed.
+A rotation of the disc rotates a and b and changes nothing else. Networks trained from several seeds
+are averaged; if the first is certain, the others are skipped. There are two kinds: one glances at
+every candidate, the other decides about those whose rim was traced.
 `python -m tools.evaluation train-rim-network` trains both.
 """
 
@@ -29,12 +29,12 @@ from redetect.array_types import Float32Array, FloatArray
 from redetect.compiled import kernel
 
 WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
-#: Besides grey values, a network sees of each direction its size in the image and its share outside
-#: it; and of all directions together size and contrast.
+#: Besides grey values, inputs are each direction's size in the image and its share outside it
+#: (`OTHERS`), and size and contrast over all directions (`SCALES`).
 OTHERS, SCALES = 2, 2
-#: Of the grey values' deviations, grey levels squared: less contrast than this is noise.
+#: Added to the variance of the grey values, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-#: Log-odds by one network below and above which the others are not asked.
+#: Log-odds of the first network below and above which the others are skipped.
 HOPELESS, CERTAIN = -4.0, 5.0
 
 _Weights = Float32Array
@@ -47,14 +47,14 @@ class RimNetwork(NamedTuple):
     around_bias: _Weights  # (N, C)
     again: _Weights  # (N, 3, C, C) second convolution
     again_bias: _Weights  # (N, C)
-    dense: _Weights  # (N, 3 C + SCALES, D) of means, greatest and least of channels, and scales
+    dense: _Weights  # (N, 3 C + SCALES, D) of channels' means, maxima and minima, and scales
     dense_bias: _Weights  # (N, D)
     out: _Weights  # (N, D + F) of the dense units and F features of the rim
     out_bias: _Weights  # (N,)
 
 
 class Networks(NamedTuple):
-    """One decides whether the rim of a candidate is followed, the other whether it is a disc's."""
+    """One decides whether the rim of a candidate is traced, the other whether it is a disc's."""
 
     glance: RimNetwork
     look: RimNetwork
@@ -77,13 +77,13 @@ def trained_networks() -> Networks:
 def network_inputs(
     grey: FloatArray, pixels_per_radius: FloatArray, sign: float
 ) -> tuple[_Weights, _Weights]:
-    """What a network sees of (K, M) grey values in K directions at M distances.
+    """The input of a network for (K, M) grey values in K directions at M distances.
 
-    These are NaN outside the image. The sign is -1 for a dark disc, which is seen as a light one.
-    Inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean square, 0
-    outside; logarithm of the pixels per radius; share outside. The last direction is before the
-    first, and the first behind the last. Scales are logarithms of the pixels per radius and of the
-    root mean square, less usual ones.
+    Grey values are NaN outside the image. `sign` is -1 for a dark disc, which is seen as a light
+    one. The inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean
+    square, 0 outside the image; the logarithm of the pixels per radius; the share outside. They are
+    padded by the last direction in front and the first at the end. The scales are logarithms of the
+    pixels per radius and of the root mean square, relative to usual ones.
     """
     directions, distances = grey.shape
     inputs = np.zeros((distances + OTHERS, directions + 2), np.float32)
@@ -142,7 +142,7 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
 ) -> float:
-    """Log-odds that a rim is a disc's, the mean of the networks; (F,) features are the rim's."""
+    """Log-odds that a rim with (F,) features is a disc's, the mean of the networks."""
     members, channels = network.around_bias.shape
     units = network.dense_bias.shape[1]
     directions = inputs.shape[1] - 2

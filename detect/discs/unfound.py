@@ -1,7 +1,7 @@
-"""Why discs are not found: the candidates of an image, with the stage and number that dropped each.
+"""Explains why discs are not found: the candidates of an image, and what rejected each.
 
 The candidates are those of the detector itself (`detect.discs.judgement`) for discs of both
-polarities. Suggestions are tried: each says what would be found with it.
+polarities. Suggestions are tried out: each states what would be found with it.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from redetect.array_types import FloatArray, GreyImage
 
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
 
-#: Radii that are tried at a place are as much smaller and larger.
+#: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
-#: A place is as far as this from where it was pointed at, radii.
+#: Largest distance of a candidate from the given position, radii.
 _NEAR = 1.5
-#: Radii of rims whose median differs by this share from the usual one are worth a suggestion.
+#: Relative deviation of the rims' median radius from the expected one that causes a suggestion.
 _OTHER_RADIUS = 0.04
 _FEWEST_RIMS = 5
 
@@ -48,21 +48,21 @@ class Candidate(NamedTuple):
 
     u: float  # pixel
     v: float
-    x_m: float  # where that is on the floor as the camera is calibrated, metres
+    x_m: float  # position on the calibrated floor, metres
     y_m: float
-    votes: float  # of edges, relative to what is usual as far away
-    contrast: float  # grey levels inside minus outside; NaN where no rim was followed
-    stage: Stage  # what dropped it; "disc" if it was found
-    value: float  # the number that decided,
-    limit: float  # and what it should have been at least; NaN where there is none
+    votes: float  # of edges, relative to the mean at the same distance
+    contrast: float  # grey levels inside minus outside; NaN if no rim was traced
+    stage: Stage  # that rejected it; "disc" if it was found
+    value: float  # the number that decided
+    limit: float  # least value of it that passes; NaN if there is none
 
     @property
     def is_disc(self) -> bool:
-        """Whether it was found."""
+        """Whether the candidate was found."""
         return self.stage == "disc"
 
     def reason(self) -> str:
-        """In words, with the flag that decides."""
+        """The reason in words, with the flag that sets the limit."""
         value, limit = f"{self.value:.2f}", f"{self.limit:.2f}"
         return {
             "disc": f"found: evidence {value}, least {limit}",
@@ -76,7 +76,7 @@ class Candidate(NamedTuple):
         }[self.stage]
 
     def record(self) -> dict[str, Any]:
-        """All of it, and the reason, for JSON; what is not finite is null."""
+        """All fields and the reason, for JSON; non-finite values become null."""
         values = self._asdict().items()
         known = {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -87,14 +87,14 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True)
 class DiscExplanation:
-    """What became of the candidates of an image."""
+    """The candidates of an image, and why they were accepted or rejected."""
 
-    candidates: tuple[Candidate, ...]  # those that were found first, then by falling votes
-    place: str  # of the place that was pointed at; empty without one
+    candidates: tuple[Candidate, ...]  # found ones first, then by decreasing votes
+    place: str  # description of the given position; empty without one
     suggestions: tuple[str, ...]  # what to try, and what that would find
 
     def to_json(self) -> str:
-        """All of it, the candidates numbered from 1."""
+        """The explanation as JSON, with candidates numbered from 1."""
         content = {
             "place": self.place,
             "suggestions": list(self.suggestions),
@@ -111,17 +111,16 @@ def explain_discs(
     settings: CircleSettings,
     at: tuple[float, float] | None = None,
 ) -> DiscExplanation:
-    """Explain what was found in an image, and what was not.
+    """Explain what was found in an image and what was not.
 
     Parameters
     ----------
     image : (H, W) uint8
     camera : Camera
     settings : CircleSettings
-        Always with `refine`: the published detector drops what is of a low quality, and nothing
-        else.
+        `refine` is always on: the published detector rejects centres only for their low quality.
     at : (float, float), optional
-        Pixel (u, v) of something that should have been found: candidates near it alone.
+        Pixel (u, v) of something that should have been found; only candidates near it are listed.
     """
     scene = _Scene(image, camera, replace(settings, refine=True))
     candidates = list(_candidates(scene))
@@ -136,7 +135,7 @@ def explain_discs(
 
 
 def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:
-    """A sentence on the candidates for discs in images (H, W) without any, and what they fail."""
+    """A sentence on why the candidates in images (H, W) without discs were rejected."""
     settings = replace(settings, refine=True)
     scenes = (_Scene(image, camera, settings) for image in images)
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
@@ -155,7 +154,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
 
 @dataclass(frozen=True)
 class _Scene:
-    """An image, and what is found in it."""
+    """An image and what is found in it."""
 
     image: GreyImage
     camera: Camera
@@ -171,13 +170,13 @@ class _Scene:
 
     @cached_property
     def judgement(self) -> tuple[FloatArray, Judgement]:
-        """Votes for the candidates of either polarity, and what they are."""
+        """Votes for the candidates of both polarities, and their classification."""
         any_sign, noise = replace(self.settings, polarity="any"), estimate_noise(self.image)
         candidates = candidates_of(self.image, self.table, any_sign, noise)
         return candidates.score, judged(self.image, self.camera, any_sign, candidates, noise)
 
     def count(self, at: tuple[float, float] | None) -> int:
-        """Discs that were found, near a pixel if one is given."""
+        """Number of discs found, near a pixel if one is given."""
         if at is None:
             return len(self.found)
         here = self.camera.floor_from_pixel(at)
@@ -185,7 +184,7 @@ class _Scene:
 
 
 def _candidates(scene: _Scene) -> Iterator[Candidate]:
-    """What was found, and the candidates that were rejected."""
+    """The discs found, and the rejected candidates."""
     camera, settings, found = scene.camera, scene.settings, scene.found
     votes, judgement = scene.judgement
     evidence = adjusted_log_odds(judgement, settings)
@@ -249,7 +248,7 @@ def _place(at: tuple[float, float], scene: _Scene) -> str:
 
 
 def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]:
-    """What to change, where it finds more (at the place that was pointed at)."""
+    """Changes of settings that find more (at the given position)."""
     settings, here = scene.settings, scene.count(at)
     if at is not None and here:
         return
@@ -283,7 +282,7 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
 
 
 def _radius_at(scene: _Scene, at: tuple[float, float]) -> float | None:
-    """The radius at which a disc of the highest evidence is found at a pixel."""
+    """The radius at which the disc with the highest evidence is found at a pixel."""
     camera, settings = scene.camera, scene.settings
     here = camera.floor_from_pixel(at)
     if not np.isfinite(here).all():

@@ -18,7 +18,7 @@ from redetect.landmarks import circle_arrays, is_positive_definite
 from redetect.plane import apply, ellipses
 from redetect.reporting.page import Part, figure_file, image_part
 
-#: Colours that stay apart in print and for the colour-blind; differences remain without them.
+#: Colours distinguishable in print and by the colour-blind; line styles differ as well.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
 
 
@@ -29,7 +29,7 @@ _MOST_DOTS = 4000
 
 
 def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
-    """Recall and precision over the least quality."""
+    """Recall and precision over the threshold of the quality."""
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
         axes.plot(least, recall, color=DATA, lw=1.4, label="recall")
@@ -71,7 +71,7 @@ def floor_figure(pairs: DiscPairs) -> Part:
     """Differences on the floor over distance, along and across the view; also levelled alike."""
     left_of = np.column_stack([-pairs.away[:, 1], pairs.away[:, 0]])
     distance = np.hypot(*pairs.reference_xy.T)
-    # Both of one panel are of the same scale, so that what levelling explains is seen.
+    # Both panels have the same scale, so that the effect of levelling is visible.
     series = [("as the rows are", pairs.as_written, SECOND, "s--")]
     if pairs.levelled_apart:
         series.append(("levelled alike", pairs.offset, DATA, "o-"))
@@ -96,8 +96,8 @@ def floor_figure(pairs: DiscPairs) -> Part:
             axes.set_title(name, fontsize=9)
         both[0].legend(fontsize=8)
     words = (
-        "Where on the floor the two sides put the same disc, detected minus reference: each pair, "
-        "and medians in bins of equally many."
+        "Positions of the same disc on the floor, detected minus reference: each pair, and medians "
+        "in bins of equal counts."
     )
     return _part(words, content, 3.1)
 
@@ -116,8 +116,8 @@ def bearings_figure(pairs: LinePairs) -> Part:
         _finish(axes, "bearing / deg, positive to the left", "error / deg")
         axes.legend(fontsize=8)
     words = (
-        "Bearing errors of matched verticals, without sign, over bearing: each vertical, "
-        "medians and 95 % quantiles in bins of equally many."
+        "Absolute bearing errors of matched verticals over bearing: each vertical, medians and "
+        "95 % quantiles in bins of equal counts."
     )
     return _part(words, content, 2.8)
 
@@ -143,12 +143,12 @@ def tilt_figure(rows: Sequence[SeenRows]) -> Part:
             _finish(axes, "", name)
         both[0].legend(fontsize=8)
         both[1].set_xlabel("frame")
-    words = "Pitch and roll that turn measured directions level, with one standard deviation."
+    words = "Pitch and roll that level measured directions, with one standard deviation."
     return _part(words, content, 3.4)
 
 
 def _dots(axes: Axes, at: FloatArray, values: FloatArray, colour: str) -> None:
-    """Some of the points, small and pale unless they are few."""
+    """Draw a subset of the points, small and pale unless they are few."""
     thin = max(1, len(at) // _MOST_DOTS)
     size, alpha = (1.5, 0.25) if len(at) > 100 else (5.0, 0.7)
     axes.plot(at[::thin], values[::thin], ".", color=colour, ms=size, alpha=alpha)
@@ -164,14 +164,14 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
 
 
-#: Size of the map's ellipses, in standard deviations, and their corners.
+#: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
 _SIGMAS, _CORNERS = 3.0, 32
 
 
 def floor_map(rows: Sequence[SeenRows]) -> Part | None:
-    """Discs found over the run, and those of the reference, along the sum of its steps.
+    """Map of the discs found and of the reference, along the path summed from the steps.
 
-    Forward at the start is up, left is left. None where there are no discs.
+    Forward at the start is up, left is left. None if there are no discs.
     """
     seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
     if not any(found.circles for found, _ in seen):
@@ -199,7 +199,7 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
         axes.legend(fontsize=8)
     words = (
         f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
-        "each frame, along the path that the odometry sums up to."
+        "each frame, along the path summed from the odometry."
     )
     return _part(words, content, _WIDE)
 
@@ -232,7 +232,7 @@ def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
 
 
 def binned(at: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Medians of `at`, medians and 95 % quantiles of `values` in up to 10 bins of equally many."""
+    """Medians of `at`, medians and 95 % quantiles of `values` in up to 10 bins of equal counts."""
     parts = np.array_split(np.argsort(at, kind="stable"), np.clip(len(at) // 8, 1, 10))
     figures = [
         (np.median(at[part]), np.median(values[part]), np.quantile(values[part], 0.95))

@@ -26,10 +26,10 @@ from redetect.storage import demand_place, write_bytes
 
 @dataclass(frozen=True)
 class ReportInputs:
-    """A run's rows, and how they compare with the reference.
+    """A run's rows, and their comparison with the reference.
 
-    `names` are the prefixes of its frames in their order, `rows` the rows of each. `sight` is None
-    without a calibration, comparisons without reference rows.
+    `names` are the prefixes of the frames in order, `rows` the rows of each. `sight` is None
+    without a calibration, comparisons are None without reference rows.
     """
 
     run: ImageRun
@@ -76,7 +76,7 @@ _JPEG_QUALITY = 88
 
 
 def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
-    """The picture of a frame with its rows; or a note that says why there is none."""
+    """The picture of a frame with its rows, or a note on why there is none."""
     frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
     try:
         image = read_image(frame, None if inputs.sight is None else inputs.sight.camera)
@@ -148,7 +148,7 @@ def _summary(inputs: ReportInputs) -> list[Part]:
 
 
 def _discs(inputs: ReportInputs) -> list[Part]:
-    """Rates and errors of discs, and whether covariances are right."""
+    """Rates and errors of discs, and consistency of the covariances."""
     result = inputs.discs
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
@@ -161,23 +161,23 @@ def _discs(inputs: ReportInputs) -> list[Part]:
         parts.append(figures.floor_figure(result.pairs))
         if result.pairs.levelled_apart:
             parts.append(Part("table", *floor_table(result)))
-    return [*parts, *_honesty(result, "two components for each matched disc")]
+    return [*parts, *_consistency(result, "two components for each matched disc")]
 
 
 def _lines(inputs: ReportInputs) -> list[Part]:
-    """Rates and errors of verticals, and whether standard deviations are right."""
+    """Rates and errors of verticals, and consistency of the standard deviations."""
     result = inputs.lines
     if result is None:
         return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
     return [
         *_summary_of(result),
-        *_honesty(result, "one for each matched vertical"),
+        *_consistency(result, "one for each matched vertical"),
         *([figures.bearings_figure(result.pairs)] if result.matched else []),
     ]
 
 
 def _summary_of(result: Comparison) -> list[Part]:
-    """What `detect compare` says."""
+    """The sentences and figures of `detect compare`."""
     rows = tuple(summary_rows(result).items())
     table = Part(
         "details", "All figures, by their names in the JSON", ("what", "value"), rows, left=(0, 1)
@@ -185,8 +185,8 @@ def _summary_of(result: Comparison) -> list[Part]:
     return [Part("text", " ".join(result.sentences())), table]
 
 
-def _honesty(result: DiscComparison | LineComparison, what: str) -> list[Part]:
-    """Whether the stated covariances are right."""
+def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Part]:
+    """Consistency of the stated covariances."""
     residuals = figures.whitened(result)
     if not len(residuals):
         return [Part("note", "No matched rows with a usable covariance: nothing to whiten.")]
@@ -219,8 +219,8 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
         key = (
             ("#ffaa00", f"disc's edge; ±1 {figures.SIGMA} of a vertical"),
             ("#3cc83c", "outlines; vertical"),
-            ("#ff3cff", "fits no reference row"),
-            ("#ff3c3c", "reference row that is missing"),
+            ("#ff3cff", "matches no reference row"),
+            ("#ff3c3c", "missed reference row"),
         )
         words = (
             "Above a disc: quality, distance to its reference row in the image. Below a "

@@ -1,1 +1,1 @@
-"""A whole run: frames in, rows out, by any number of workers, and not lost when it ends early."""
+"""Processes a run: frames in, rows out, with any number of workers; resumes interrupted runs."""

@@ -26,8 +26,8 @@ from redetect.landmarks import read_tilts
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
-#: Runs of at least `_FEWEST_FRAMES` frames get a warning if there are hardly any discs in them, and
-#: if the logarithm of the radius differs by `_OTHER_RADIUS`.
+#: Runs of at least `_FEWEST_FRAMES` frames get a warning if hardly any discs are found, and if the
+#: logarithms of the likely and the given radius differ by `_OTHER_RADIUS`.
 _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
 
 
@@ -122,26 +122,26 @@ def _all(command: All, run: Run) -> Job:
 
 
 def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
-    """The settings with the radius that the discs have in some of the images."""
+    """The settings with the radius estimated from some of the images."""
     from detect.discs.radius import find_radius
 
     images = list(_some_images(run))
     found = find_radius(images, run.camera, settings)
     if found is None:
         raise DetectError(
-            f"{len(images)} images: no radius of discs can be found in them: expected some discs "
-            "on the floor, or --radius-m"
+            f"{len(images)} images: the radius of the discs cannot be estimated from them: "
+            "expected some discs on the floor, or --radius-m"
         )
     print(
-        f"discs have a radius of {found.radius_m:.4f} +- {found.sigma_m:.4f} m, by {found.discs} "
-        f"of them in {len(images)} images",
+        f"discs have a radius of {found.radius_m:.4f} +- {found.sigma_m:.4f} m, estimated from "
+        f"{found.discs} of them in {len(images)} images",
         file=sys.stderr,
     )
     return replace(settings, radius_m=round(found.radius_m, 4))
 
 
 def _some_images(run: Run) -> Iterator[ByteArray]:
-    """Images that are spread over a run, if its length is known in advance."""
+    """Images spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")
     step = max(1, run.frames.expected // _RADIUS_IMAGES)
@@ -151,10 +151,10 @@ def _some_images(run: Run) -> Iterator[ByteArray]:
 
 
 def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
-    """The file that a command's result is written to."""
+    """The file for a command's result."""
     output = command.output if command.output is not None else run.output(kind)
     if not output.name:  # what an empty word becomes, too
-        raise DetectError(f"{output}: is a folder: expected the file to write")
+        raise DetectError(f"{output}: is a folder: expected an output file")
     return output
 
 
@@ -190,7 +190,7 @@ def _print_results(job: Job, summary: RunSummary) -> None:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
     if "tilt" in places and tilt is not None:
         frames_tilt = frames_tilt_place(places["tilt"])
-        print(f"{frames_tilt}: the tilt of {found['tilts']} frames, each by itself")
+        print(f"{frames_tilt}: the separate tilts of {found['tilts']} frames")
         print(f"{places['tilt']}: {tilt.sentence()}")
     elif "tilt" in places:
         others = _other_frames(job.plan, summary)
@@ -208,7 +208,7 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:
         print(
-            "the calibration does not state its covariance: it is taken to be wrong by "
+            "the calibration has no covariance: its error is assumed to be "
             f"{circles.calibration_px:g} px (--calibration-px)"
         )
     elif circles and circles.refine and camera and any(camera.covariance or ()):
@@ -221,18 +221,24 @@ def _print_results(job: Job, summary: RunSummary) -> None:
 
 
 def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
-    """What is done with the discs of frames that have no tilt, if there are any."""
+    """How the discs of frames without a tilt are treated, if there are any."""
     others = summary.frames - summary.failed - summary.found["tilts"]
     if plan.circles is None or plan.levelling == "none" or others == 0:
         return ""
+<<<<<<< HEAD
     sigma_deg = math.degrees(plan.circles.tilt_sigma_rad)
     if sigma_deg == 0.0:
         return f"; the other {others} count as level beyond doubt (see --circles.tilt-sigma-deg)"
     return f"; the other {others} count as level within {sigma_deg:g} degrees"
+=======
+    if plan.circles.tilt_sigma_deg == 0.0:
+        return f"; the other {others} are assumed exactly level (see --circles.tilt-sigma-deg)"
+    return f"; the other {others} are assumed level within {plan.circles.tilt_sigma_deg:g} degrees"
+>>>>>>> english
 
 
 def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
-    """Why hardly anything was found, and what to try."""
+    """Reasons why hardly anything was found, and what to try."""
     plan, camera, found = job.plan, job.plan.camera, summary.found
     if camera is None:
         return
@@ -241,13 +247,13 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
 
         if not cached_vertical_table(camera).usable.any():
             yield (
-                "no verticals: as it is calibrated, the camera looks too far past the horizon, or "
-                "lies on its side"
+                "no verticals: according to the calibration, the camera looks too far above or "
+                "below the horizon, or lies on its side"
             )
     if camera.seen_share < 1.0:
         yield (
-            f"as it is calibrated, the lens folds in the image: {100 * camera.seen_share:.0f} % of "
-            "the pixels see anything; nothing is detected in the others"
+            "according to the calibration, the distortion is not invertible in all of the image: "
+            f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
     hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found["discs"] < summary.frames
     none = not found["discs"] and summary.frames > summary.failed
@@ -270,23 +276,23 @@ def _hints_on_discs(job: Job, settings: CircleSettings, summary: RunSummary) -> 
         discs += f"{why_none(images, job.run.camera, settings)} "
     if summary.frames < _FEWEST_FRAMES:
         yield discs + (
-            "If there are discs in view, try --radius-m auto, which looks for their radius, and "
-            "hold the calibration against the images (`detect draw`)."
+            "If discs are visible, try --radius-m auto, which estimates their radius, and check "
+            "the calibration against the images (`detect draw`)."
         )
         return
     likely = find_radius(images, job.run.camera, replace(settings, polarity="any"))
     if likely is None:
         yield discs + (
-            f"At no radius are more found in {len(images)} of the images: is the calibration that "
-            "of this camera (`detect draw` shows outlines), are there discs in view?"
+            f"Other radii find no more in {len(images)} of the images: is the calibration that of "
+            "this camera (`detect draw` shows outlines), are discs visible?"
         )
     elif abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
         yield discs + (
-            f"It looks as if their radius were {likely.radius_m:.3f} m: {likely.discs} of them are "
-            f"found in {len(images)} of the images. Try --radius-m {likely.radius_m:.3f}."
+            f"Their radius seems to be {likely.radius_m:.3f} m: {likely.discs} of them are found "
+            f"in {len(images)} of the images. Try --radius-m {likely.radius_m:.3f}."
         )
     elif settings.polarity != "any":
         yield discs + (
-            f"Lighter and darker ones together are {likely.discs} in {len(images)} of the images: "
+            f"With both polarities, {likely.discs} are found in {len(images)} of the images: "
             "try --polarity any."
         )

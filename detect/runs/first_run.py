@@ -1,7 +1,7 @@
-"""Stages of the detection of discs where there are none: for their kernels.
+"""Runs later stages of the detection on empty input, so that their kernels are compiled.
 
-A process that has to compile the kernels meets them in the order of a frame's path. Others call
-these functions at the same time, and keep on the disk what the first would compile later.
+A process compiles kernels in the order of a frame's path. Other processes call these functions at
+the same time, and store in the disk cache what the first one would have to compile later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lut import cached_vote_table
 
 
 def place_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Place no disc of the first frame."""
+    """Locate zero discs in the first frame."""
     camera, settings = plan.camera, plan.circles
     if camera and settings and settings.refine:
         image = read_image(tasks[0].frame, camera, plan.working_folder)
@@ -32,7 +32,7 @@ def place_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
 
 
 def level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Find the tilt of the first frame by the outline of no disc, and that of a run."""
+    """Estimate the tilt of the first frame from the outlines of zero discs, and that of a run."""
     camera, settings = plan.camera, plan.circles
     if camera and settings and settings.refine and plan.levelling == "run":
         image = read_image(tasks[0].frame, camera, plan.working_folder)

@@ -1,9 +1,9 @@
-"""The path of one frame: its image in, its verticals, tilts, discs and markers out, and its rows.
+"""Processes one frame: image in; verticals, tilts, discs and markers out, and their rows.
 
-There is a second pass over a run: its discs levelled by the tilt of all its frames.
+A second pass over a run levels its discs by the tilts of all frames.
 
 Workers import this module; a process that delegates the work needs neither the detectors nor the
-compiler, and starts without them.
+compiler, and does not load them.
 """
 
 from __future__ import annotations
@@ -79,27 +79,27 @@ class FrameDetections:
 
     image: GreyImage | None = None  # (H, W); None where it cannot be read
     lines: LineDetections | None = None
-    tilt: FrameTilt | None = None  # by the lines, if enough determine it, or known before
-    seen: CircleDetections | None = None  # discs, where they would be on a level robot
+    tilt: FrameTilt | None = None  # from the lines, if enough determine it, or prior data
+    seen: CircleDetections | None = None  # discs, assuming a level robot
     discs: CircleDetections | None = None  # corrected for the tilt, if the plan says so
-    outline_tilt: FrameTilt | None = None  # by the discs, if a run is levelled by all frames
+    outline_tilt: FrameTilt | None = None  # from the discs, if a run is levelled by all frames
     markers: MarkerDetections | None = None
-    error: str | None = None  # why the frame cannot be worked on
+    error: str | None = None  # why the frame cannot be processed
 
 
-#: What discs are searched with: the camera, as it leans, and its table.
+#: Inputs of the search for discs: the camera, including its lean, and its table.
 Search = tuple[Camera, VoteTable | DiscTable]
 
 
 @lru_cache(maxsize=16)
 def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Search:
-    """The search for discs of a camera: a process makes it or takes it from the cache once."""
+    """Inputs of a camera's search for discs, made or loaded from the cache once per process."""
     leaning = camera if lean is None else leaning_camera(camera, lean)
     return leaning, disc_table(leaning, circles)
 
 
 def prepare(plan: FramePlan) -> None:
-    """Make the tables that a plan needs, or take them from the cache."""
+    """Make the tables that a plan needs, or load them from the cache."""
     if plan.camera and plan.lines:
         cached_vertical_table(plan.camera)
     if plan.camera and plan.circles:
@@ -109,15 +109,15 @@ def prepare(plan: FramePlan) -> None:
 def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetections]:
     """Detect the landmarks of a plan in the images of some frames.
 
-    Every stage is done with all frames before the next one: a decoder and the detectors drive each
-    other's instructions and tables out of the processor's caches. A frame that cannot be worked on
-    costs itself only. As many images are in memory at once as there are tasks.
+    Each stage processes all frames before the next one starts, because the decoder and the
+    detectors evict each other from the processor's caches. A frame that cannot be processed does
+    not affect the others. The images of all tasks are in memory at once.
     """
     batch = [FrameDetections() for _ in tasks]
     verticals = cached_vertical_table(plan.camera) if plan.camera and plan.lines else None
     paths = [_path(task, found, plan, verticals) for task, found in zip(tasks, batch)]
-    with interrupts_deferred():  # one that reaches Numba while it hands over tuples is a crash
-        for _ in zip_longest(*paths):  # advances each of them to its next `yield` in turn
+    with interrupts_deferred():  # an interrupt while Numba unpacks tuples would crash the process
+        for _ in zip_longest(*paths):  # advances each path to its next `yield` in turn
             pass
     return batch
 
@@ -125,7 +125,7 @@ def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetec
 def _path(
     task: FrameTask, found: FrameDetections, plan: FramePlan, verticals: VerticalTable | None
 ) -> Iterator[None]:
-    """The path of one image from top to bottom; at each `yield`, the others of a batch catch up."""
+    """All stages of one image in order; at each `yield`, the others of a batch catch up."""
     camera, prefix = plan.camera, task.frame.step.prefix
     try:
         image = found.image = read_image(task.frame, camera, plan.working_folder)
@@ -152,7 +152,7 @@ def _path(
             found.seen = found.discs = seen
             if by_frame is not None:
                 found.discs = levelled(found.seen, camera, by_frame)
-            if plan.levelling != "run" and settings.refine:  # levelling by the run adds it later
+            if plan.levelling != "run" and settings.refine:  # levelling by the run does so later
                 discs, by_verticals = found.discs, by_frame is not None
                 covariance = discs.covariance + common_covariance(
                     camera, discs.floor_xy, settings.calibration_px, by_verticals=by_verticals
@@ -164,7 +164,7 @@ def _path(
         yield
 
         if plan.markers:
-            from detect.markers.detect import detect_markers  # hardly any run looks for them
+            from detect.markers.detect import detect_markers  # rarely needed
 
             found.markers = detect_markers(image, plan.markers, camera)
     except COSTS_THE_FRAME as error:
@@ -174,7 +174,7 @@ def _path(
 def _discs(
     image: GreyImage, camera: Camera, settings: CircleSettings, search: Search
 ) -> CircleDetections:
-    """The discs as the calibrated camera sees them, searched as it leans."""
+    """Discs as the calibrated camera sees them, found with the camera's lean."""
     leaning, table = search
     found = detect_circles(image, leaning, table, settings)
     return found if leaning == camera else as_calibrated(found, leaning, camera)
@@ -186,14 +186,14 @@ def _of_known_tilt(settings: CircleSettings) -> CircleSettings:
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
-    """Why a frame cannot be worked on, in words."""
+    """Why a frame cannot be processed, in words."""
     if isinstance(error, FrameError):
         return str(error)
     return f"{task.name}: {type(error).__name__}: {error}"
 
 
 def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
-    """The tilt that lines show, in the digits of its file: one pass finds what two passes do."""
+    """The tilt from lines, rounded as in its file, so that one pass and two passes agree."""
     tilt = lines.tilt
     if tilt is None:
         return None
@@ -206,10 +206,10 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
 #: Prefix, lines and tilt of a frame.
 _Tilted = tuple[str, int, FrameTilt | None]
 
-#: Standard deviation of where a map's discs are seen, besides their covariances: its path's (m).
+#: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-#: Least lean with which discs are searched, degrees, and how much more evidence it has to give: all
-#: verticals may lean, and a slight lean is no hindrance.
+#: Least lean that the search for discs takes into account, degrees, and the factor by which it has
+#: to increase the evidence: all verticals may lean, and a slight lean does no harm.
 _LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
 #: Steps of the lean of a single frame, degrees.
 _FRAME_LEAN_DEG = 2.0
@@ -220,7 +220,7 @@ PIXELS_AT_ONCE = 1 << 25
 
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRows]:
-    """The rows of frames; as many are worked on at a time as fit in memory."""
+    """The rows of frames, processed in batches that fit in memory."""
     rows: list[FrameRows] = []
     for own, group in groupby(tasks, lambda task: task.plan or plan):
         alike, camera, at_once = list(group), own.camera, 1
@@ -287,7 +287,7 @@ def _text(rows: Iterable[Landmark]) -> str:
 def _disc_rows(
     discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
 ) -> list[CircleLandmark]:
-    """The rows, with the IDs of a known row of the same disc, or of a map's, or -1."""
+    """The rows, each with the IDs of a known row of the same disc, or of a map's disc, or -1."""
     unknown = np.full(len(discs), -1)
     rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     if not (known.discs or known.mapped):
@@ -325,20 +325,20 @@ def _disc_records(
 
 
 def pays(leaning: float, evidence: float) -> bool:
-    """Whether there is clearly more evidence of discs where they are searched as a camera leans."""
+    """Whether a search with the camera's lean finds clearly more evidence of discs."""
     return leaning > _MORE_EVIDENCE * evidence
 
 
 def evidence_of(frames: Iterable[FrameRows]) -> float:
-    """Of all discs in the rows of frames, which have them in JSON, too."""
+    """Total evidence of the discs in the rows of frames, which must include JSON."""
     discs = [disc for rows in frames for disc in json.loads(rows.rows["json"]).get("discs", ())]
     return sum(disc["evidence"] or 0.0 for disc in discs)
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:
-    """The lean with which discs are searched in a frame by its own tilt, in coarse steps.
+    """The lean for the search for discs in a frame, from its own tilt, in coarse steps.
 
-    So the tilts of many frames need few tables.
+    The steps limit the number of tables.
     """
     pitch, roll = (
         math.radians(_FRAME_LEAN_DEG * round(math.degrees(angle) / _FRAME_LEAN_DEG))
@@ -348,15 +348,15 @@ def lean_of_frame(tilt: FrameTilt) -> Lean | None:
 
 
 def lean_of_run(camera: Camera, frames: Iterable[FrameRows]) -> Lean | None:
-    """The lean with which discs are searched in a run, by the rows of some frames.
+    """The lean for the search for discs in a run, from the rows of some frames.
 
-    None where few of them have a tilt, or where it is so small that it makes no difference.
+    None if few of them have a tilt, or if it is so small that it makes no difference.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
     found = tilt_of_run(verticals, outlines, common_tilt_variance(camera))
     if found is None:
         return None
-    lean_deg = np.degrees(found.lean).round(1)  # runs of one camera share the table in the cache
+    lean_deg = np.degrees(found.lean).round(1)  # so that runs of a camera share a cached table
     if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:
         return None
     pitch, roll = np.radians(lean_deg).tolist()
@@ -366,7 +366,7 @@ def lean_of_run(camera: Camera, frames: Iterable[FrameRows]) -> Lean | None:
 def _tilts_of(
     frames: Iterable[Mapping[str, str]],
 ) -> tuple[list[_Tilted], FrameTilts, FrameTilts]:
-    """The tilts in the rows of frames; as numbers those by verticals, and those by outlines."""
+    """The tilts in the rows of frames, and as arrays those from verticals and from outlines."""
     own: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []
     for rows in frames:
@@ -384,9 +384,9 @@ def level_run(
 ) -> Iterator[Mapping[str, str]]:
     """The rows of each frame with levelled discs, and `RUN_TILT`.
 
-    Where too few frames have a tilt to learn from (`detect.run_tilt.LEAST_FRAMES`), each frame is
-    levelled by its own; an unknown one has the standard deviation of the settings. The summary
-    is given the tilt of the run. `read` gives the rows of all frames as seen, and is called twice.
+    If too few frames have a tilt (`detect.run_tilt.LEAST_FRAMES`), each frame is levelled by its
+    own; unknown tilts have the standard deviation of the settings. The tilt of the run is stored in
+    the summary. `read` returns the rows of all frames before levelling, and is called twice.
     """
     frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)
@@ -421,8 +421,8 @@ def _levelled(
 ) -> list[str]:
     """The rows of frames, each with its STEP first, levelled by their tilts.
 
-    These are the `run`'s, if there is one, and have the variances that all frames have in `common`;
-    else the frames' own, or unknown: by no lines.
+    The tilts are those of the `run`, if given, with the variances `common` to all frames; else the
+    frames' own, or unknown ones, with 0 lines.
     """
     texts: list[str] = []
     words: list[list[str]] = []
@@ -439,7 +439,7 @@ def _levelled(
     height_sigma = 0.0
     if run is not None:
         height_sigma = run.height_sigma  # as a share of the camera's height
-        if common is not None:  # it comes with the calibration's other errors
+        if common is not None:  # included in the calibration's errors
             tilt_covariance = tilt_covariance - np.diag(common)
     floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt, tilt_covariance)
     from_camera = floor_xy - camera.centre[:2]
@@ -453,7 +453,7 @@ def _levelled(
 
 
 def _lines(text: str) -> list[str]:
-    return text.rstrip("\n").split("\n")  # `splitlines` splits names at other characters, too
+    return text.rstrip("\n").split("\n")  # `splitlines` would split names at other characters
 
 
 def _tilt_of_row(row: str) -> _Tilted:

@@ -1,8 +1,8 @@
-"""The files that a run is written to: each its kind, its place, its head, its rows; and the log.
+"""The output files of a run, each with kind, path, head and rows; and the log.
 
-The log, ``<output>.log.json``, states the program and its settings, the frames that could not be
-processed and why, and how much was found. Nothing in it depends on the time of day or on the
-workers: the same run writes the same bytes.
+The log, ``<output>.log.json``, contains the program and its settings, the frames that could not be
+processed and why, and how much was found. It does not depend on the time of day or the workers: the
+same run writes the same bytes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from detect.sources.interface import ImageRun
 from redetect.landmarks import format_head
 from redetect.landmarks.times import TIMES_HEAD
 
-#: In the head of files whose positions are levelled, or corrected for the tilt.
+#: Phrases in the head of files whose positions are levelled, or corrected for the tilt.
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the tilts that a second pass makes (`detect.runs.frame`).
+#: The kind of the tilts that the second pass writes (`detect.runs.frame`).
 RUN_TILT = "run tilt"
 
 _ROBOT = "Robot frame: origin on the floor, X left, Y backward (forward is -Y), metres, radians."
@@ -57,7 +57,7 @@ _COMMON = "  covariances include the calibration's ({}): its errors are the same
 
 @dataclass(frozen=True)
 class Output:
-    """A file of a run: `FrameRows.rows` of a kind, between head and tail and separated."""
+    """A file of a run: `FrameRows.rows` of a kind between head and tail, with separators."""
 
     path: Path
     kind: str
@@ -67,13 +67,13 @@ class Output:
     crlf: bool = False
 
     def encoded(self, text: str) -> bytes:
-        """A part of its content, as bytes."""
+        """A part of the content, as bytes."""
         text = text.replace("\n", "\r\n") if self.crlf else text
         return text.encode("utf-8", "surrogateescape")
 
 
 def outputs_of(job: Job) -> list[Output]:
-    """The files of a run, without its log."""
+    """The files of a run, except its log."""
     run, plan, places = job.run, job.plan, job.places
     outputs = []
     by_run = plan.levelling == "run" and plan.lines is not None
@@ -101,7 +101,7 @@ def outputs_of(job: Job) -> list[Output]:
 
 
 def frames_tilt_place(tilt: Path) -> Path:
-    """The file of the single frames' tilts beside that of the tilts that discs are levelled by."""
+    """The file of the single frames' tilts, beside that of the tilts used for levelling."""
     return tilt.with_name(f"{tilt.stem}.frames.tilt")
 
 
@@ -126,7 +126,7 @@ def _circles_text(job: Job) -> list[str]:
 
 
 def lean_sentence(lean: Lean) -> str:
-    """With which lean of the camera discs were searched."""
+    """A sentence on the camera's lean in the search for discs."""
     pitch, roll = map(math.degrees, lean)
     return (
         f"discs are searched as the camera leans from its calibration: pitch {pitch:.1f}, "
@@ -169,7 +169,7 @@ def _markers_text(run: ImageRun, plan: FramePlan) -> list[str]:
 
 
 def _json_file(path: Path, plan: FramePlan) -> Output:
-    """The text that `json.dumps` with an indent of 1 gives."""
+    """A JSON file as `json.dumps` with an indent of 1 would write it."""
     assert plan.circles is not None
     assert plan.camera is not None
     document = {

@@ -1,6 +1,6 @@
-"""The plan of a run and its prior data; what a worker gets of it and sends back.
+"""The plan of a run and its prior data; the inputs and outputs of workers.
 
-Nothing heavy is imported.
+Imports nothing heavy.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 
 T_co = TypeVar("T_co", covariant=True)
 
-#: How a camera leans from its calibration: pitch and roll (rad) that turn directions level.
+#: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
 Lean = tuple[float, float]
 
-#: Discs of a map that are farther from a frame than this are not matched in it, metres.
+#: Largest distance from the robot at which discs of a map are matched, metres.
 _REACH_M = 20.0
 
 
 class ByPrefix(Protocol[T_co]):
-    """Data on each frame by its image's prefix: a dict, or a file that is read on demand."""
+    """Data on frames by the prefixes of their images: a dict, or a file that is read on demand."""
 
     def get(self, prefix: str, /) -> T_co | None: ...
 
@@ -70,10 +70,10 @@ class Known:
     """Prior data on the frames of a run, by the prefixes of their images."""
 
     tilts: ByPrefix[FrameTilt] | None = None  # of frames whose verticals are not detected
-    lines: ByPrefix[Frame] | None = None  # with IDs, carried over to rows of the same lines
-    discs: ByPrefix[Frame] | None = None  # the same of discs
+    lines: ByPrefix[Frame] | None = None  # with IDs, transferred to rows of the same lines
+    discs: ByPrefix[Frame] | None = None  # the same for discs
     discs_level: bool = False  # whether these are corrected for the tilt
-    #: Discs of a map: rows without an ID by `discs` get the ID of the one that they fall on.
+    #: Discs of a map: rows without an ID from `discs` get the ID of the one at their position.
     mapped: ByPrefix[tuple[CircleLandmark, ...]] | None = None
 
     def of(self, prefix: str) -> KnownOfFrame:
@@ -90,11 +90,10 @@ class Known:
 
 
 class FramesByImage:
-    """The frames of a landmark file, by the name of their image; of equal names the last counts.
+    """The frames of a landmark file, by the names of their images; of equal names the last counts.
 
-    The file is read once for the offset of each frame, and again there when a frame is requested:
-    its rows are not kept in memory. If it is malformed there is a
-    `redetect.landmarks.LandmarkFileError`.
+    The file is indexed once, and a frame's rows are read on request, so they are not kept in
+    memory. Malformed files raise a `redetect.landmarks.LandmarkFileError`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -117,9 +116,9 @@ class FramesByImage:
 
 
 class MapByImage:
-    """The discs of a map that the frames of a path should see, by the name of their image.
+    """The discs of a map that should be visible from the frames of a path, by image name.
 
-    Map and path are files of `slam map`; as them, malformed ones raise a `LandmarkFileError`.
+    Map and path are files of `slam map`; malformed ones raise a `LandmarkFileError`.
     """
 
     def __init__(self, map_path: Path, path_path: Path) -> None:
@@ -128,7 +127,7 @@ class MapByImage:
         self._poses = dict(zip(map(image_name, path.prefixes), path.poses))
 
     def get(self, prefix: str) -> tuple[CircleLandmark, ...] | None:
-        """The discs within reach of a frame's pose; None if the path does not have the frame."""
+        """The discs within reach of a frame's pose; None if the path lacks the frame."""
         pose = self._poses.get(image_name(prefix))
         if pose is None:
             return None
@@ -145,9 +144,9 @@ KEPT_FAILURES = 100
 
 @dataclass(frozen=True)
 class FramePlan:
-    """What is done with every frame of a run. Small: it is sent with every task.
+    """How every frame of a run is processed. Small, since it is sent with every task.
 
-    Without a camera only markers can be detected; of settings that are None, nothing is detected.
+    Without a camera only markers can be detected; kinds whose settings are None are not detected.
     """
 
     camera: Camera | None
@@ -155,33 +154,33 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: What discs are levelled by: nothing, the tilt of their own frame, or, when all frames are
-    #: done, of the run.
+    #: Whether discs are levelled by nothing, by the tilt of their own frame, or, after all frames
+    #: are done, by that of the run.
     levelling: Levelling = "frame"
-    #: How the camera leans where discs are searched; set by `detect_run`.
+    #: Lean of the camera in the search for discs; set by `detect_run`.
     lean: Lean | None = None
     working_folder: Path = field(default_factory=Path.cwd)  # where relative paths start from
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run to be processed, and where its results go."""
+    """A run to be processed, and the places of its results."""
 
     run: ImageRun
     plan: FramePlan
     #: The files to write: "circles", "lines", "tilt", "markers", "json" (the discs once more).
     places: Mapping[str, Path]
     known: Known = field(default_factory=Known)
-    #: What log, journal and times are called but for their endings; None: the first of the places.
+    #: Path of log, journal and times without their extensions; None: the first of the places.
     base: Path | None = None
-    command: str = ""  # what the log calls the run
-    crlf: bool = False  # how lines of files of landmarks end
+    command: str = ""  # name of the run in the log
+    crlf: bool = False  # whether lines of landmark files end with CRLF
     overwrite: bool = False
-    strict: bool = False  # whether the first frame that cannot be worked on ends the run
-    resume: bool = False  # whether the frames that an unfinished run kept are taken over
+    strict: bool = False  # whether the first frame that cannot be processed ends the run
+    resume: bool = False  # whether to reuse the finished frames of an interrupted run
 
     def beside(self, ending: str) -> Path:
-        """A file beside the results that is called like them."""
+        """A file beside the results, with their name and this extension."""
         base = self.base or next(iter(self.places.values()))
         return base.with_name(f"{base.name}{ending}")
 
@@ -195,7 +194,7 @@ class FrameTask(NamedTuple):
 
     @property
     def name(self) -> object:
-        """What messages call it."""
+        """The frame's name in messages."""
         return self.frame.image or self.frame.step.prefix
 
 
@@ -204,8 +203,8 @@ class FrameRows(NamedTuple):
 
     prefix: str
     rows: Mapping[str, str]  # by kind of file: those of `Job.places`, and "times"
-    found: Mapping[str, int] = {}  # how many "discs", "lines", "tilts" and "markers"
-    rejected: Mapping[str, int] = {}  # how many candidates for markers, by cause
+    found: Mapping[str, int] = {}  # numbers of "discs", "lines", "tilts" and "markers"
+    rejected: Mapping[str, int] = {}  # numbers of rejected candidates for markers, by cause
     error: str | None = None  # why there are no landmarks
 
 
@@ -218,10 +217,16 @@ class RunSummary:
     rejected: Counter[str] = field(default_factory=Counter)
     failed: int = 0
     failures: list[str] = field(default_factory=list)
+<<<<<<< HEAD
     images_without_step: int = 0  # the odometry does not have them
     lean: Lean | None = None  # of the camera, with which discs were searched
     unlevelled_deg: float | None = None  # sigma of pitch and roll, enlarged by the camera's lean
     tilt: RunTilt | None = None  # that discs were levelled by, if by the run's
+=======
+    images_without_step: int = 0  # missing in the odometry
+    lean: Lean | None = None  # of the camera in the search for discs
+    tilt: RunTilt | None = None  # used for levelling, if that was by the run
+>>>>>>> english
 
     def add(self, rows: FrameRows) -> None:
         """Count a frame."""
@@ -245,7 +250,7 @@ def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:
 
 
 def time_row(task: FrameTask) -> str:
-    """The row of a file of times."""
+    """The frame's row in a file of times."""
     frame = task.frame
     return "" if frame.time_s is None else f"{format_time(frame.step.prefix, frame.time_s)}\n"
 

@@ -5,17 +5,17 @@
 The files have the same bytes with any number of workers; they appear together at the end, or not at
 all.
 
-The rows of each frame that is done go to the journal, an append-only text file beside the results,
-locked while the run lasts (`redetect.storage.parts`). Each of its lines has a digest, of its record
-and all before it, and the record in JSON: what made the rows, then one for each frame, and finally
-one that says that the results are written. Lines that do not fit their digest, and all that follow,
-are ignored.
+The rows of each finished frame are appended to the journal, a text file beside the results that is
+locked during the run (`redetect.storage.parts`). Each line consists of a digest, of its record and
+all before it, and the record in JSON: first what made the rows, then one record for each frame, and
+finally one stating that the results are written. Lines that do not match their digest, and all
+lines after them, are ignored.
 
-However a run ends, by a signal, a full disk, workers that are gone, the journal is there, and a run
-that resumes goes on after its frames, as long as program, settings, camera and frames are the same.
-When all frames are done, the results are written from the journal to parts and brought to the disk;
-the journal says so; they take their places. A process killed in between leaves this last step to
-the next run.
+However a run ends (a signal, a full disk, lost workers), the journal remains, and a resumed run
+continues after its frames, provided that program, settings, camera and frames are the same. When
+all frames are done, the results are written from the journal to part files and flushed to disk, the
+journal records that, and they are renamed. If the process is killed in between, the next run does
+the renaming.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ _JOURNAL_VERSION = 7
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
 _COMPLETE = "complete"
-#: Number of frames in which it is seen how the camera leans, and at most how far apart they are.
+#: Number of frames from which the camera's lean is estimated, and their largest spacing.
 _LEAN_FRAMES, _LEAN_STEP = 32, 20
 
 
 class Journal:
-    """A journal that this process has locked; whoever opened its file closes or removes it."""
+    """A journal that this process has locked; the caller closes or removes its file."""
 
     def __init__(self, file: PartFile) -> None:
         self.file = file
         self._digest, self._end = hashlib.sha256(), 0
 
     def write(self, *records: object) -> None:
-        """Append records to those that were taken over or written."""
+        """Append records."""
         self.file.stream.seek(self._end)
         for record in records:
             line = json.dumps(record, separators=(",", ":")).encode()
@@ -76,22 +76,22 @@ class Journal:
         self.file.stream.flush()
 
     def write_frames(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Write the rows of frames that are done."""
+        """Write the rows of finished frames."""
         self.write(*([task_digest(task), *rows] for task, rows in frames))
 
     def write_complete(self, parts: Sequence[int], *, overwrite: bool) -> None:
-        """Note that the results are on the disk, in these parts, and only have to be renamed."""
+        """Record that the results are on disk, in these parts, and only have to be renamed."""
         self.write([_COMPLETE, parts, overwrite])
         self.file.sync()
 
     def is_by(self, made_by: str) -> bool:
-        """Whether its first record says so."""
+        """Whether the first record has this digest."""
         return next(self._records(), None) == [made_by]
 
     def frames(self) -> Iterator[tuple[str, FrameRows]]:
         """The digest of the task and the rows of each frame.
 
-        Requesting the next one takes it over; `cut` discards the last one and all that follow.
+        Requesting the next frame accepts the last one; `cut` discards it and all that follow.
         """
         records = self._records()
         next(records, None)
@@ -100,12 +100,12 @@ class Journal:
                 yield record[0], FrameRows(*record[1:])
 
     def complete(self) -> tuple[Sequence[int], bool] | None:
-        """What `write_complete` noted, if it did."""
+        """The record of `write_complete`, if there is one."""
         (last,) = deque(self._records(), maxlen=1) or [None]
         return (last[1], last[2]) if last and last[0] == _COMPLETE else None
 
     def cut(self) -> None:
-        """Discard the records that were not taken over; the next one is written there."""
+        """Discard the records that were not accepted; the next one is written in their place."""
         self.file.stream.truncate(self._end)
 
     def _records(self) -> Iterator[list[Any]]:
@@ -128,11 +128,11 @@ class Journal:
 
 
 def made_by(outputs: Sequence[Output], plan: FramePlan) -> str:
-    """A digest of whatever decides the rows, besides the frames themselves."""
+    """A digest of everything that determines the rows, except the frames themselves."""
     values = (
         _JOURNAL_VERSION,
         __version__,
-        # A process that has others do the work does not load the compiler, which takes long.
+        # A process that delegates the work does not load the compiler, which takes long.
         (np.__version__, cv2.__version__, version("numba")),
         replace(plan, camera=None, working_folder=Path()),
         plan.camera and (plan.camera.content_hash, plan.camera.covariance),
@@ -142,9 +142,9 @@ def made_by(outputs: Sequence[Output], plan: FramePlan) -> str:
 
 
 def task_digest(task: FrameTask) -> str:
-    """A digest of the work on a frame: its step, its image and the prior data on it.
+    """A digest of a frame's inputs: its step, its image and the prior data on it.
 
-    Of an image file, name, size and time of change count.
+    An image file is identified by name, size and modification time.
     """
     frame = task.frame
     beside = (frame.step, _file_of(frame), frame.time_s, frame.failure, task.known)
@@ -156,13 +156,13 @@ def _digest_of(text: str, content: bytes = b"") -> str:
 
 
 def _file_of(frame: RunFrame) -> object:
-    """What identifies the current state of a frame's image file."""
+    """Identifies the current state of a frame's image file."""
     if frame.image is None:
         return None
     try:
         status = frame.image.stat()
     except (OSError, ValueError):
-        return frame.image.name  # nothing there: that counts as well
+        return frame.image.name  # a missing file is a state as well
     return frame.image.name, status.st_size, status.st_mtime_ns
 
 
@@ -174,18 +174,18 @@ def detect_run(
 ) -> RunSummary:
     """Process every frame of a run by a plan, and write the results.
 
-    Each image is decoded once, but for some that show first how the camera leans: discs are
-    searched as it is mounted. Levelled by the run, the tilt file has the tilts that the discs were
-    levelled by, and those of single frames are in another one (`outputs.frames_tilt_place`).
-    Workers are by default this process; `on_progress` is called once after every frame.
+    Each image is decoded once, except for some from which the camera's lean is estimated first. If
+    discs are levelled by the run, the tilt file has the tilts used for that, and those of single
+    frames are in another file (`outputs.frames_tilt_place`). By default, this process is the only
+    worker; `on_progress` is called once after every frame.
 
     Raises
     ------
     DetectError
-        If another run is writing the same files, a frame fails where every frame is demanded, or
-        there is no such dictionary of markers.
+        If another run is writing the same files, a frame fails in strict mode, or the dictionary of
+        markers is unknown.
     lut.TableError, redetect.storage.OutputExistsError, WorkerError
-        If there can be no table for the camera, an output exists and must not be replaced, or there
+        If no table can be made for the camera, an output exists and must not be replaced, or there
         are no workers.
     """
     workers = workers or local_workers(1, large=job.run.frames.ships_images)
@@ -222,8 +222,13 @@ def detect_run(
     return summary
 
 
+<<<<<<< HEAD
 def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
     """The plan with the camera's lean, by some frames of a run: to search with, and as unknown."""
+=======
+def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
+    """The camera's lean for the search for discs, from some frames of a run."""
+>>>>>>> english
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
@@ -252,17 +257,17 @@ def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
 
 
 def make_folder(folder: Path) -> None:
-    """A folder for results, if there is none yet."""
+    """Make a folder for results, if there is none yet."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise DetectError(
-            f"{folder}: is no folder: expected one, or the name of a new one"
+            f"{folder}: is not a folder: expected one, or the name of a new one"
         ) from None
 
 
 class RunFiles:
-    """The files of a run: a context manager that begins or resumes its journal, and ends it."""
+    """The files of a run: a context manager that begins or resumes its journal, and closes it."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._outputs = job, outputs_of(job)
@@ -279,7 +284,7 @@ class RunFiles:
     def __enter__(self) -> RunFiles:
         places = [os.path.realpath(path) for path in self._paths]
         for path, place in zip(self._paths, places):
-            if places.count(place) > 1:  # the last one would be all there is
+            if places.count(place) > 1:  # each would overwrite the one before
                 raise DetectError(f"{path}: named for two results: expected a file for each")
         left = left_part(self._base, "journal", named=self._paths[0])
         try:
@@ -297,7 +302,7 @@ class RunFiles:
         return self
 
     def _take_up(self, left: PartFile) -> None:
-        """See whether a journal that was left can be resumed, and complete its run if it ended."""
+        """Resume a journal that was left, if possible, or complete its run if that had ended."""
         journal = Journal(left)
         self._resumes = self._job.resume and journal.is_by(self._made_by)
         complete = journal.complete()
@@ -310,15 +315,15 @@ class RunFiles:
             left.remove()
         elif self._job.resume:
             _log.info(
-                "what an unfinished run left was made with other settings, another camera or "
-                "version: beginning anew"
+                "the unfinished run had other settings, another camera or another version: "
+                "starting again"
             )
         else:
-            _log.info("removing what an unfinished run left (--resume would have gone on with it)")
+            _log.info("removing the journal of an unfinished run (--resume would continue it)")
 
     def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
-        """Complete a run that was killed while its files took their places."""
-        _log.info("the files of a run that was killed at its very end take their places")
+        """Complete a run that was killed while its files were renamed."""
+        _log.info("renaming the files of a run that was killed at its very end")
         for path, number in zip(self._paths, numbers):
             part = left_part(path, number=number)
             if part is not None:
@@ -341,7 +346,7 @@ class RunFiles:
             raise
 
     def _demand_places(self) -> None:
-        """Refuse to replace what must not be, or cannot be."""
+        """Raise an error if an existing file must not be replaced, or cannot be."""
         for path in self._paths:
             demand_place(path, overwrite=self._overwrite)
 
@@ -350,7 +355,7 @@ class RunFiles:
     def take_over(
         self, tasks: Iterator[FrameTask], count: Callable[[FrameRows], None]
     ) -> Iterator[FrameTask]:
-        """Take over the frames that are done already, counting each; returns the remaining ones."""
+        """Reuse the finished frames of the journal, counting each; returns the remaining ones."""
         if not self._resumes:
             return tasks
         beyond: list[FrameTask] = []
@@ -363,11 +368,11 @@ class RunFiles:
             self._frames += 1
             count(rows)
         self._journal.cut()
-        _log.info("%d frames of an unfinished run are taken over", self._frames)
+        _log.info("%d frames of an unfinished run are reused", self._frames)
         return chain(beyond, tasks)
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Note the next frames."""
+        """Write the next frames to the journal."""
         self._keep = not self._job.strict or all(rows.error is None for _, rows in frames)
         for _, rows in frames:
             self._demand_strictly(rows)
@@ -387,7 +392,7 @@ class RunFiles:
     def finish(self, rows_of_frames: Iterable[Mapping[str, str]], summary: RunSummary) -> None:
         """Write the results, and move them to their final paths."""
         if not self._journal.file.is_in_place():
-            # Another folder may have come in its place: nothing in it is touched.
+            # The folder may have been replaced by another one: nothing in it is touched.
             raise FileNotFoundError(errno.ENOENT, "the run's journal is gone", str(self._paths[0]))
         with ExitStack() as stack:
             parts = [stack.enter_context(new_part(path)) for path in self._paths]
@@ -424,7 +429,7 @@ class RunFiles:
                 raise
             except BaseException:
                 for part in parts:
-                    part.close()  # the next run goes on with it
+                    part.close()  # the next run continues with it
                 raise
 
     def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
@@ -432,7 +437,7 @@ class RunFiles:
         if (
             self._done
             or not self._keep
-            or isinstance(error, OutputExistsError)  # another process was faster
+            or isinstance(error, OutputExistsError)  # another process was first
             or not (self._frames or self._resumes)
             or journal.stream.closed
             or not journal.is_in_place()
@@ -441,4 +446,4 @@ class RunFiles:
             return
         journal.close()
         if self._frames:
-            _log.info("%d frames are kept: --resume goes on after them", self._frames)
+            _log.info("%d frames are kept: --resume continues after them", self._frames)

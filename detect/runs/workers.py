@@ -1,13 +1,12 @@
-"""Processes frames with any number of workers, and gives their rows in the order of the run.
+"""Processes frames with any number of workers, and returns their rows in the order of the run.
 
 Workers are a standard `concurrent.futures.Executor`: this process, others on this machine, or a
-cluster. Frames travel in chunks. Only a window of them is under way at any
-time, so that neither what waits nor what is finished grows with the run, and a slow frame holds the
-others up only when they are a window ahead of it.
+cluster. Frames are sent in chunks. Only a window of chunks is pending at any time, so that memory
+does not grow with the run, and a slow frame delays the others only when they are a window ahead.
 
-A worker that dies, killed or out of memory, loses no other frame: all frames under way are
-processed again, one at a time, until the frame that kills its worker is alone; that one is reported
-like an image that cannot be read.
+If a worker dies, killed or out of memory, no other frame is lost: all pending frames are processed
+again, one at a time, until the frame that kills its worker is isolated; it is reported like an
+image that cannot be read.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 
 Chunk = tuple[FrameTask, ...]
 
-#: After this many consecutive frames that killed their workers, the frames are not the cause.
+#: After this many consecutive frames that killed their workers, the run is given up.
 _DEADLY_FRAMES = 10
 
 
@@ -54,24 +53,24 @@ _DEADLY_FRAMES = 10
 class Workers:
     """Workers that process the frames."""
 
-    #: Starts them for a plan, again after workers have died: gives the executor, and ends it.
+    #: Starts the executor for a plan, also again after workers have died, and ends it.
     start: Callable[[FramePlan], AbstractContextManager[Executor]]
-    chunk: int  # frames of a task
-    window: Callable[[], int]  # how many tasks may be under way; called again, as clusters grow
+    chunk: int  # frames per chunk
+    window: Callable[[], int]  # largest number of pending chunks; not constant, as clusters grow
     died: tuple[type[BaseException], ...] = ()  # raised if a worker dies, as `BrokenExecutor` is
 
 
 def detect_chunks(
     tasks: Iterable[FrameTask], plan: FramePlan, crew: Crew
 ) -> Iterator[list[tuple[FrameTask, FrameRows]]]:
-    """Frames with their rows, in the order of the tasks, as many at a time as a worker gives back.
+    """Frames with their rows, in the order of the tasks, chunk by chunk.
 
-    Raises WorkerError if workers die with any frame, disappear, or do not have this program, and
-    `lut.TableError` if there can be no table for the camera.
+    Raises WorkerError if workers die with every frame, disappear, or do not have this program, and
+    `lut.TableError` if no table can be made for the camera.
     """
     source = iter(tasks)
     chunks = iter(lambda: tuple(islice(source, crew.chunk)), ())
-    # A chunk without a future is suspect: to be processed while nothing else is under way.
+    # A chunk without a future is suspect: it is processed while nothing else is pending.
     under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
     crew.plan = plan
     while True:
@@ -95,7 +94,7 @@ def detect_chunks(
 
 
 def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
-    """Process a task in a worker; its input and output are small."""
+    """Process a chunk in a worker; its input and output are small."""
     from detect.runs.frame import rows_of_frames  # loads the compiler, which only workers need
 
     return rows_of_frames(chunk, plan)
@@ -104,10 +103,10 @@ def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
 class Crew:
     """The workers of a run, started when they are needed, and replaced when one of them has died.
 
-    Close it when all is done: that ends them.
+    `close` ends them.
     """
 
-    plan: FramePlan  # what they do with frames
+    plan: FramePlan  # how they process frames
 
     def __init__(self, workers: Workers) -> None:
         self.died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
@@ -126,7 +125,7 @@ class Crew:
             if self._executor is None:
                 self._executor = self._started.enter_context(self._workers.start(self.plan))
             return self._executor.submit(work_on_chunk, self.plan, chunk)
-        except self.died as error:  # they died before they were given anything
+        except self.died as error:  # they died before they received anything
             failed: Future[list[FrameRows]] = Future()
             failed.set_exception(error)
             return failed
@@ -137,7 +136,7 @@ class Crew:
             rows = future.result()
         except ImportError as error:
             raise WorkerError(
-                f"a worker cannot do the work: {error}: expected redetect there, the same version"
+                f"a worker cannot import the program: {error}: expected the same version there"
             ) from None
         except CancelledError:
             raise WorkerError("the workers are gone: expected the cluster to stay") from None
@@ -152,7 +151,7 @@ class Crew:
                 return rows
             except self.died as error:
                 self.dismiss(error)
-        reason = f"{task.name}: every worker died that was given this frame"
+        reason = f"{task.name}: every worker died on this frame"
         self._deadly += 1
         if self._deadly == _DEADLY_FRAMES:
             raise WorkerError(
@@ -161,7 +160,7 @@ class Crew:
         return rows_of_failure(task, f"{reason}: out of memory?")
 
     def dismiss(self, error: BaseException) -> None:
-        """End the rest of broken workers; the next chunk gets new ones."""
+        """End the remaining workers if their pool is broken; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
             self.close()
 
@@ -177,20 +176,20 @@ class Crew:
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Fewer frames than this are not worth another process's start.
+#: Number of frames for which starting another process pays off.
 FRAMES_PER_PROCESS = 500
 
-#: Frames of a task.
+#: Frames per chunk.
 _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
-#: Time that processes have to end by themselves, and in which an interrupt is noticed.
+#: Time after which processes are killed, and interval of checks for an interrupt.
 _GRACE_S, _PATIENCE_S = 1.0, 0.2
 
 
 def default_jobs(frames: int) -> int:
-    """A process for every `FRAMES_PER_PROCESS` frames, at most as many as there are cores."""
+    """One process for every `FRAMES_PER_PROCESS` frames, up to the number of cores."""
     return max(1, min(_cores(), frames // FRAMES_PER_PROCESS))
 
 
@@ -200,10 +199,10 @@ def _cores() -> int:
 
 
 def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Workers:
-    """Processes of this machine; 1 is this process itself.
+    """Processes on this machine; 1 is this process itself.
 
-    Of `large` tasks, which carry images, each has one frame. With `shared`, one that has to compile
-    has the kernels compiled by two or three others at the same time.
+    Chunks of `large` tasks, which contain images, have one frame. With `shared`, a single process
+    lets two or three others compile missing kernels at the same time.
     """
     if jobs < 1:
         raise WorkerError(f"jobs is {jobs}: expected 1 or more")
@@ -216,10 +215,10 @@ def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Wo
 
 
 def cluster_workers(address: str, *, large: bool = False) -> Workers:
-    """The workers of a dask cluster, whose scheduler has an `address` as ``tcp://host:8786``.
+    """The workers of a dask cluster with the scheduler's `address`, such as ``tcp://host:8786``.
 
-    They have this program installed, in the same version, and see the images under the same
-    paths. `large` as for `local_workers`.
+    They need the same version of this program and access to the images under the same paths.
+    `large` as for `local_workers`.
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
@@ -236,11 +235,11 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
 
 
 class _CompiledElsewhereError(Exception):
-    """Instead of the kernel that a process was about to compile: there it is, to be loaded."""
+    """Other processes have compiled the kernel: it can be loaded from the disk cache."""
 
 
 class _InProcess(Executor):
-    """Runs each task immediately, before it returns the future."""
+    """Runs each task immediately, before returning the future."""
 
     def __init__(self, plan: FramePlan, *, shared: bool) -> None:
         self._plan = plan
@@ -271,13 +270,13 @@ class _InProcess(Executor):
         from detect.runs.first_run import level_none, place_none
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
-        # Where no process can be started, this one compiles all of them.
+        # If no process can be started, this one compiles all kernels.
         with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
             one, *others = [
                 started.enter_context(_ProcessPool(1, plan, show=False))
                 for plan in (discs, lines, discs)[: _cores()]
             ]
-            # Discs take longer than lines. So others take on what comes later, and last, of these.
+            # Discs take longer than lines, so other processes compile their later stages.
             done: list[Future[Any]] = [
                 one.submit(work_on_chunk, discs, self._chunk),
                 others[0].submit(work_on_chunk, lines, self._chunk),
@@ -285,22 +284,21 @@ class _InProcess(Executor):
             ]
             for more in others[1:]:
                 more.submit(place_none, discs, self._chunk)
-            # What fails there fails here again, and is reported.
+            # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:
                 raise_if_interrupt_waits()
             raise _CompiledElsewhereError
 
 
-# They are spawned, not forked: compiled kernels, OpenCV and the libraries of linear algebra have
-# threads of their own, which no fork survives. They take no notice of an interrupt from the
-# keyboard; the process that started them does, and ends them. If that process is killed, they end
-# by themselves.
+# Processes are spawned, not forked: compiled kernels, OpenCV and linear algebra libraries have
+# threads, which do not survive a fork. They ignore keyboard interrupts; the parent process handles
+# these and ends them. If the parent is killed, they end by themselves.
 
 
 class _ProcessPool(ProcessPoolExecutor):
-    """Processes that get ready for a plan; as a context manager it ends them.
+    """Processes prepared for a plan; leaving the context ends them.
 
-    They inherit a blocked interrupt: it would reach them even while they start.
+    They start with interrupts blocked, which could reach them even while they start.
     """
 
     def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
@@ -309,14 +307,14 @@ class _ProcessPool(ProcessPoolExecutor):
         super().__init__(count, mp_context=context, initializer=_begin, initargs=arguments)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        with interrupts_deferred():  # else one would be left half started
+        with interrupts_deferred():  # else a process could be left half started
             return super().submit(_in_worker, fn, *args, **kwargs)
 
     def __exit__(self, *_: object) -> None:
-        """End them, whatever they are doing; a further interrupt waits for that.
+        """End the processes, whatever they are doing; further interrupts wait for that.
 
-        Of an interrupted program the thread that manages them could be stopped after it has removed
-        a semaphore and before it has recorded that: it is joined.
+        The thread that manages them is joined: otherwise, it could be stopped at exit between
+        removing a semaphore and recording that.
         """
         with interrupts_deferred():
             processes = list((self._processes or {}).values())
@@ -332,12 +330,12 @@ class _ProcessPool(ProcessPoolExecutor):
                 manager.join(_GRACE_S)
 
 
-#: Held by the process that compiles kernels, until it has done what it needs them for.
+#: The lock that a process holds while it compiles kernels, until the end of that task.
 _compiling: list[RLock] = []
 
 
 def _begin(plan: FramePlan, lock: RLock, show: bool) -> None:
-    """Make a new process a worker; the first one to need them fills the caches for all."""
+    """Initialise a worker process; the first one that needs the caches fills them for all."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:
@@ -356,7 +354,7 @@ def _compile_or_wait(lock: RLock) -> None:
         _compiling.append(lock)
         say_compiling()
     elif not _compiling:
-        # All kernels but this one will be loaded: the other process has kept them.
+        # All further kernels will be loaded: the other process has cached them.
         with lock:
             pass
 
@@ -389,8 +387,8 @@ def _cluster(address: str, clients: list[Client]) -> Iterator[Executor]:
             client.wait_for_workers(1, timeout=_CLUSTER_PATIENCE_S)
         except TimeoutError:
             raise WorkerError(
-                f"{address}: no worker came within {_CLUSTER_PATIENCE_S:g} s"
+                f"{address}: no worker connected within {_CLUSTER_PATIENCE_S:g} s"
             ) from None
         clients[:] = [client]
-        # The same frame twice is not the same task: nothing is kept between runs.
+        # Not pure, so that dask does not reuse results of earlier runs.
         yield client.get_executor(pure=False)

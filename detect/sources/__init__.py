@@ -1,4 +1,4 @@
-"""Where frames come from: one small module per source, behind one interface (`interface`).
+"""Sources of frames: one small module per source, behind one interface (`interface`).
 
 ::
 
@@ -9,6 +9,6 @@
     ROS bag, MCAP      bag           the .bag or .mcap file, or the folder of a ROS 2 bag
     live camera        video         camera:0
 
-A source gives images in order, with their times if it has them. Odometry is added to it
-(`poses`), so that any source may be combined with any odometry; `opening` puts both together.
+A source yields images in order, with their times if known. Odometry is separate (`poses`), so that
+any source can be combined with any odometry; `opening` combines both.
 """

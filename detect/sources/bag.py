@@ -1,11 +1,11 @@
-"""ROS 1 and 2 bags and MCAP files as a source, read by the package ``rosbags``: no ROS is needed.
+"""ROS 1 and 2 bags and MCAP files as a source, read by the package ``rosbags``, without ROS.
 
-The images are one topic of sensor_msgs/Image or sensor_msgs/CompressedImage, in the order of the
-recording; the odometry is a topic of nav_msgs/Odometry, read beside them. The time of a message is
-that of its header or, where that is zero, of its recording.
+The images are those of a topic of sensor_msgs/Image or sensor_msgs/CompressedImage, in the order of
+the recording; the odometry is a topic of nav_msgs/Odometry, read in parallel. The time of a message
+is that of its header or, if that is zero, of its recording.
 
-A bag may also hold the lens's calibration, camera_info: it is converted to the project's model, and
-refused where that cannot follow it. Only what needs no floor can be detected with it alone.
+A bag may also contain the lens calibration, camera_info: it is converted to the project's model, or
+rejected if that does not fit. Without a pose, only landmarks that need no floor can be detected.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from redetect.storage.messages import OneLineError, excerpt, one_line
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-#: Characters that are shown of what another package says, and of topics and types in a bag.
+#: Longest excerpts of other packages' messages, and of topics and types in a bag, characters.
 _LONGEST_CAUSE, LONGEST_NAME = 200, 60
 
-#: Numbers of a pixel, by its encoding; numbers have 16 bits if the encoding says so, else 8.
+#: Channels of each encoding; they have 16 bits if the encoding's name says so, else 8.
 _CHANNELS = {
     "mono8": 1, "8UC1": 1, "mono16": 1, "16UC1": 1,
     "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "8UC3": 3, "8UC4": 4,
     "bgr16": 3, "rgb16": 3, "bgra16": 4, "rgba16": 4,
     "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2,
 }  # fmt: skip
-# Which of the two numbers of a pixel is the brightness.
+# Index of the luminance in the two bytes of a pixel.
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)_?[0-9]*")
 
@@ -89,13 +89,13 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[float,
 
 @contextmanager
 def understood(name: str) -> Iterator[None]:
-    """Work on a message: a bag brings its own definitions, which may be other than ROS's."""
+    """Process a message: a bag has its own definitions, which may differ from those of ROS."""
     try:
         yield
     except OneLineError:  # reported already
         raise
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise DetectError(f"{name}: a message is not as ROS defines it: {_cause(error)}") from None
+        raise DetectError(f"{name}: a message differs from ROS's type: {_cause(error)}") from None
 
 
 def chosen_topic(
@@ -119,7 +119,7 @@ def chosen_topic(
 
 
 def stamp_s(message: Any, recorded_s: float) -> float:
-    """The time in a message's header (s); that of its recording where the header has none."""
+    """The time in a message's header (s); that of its recording if the header has none."""
     stamp = message.header.stamp
     return (stamp.sec + stamp.nanosec / 1e9) if stamp.sec or stamp.nanosec else recorded_s
 
@@ -131,8 +131,8 @@ def _cause(error: Exception) -> str:
 def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     """The pixels of a `sensor_msgs/Image`: grey values, or blue, green, red and perhaps opacity.
 
-    Of Bayer patterns and YUV 4:2:2 they are the brightness. A FrameError is raised if the encoding
-    is another, or there is less data than the message states.
+    For Bayer patterns and YUV 4:2:2 they are the luminance. Raises FrameError for other encodings,
+    or if there is less data than the message states.
     """
     encoding, height, width = message.encoding, message.height, message.width
     bayer = _BAYER.fullmatch(encoding)
@@ -181,7 +181,7 @@ _ODOMETRY, _INFO = "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
 
 # x, y and the rotation about z, in the 6x6 covariances of ROS.
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-# A pose's covariance has not grown where that is less definite than this, against its own.
+# Least relative eigenvalue of a growth of a pose's covariance; below, it counts as constant.
 _INDEFINITE = 1e-9
 
 
@@ -221,7 +221,7 @@ class Bag(Source):
                 yield RunFrame(still(prefix), None, content, time_s, failure)
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The ``.cam`` file beside it, of its name or the only one; else its own: no pose."""
+        """The ``.cam`` file beside the bag, of its name or the only one; else its own, unposed."""
         beside = super().calibration(posed=posed)
         if beside is not None or posed:
             return beside
@@ -261,10 +261,10 @@ def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPo
 
 
 def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPose, None, None]:
-    """Poses with the sum of what each movement adds to the covariance since the first.
+    """Poses with covariances accumulated over the movements since the first pose.
 
-    That is what the pose's own has grown by or, where it has not grown as by a movement (a driver
-    that publishes the same all the time), the twist's over the time, independent of that before.
+    Each movement adds the growth of the pose's covariance or, if that has not grown as by a
+    movement (a driver that publishes a constant), the twist's covariance over the time step.
     """
     before: TimedPose | None = None
     total = np.zeros((3, 3))
@@ -284,9 +284,9 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
 
 
 def _recorded_calibration(path: Path, image_topic: str) -> Camera | None:
-    """The calibration that a bag holds of the camera of a topic of images; None if there is none.
+    """The calibration in a bag for the camera of an image topic; None if there is none.
 
-    It says nothing of the camera's pose.
+    It has no pose.
     """
     with opened_bag(path) as reader:
         topic = _info_topic(reader, image_topic)

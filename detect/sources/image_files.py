@@ -1,6 +1,6 @@
-"""Image files as a source, and which of them belongs to a step: never one outside the run.
+"""Image files as a source, and the image of each step, which is never outside the run.
 
-Of a frame its image's name is kept in memory, and nothing else.
+Only the names of the images are kept in memory.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".t
 def image_name(prefix: str) -> str:
     """Name of an image without directories (of either system) and image extension."""
     name = last_part(prefix)
-    # Not just any suffix: the data set's prefixes end in a number, as in e.0067.
+    # Image suffixes only: the data set's prefixes end in a number, as in e.0067.
     stem, dot, extension = name.rpartition(".")
     return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
 
@@ -39,13 +39,13 @@ def last_part(prefix: str) -> str:
 class ImageNames:
     """Names of a folder's image files that match a pattern, in natural order: numbers by value.
 
-    Hidden files are skipped unless the pattern begins with a dot: some systems keep metadata in
-    files named ``._`` and the image's name.
+    Hidden files are skipped unless the pattern begins with a dot: some systems store metadata in
+    files whose names are ``._`` followed by the image's name.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
         self.folder = folder
-        # Where a run's images may be: in their folder, or that of the run.
+        # Links may lead to the folder of the images, or that of the run.
         own = Path(os.path.abspath(folder))  # noqa: PTH100 - links are not followed yet
         self._homes = (own, own.parent) if own.name == "images" else (own,)
         matches = re.compile(fnmatch.translate(pattern)).match
@@ -59,16 +59,16 @@ class ImageNames:
                 and (pattern.startswith(".") or not entry.name.startswith("."))
             )
         self.names = sorted(names, key=_natural_order)  # of equal numbers, 01 before 1
-        self._called: dict[str, str] = {}  # by the name with and without its ending; the first
+        self._called: dict[str, str] = {}  # first image by name with and without extension
         for name in self.names:
             for called in (name, name[: name.rindex(".")]):
                 self._called.setdefault(called, name)
 
     def image_of(self, prefix: str) -> Path | None:
-        """A step's image, by its name alone; None if there is none.
+        """A step's image, by the last part of its prefix; None if there is none.
 
-        A prefix that leads out of the run is a FrameError: a file of steps must not decide which
-        other files are read.
+        A prefix that leads out of the run is a FrameError, so that a file of steps cannot cause
+        other files to be read.
         """
         name = prefix.strip('"')
         why = leads_out(name, *map(str, self._homes))
@@ -82,7 +82,7 @@ class ImageNames:
         if path.is_symlink() and link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
-                "in it"
+                "inside"
             )
         return path
 
@@ -101,7 +101,7 @@ def images_of_folder(folder: Path) -> ImageNames:
 
 
 def _natural_order(name: str) -> list[tuple[int, str]]:
-    """Sort key of names with numbers by value, which come before letters' places."""
+    """Sort key of names: numbers by value, before letters."""
     parts = re.findall("([0-9]+)|([^0-9]+)", name)
     return [(int(number), "") if number else (-1, word) for number, word in parts]
 
@@ -110,7 +110,7 @@ WILDCARDS = frozenset("*?[")
 
 
 class RunFrames(Frames):
-    """The frames of a file of STEP rows, with the images that these name, in its order."""
+    """The frames of a file of STEP rows, in its order, with the images that the rows name."""
 
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
@@ -145,8 +145,8 @@ class RunFrames(Frames):
 class ImageFiles(Source):
     """Images in natural order of their names.
 
-    Calibration and times (``<folder>.times``, if not named) are in the run's folder, and results
-    are written there: the folder of the images, or the one above ``images/``.
+    Calibration and times (by default ``<folder>.times``) are in the run's folder, and results are
+    written there: the folder of the images, or the one above ``images/``.
     """
 
     ships_images = False
@@ -173,7 +173,7 @@ class ImageFiles(Source):
             path = self._names.folder / name
             step, time_s = still(frame_prefix(path.stem)), self._times.get(path.stem)
             try:
-                if not self._is_pattern:  # which names its links; a folder may be somebody else's
+                if not self._is_pattern:  # a pattern names links explicitly, a folder does not
                     path = self._names.checked(path)
                 yield RunFrame(step, path, time_s=time_s)
             except FrameError as error:
@@ -188,7 +188,7 @@ def _matching_images(pattern: Path) -> ImageNames:
     """The images that a pattern matches, or one image."""
     if WILDCARDS & set(str(pattern.parent)):
         raise DetectError(
-            f"{pattern}: wildcards in the folder's name: expected them in the last part only"
+            f"{pattern}: wildcards in a folder's name: expected them in the last part only"
         )
     if not pattern.parent.is_dir():
         raise DetectError(f"{pattern}: no such folder: {pattern.parent}")

@@ -1,13 +1,13 @@
-"""A run, its frames and their grey images, and what all sources of images have in common.
+"""A run, its frames and their grey images, and the base classes of all image sources.
 
 A frame is a STEP row with its image; without odometry, an image with a STEP row of zeros. A run may
 be long: frames are made on demand.
 
-Images of any kind become the 8-bit grey images of the detectors. Colour becomes
-0.299 R + 0.587 G + 0.114 B, as OpenCV has it (of a JPEG, the brightness that it stores). Of images
-with 16 bits, the 8 highest of those that their values need are kept: a 12-bit camera's values are
-stored in 16-bit files, and would be nearly black otherwise. No image takes more memory than images
-of its run do, whatever its file is or claims to be.
+All images are converted to 8-bit grey images. Colour becomes 0.299 R + 0.587 G + 0.114 B, as in
+OpenCV (for a JPEG, its luminance). Of 16-bit images, the 8 highest of the bits that their values
+need are kept: values of a 12-bit camera are stored in 16-bit files, and would be nearly black
+otherwise. No image takes more memory than the images of its run do, whatever its file contains or
+claims.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class RunFrame:
     """One frame of a run: its STEP row, and the image taken after it."""
 
     step: Step
-    image: Path | None  # its file, where it has one
-    #: The encoded image or (H, W) uint8 grey values, where it comes from no file of its own.
+    image: Path | None  # its file, if it has one
+    #: The encoded image or (H, W) uint8 grey values, if it has no file of its own.
     content: bytes | GreyImage | None = field(default=None, compare=False, repr=False)
-    time_s: float | None = None  # when it was taken, where that is known
+    time_s: float | None = None  # time of the image, if known
     failure: str | None = None  # why there is no image, although there should be
 
 
@@ -53,9 +53,9 @@ class Frames(ABC):
     Iterating again starts over (with a live camera: from then on).
     """
 
-    ships_images = True  # it gives contents of images, not files
-    expected: int | None = None  # approximate number of frames, where it is known
-    left_out = 0  # how many images, so far, are no part of the run
+    ships_images = True  # yields contents of images, not files
+    expected: int | None = None  # approximate number of frames, if known
+    left_out = 0  # number of images, so far, that are not part of the run
     why_left_out = "images are left out"
 
     @abstractmethod
@@ -66,32 +66,32 @@ class Source(Frames):
     """Images in order, as frames of a run in which the robot does not move."""
 
     name: str  # in messages
-    output_base: Path  # results are called this, with an ending of their own
+    output_base: Path  # path of results without their extensions
     beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
-    times_own = True  # images have times by themselves; of others, they can be named
+    times_own = True  # images have their own times; for other sources, a file can be given
     has_times = True
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The calibration beside it, or that it holds; None if there is none.
+        """The calibration beside the source, or contained in it; None if there is none.
 
-        One of several is refused; if `posed`, one whose pose above the floor is not known is none.
+        Several are an error; if `posed`, a calibration without a pose above the floor is ignored.
         """
         return None if self.beside is None else camera_in(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
-        """The odometry that it has itself: of a topic, or the only one; None if there is none."""
+        """The source's own odometry: of a topic, or the only one; None if there is none."""
         if topic is not None:
-            raise DetectError(f"{self.name}: holds no topic {topic}: only bags do")
+            raise DetectError(f"{self.name}: has no topic {topic}: only bags do")
         return None
 
 
 def frame_prefix(name: str) -> str:
-    """A name as allowed in a STEP row and a ``.times`` file: without characters that split it."""
+    """A name as allowed in STEP rows and ``.times`` files: without separators."""
     return re.sub(r'[\s,#"\\]', "_", name) or "_"
 
 
 def numbered_prefix(stem: str, number: int) -> str:
-    """The prefix of a frame that has no name, as the data set's are: ``e.0000``."""
+    """The prefix of an unnamed frame, in the data set's form: ``e.0000``."""
     return f"{frame_prefix(stem)}.{number:04d}"
 
 
@@ -104,20 +104,20 @@ def still(prefix: str) -> Step:
 class ImageRun:
     """A run whose files were found and read, with or without a calibration."""
 
-    folder: Path  # of another source the folder that it is in
+    folder: Path  # for sources other than folders, the one that contains them
     frames: Frames
-    odometry: Path | None  # where the STEP rows come from
+    odometry: Path | None  # source of the STEP rows
     output_base: Path  # results are called this, with an ending of their own
-    has_times: bool = False  # whether frames' times are known, and written beside the results
+    has_times: bool = False  # whether times of frames are known, and written beside the results
 
     @property
     def name(self) -> str:
-        """The recording's own name, or else the folder's."""
+        """The recording's own name, or the folder's."""
         recording = self.output_base.name.removesuffix(".detected")
         return self.folder.resolve().name if recording == "detected" else recording
 
     def output(self, kind: str) -> Path:
-        """The file that a kind of result is written to."""
+        """The file for a kind of result."""
         return self.output_base.with_name(f"{self.output_base.name}.{kind}")
 
     def calibrated(self, camera: Camera) -> Run:
@@ -135,11 +135,11 @@ class Run(ImageRun):
 def read_image(
     frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
 ) -> GreyImage:
-    """The grey image of a frame (H, W); 16 bits are brought to 8 (see `detect.sources.interface`).
+    """The grey image (H, W) of a frame; 16 bits become 8 (see `detect.sources.interface`).
 
-    It must have the size of the camera, if any. Relative paths start from `working_folder`, by
-    default the process's own. Raises FrameError if there is no image, it cannot be read, or has
-    another size.
+    It must have the size of the camera, if any. Paths are relative to `working_folder`, by default
+    the process's own. Raises FrameError if there is no image, it cannot be read, or has another
+    size.
     """
     name: object = frame.image or frame.step.prefix
     size = None if camera is None else (camera.width, camera.height)
@@ -159,11 +159,11 @@ def read_image(
     return image
 
 
-#: Bits that cameras give; the fewest that hold the values of a 16-bit image are its own.
+#: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
 _BIT_DEPTHS = (8, 10, 12, 14, 16)
 
-# A file is at most as large as its uncompressed pixels, 16 bits in four channels, twice over for
-# formats that grow, plus thumbnails and other metadata that cameras write.
+# Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
+# expand, plus thumbnails and other metadata of cameras.
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 
@@ -171,13 +171,13 @@ _BYTES_BESIDE = 1 << 23
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    An image that claims another width and height than `size` is not decoded. Raises FrameError,
-    which calls the image `name`, if there is no image in it, or it is cut off.
+    An image with another width and height than `size` is not decoded. Raises FrameError, with
+    `name` for the image, if the content is not an image, or is truncated.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
-        raise FrameError(f"{name}: the JPEG is cut off: its end is missing")
+        raise FrameError(f"{name}: the JPEG is truncated: its end is missing")
     claimed = claimed_size(content)
     if claimed is not None and claimed[0] * claimed[1] > MOST_PIXELS:
         raise FrameError(
@@ -193,10 +193,10 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
 
 
 def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
-    """Bring pixels to (H, W) uint8 grey values, contiguous and writable.
+    """Convert pixels to (H, W) uint8 grey values, contiguous and writable.
 
-    They are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps
-    opacity, of 8 or 16 bits, any byte order and strides; else a FrameError. `name` as of
+    Pixels are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps
+    opacity, of 8 or 16 bits, any byte order and strides; else FrameError is raised. `name` as in
     `decode_gray`.
     """
     dtype = pixels.dtype.newbyteorder("=")
@@ -210,7 +210,7 @@ def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
             f"{name}: is an array of shape {pixels.shape}: expected (height, width) grey values, "
             "or (height, width, 3 or 4) of colours in the order blue, green, red"
         )
-    # Numba would compile every kernel once more for arrays that are read-only, as in messages.
+    # For read-only arrays, as in messages, Numba would compile every kernel once more.
     gray: NDArray[Any] = np.require(pixels, dtype, ["C", "W"])
     if channels != 1:
         code = cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY
@@ -234,7 +234,7 @@ def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None
 
 
 def wrong_size(name: object, found: tuple[int, int], expected: tuple[int, int]) -> FrameError:
-    """The error of an image that has not the calibration's width and height."""
+    """The error for an image without the calibration's width and height."""
     return FrameError(
         f"{name}: is {found[0]}x{found[1]} px: "
         f"expected {expected[0]}x{expected[1]}, the calibration's size: "

@@ -1,4 +1,4 @@
-"""A run from the name of whatever holds its images."""
+"""Opens a run by the name of its image source."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import FramesAlongPoses, PoseStream, SomeFrames, tick_poses, tum_poses
 from detect.sources.video import LiveCamera, VideoFile
 
-#: Endings of bags that are one file.
+#: Extensions of bags that are a single file.
 _BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
@@ -22,21 +22,21 @@ _LIVE = re.compile(r"camera:([0-9]{1,4})")
 def open_run(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> Run:
-    """Open what holds a run's images, with a calibration.
+    """Open a run by the name of its image source, with a calibration.
 
     Parameters
     ----------
     name : path
         A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
     camera_path : path, optional
-        The calibration; by default the one beside the images (of several in a run folder
-        ``<run>.cam``).
+        The calibration; by default the one beside the images (``<run>.cam`` if a run folder has
+        several).
     options : SourceOptions, optional
 
     Raises
     ------
     DetectError
-        If there is no such thing, it cannot be read, or there is no calibration.
+        If the source does not exist or cannot be read, or there is no calibration.
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read, or there are several calibrations.
     """
@@ -45,28 +45,28 @@ def open_run(
         return run
     raise DetectError(
         f"{name}: no calibration: expected a .cam file beside the images, or one named by "
-        "--camera; `camera calibrate` makes one, `camera convert` brings one over"
+        "--camera; `camera calibrate` makes one, `camera convert` converts one"
     )
 
 
 def open_source(
     name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
 ) -> ImageRun:
-    """Open it with or without a calibration; without one it is no `Run`."""
+    """Open a source with or without a calibration; without one the result is not a `Run`."""
     return _open(name, camera_path, options or SourceOptions(), posed=False)
 
 
 def demand_recording(name: Path) -> None:
-    """Raise DetectError for a live camera: existing rows are not of its images."""
+    """Raise DetectError for a live camera, since existing rows do not belong to its images."""
     if _LIVE.fullmatch(str(name)):
         raise DetectError(
-            f"{name}: shows other images now than those that the rows are from: expected a "
-            "recording: a folder or pattern of images, a video or a bag"
+            f"{name}: its images are not those of the rows any more: expected a recording: a "
+            "folder or pattern of images, a video or a bag"
         )
 
 
 def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
-    """Open any source, with a calibration where there is one; `posed`: one with a pose."""
+    """Open any source, with its calibration if there is one (if `posed`, one with a pose)."""
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames: Frames
@@ -84,7 +84,7 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
 
 
 def _own_odometry(folder: Path) -> Path | None:
-    """The odometry of a run folder as the data set has them."""
+    """The odometry of a run folder in the data set's layout."""
     usual = folder / f"{folder.resolve().name}.txt", folder / "map.circles"
     return next((path for path in usual if path.is_file()), None)
 
@@ -92,7 +92,7 @@ def _own_odometry(folder: Path) -> Path | None:
 def _source(name: Path, options: SourceOptions) -> Source:
     is_bag = _is_ros2_bag(name) or name.suffix.lower() in _BAG_SUFFIXES
     if is_bag and name.exists():
-        from detect.sources.bag import Bag  # takes as long as everything else
+        from detect.sources.bag import Bag  # importing takes as long as everything else
 
         return Bag(name, options.image_topic)
     if options.image_topic and not is_bag:
@@ -110,7 +110,7 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
-    """The frames of a source along the odometry that was named, and the file of that."""
+    """The frames of a source along the given odometry, and the odometry's file."""
     named = options.odometry
     poses: PoseStream | None
     if options.times and source.times_own:
@@ -123,13 +123,13 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
             raise DetectError(
-                f"{named}: ticks of wheels: expected --wheel-base-m and --metres-per-tick above 0"
+                f"{named}: wheel ticks: expected --wheel-base-m and --metres-per-tick above 0"
             )
         poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
     elif named and named != "none":
         if not isinstance(source, ImageFiles):
             raise DetectError(
-                f"{named}: STEP rows are those of image files: expected a trajectory (.tum), "
+                f"{named}: STEP rows belong to image files: expected a trajectory (.tum), "
                 f"ticks (.ticks), a bag's topic or none for {source.name}"
             )
         return source.along(Path(named)), Path(named)
@@ -139,8 +139,8 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         return source, None
     if not source.has_times:
         raise DetectError(
-            f"{source.name}: no times of the images: a trajectory needs them: "
-            "name a file of rows 'prefix seconds' by --times"
+            f"{source.name}: no times of the images, which a trajectory needs: "
+            "give a file of rows 'prefix seconds' by --times"
         )
     return FramesAlongPoses(source, poses), poses.path
 

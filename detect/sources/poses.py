@@ -1,10 +1,9 @@
-"""Poses of the robot over time, and what becomes of them: the STEP rows of the data set.
+"""Poses of the robot over time, and their conversion to the STEP rows of the data set.
 
-A pose (x, y, theta) has the robot's X forward and Y left, as in ROS; a STEP its X left and Y
-backward, in the robot's frame before it. Turning by the same angle is the same in both. Poses may
-come from TUM trajectories, rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from
-the counters of two wheels, rows ``t left right``. The robot moves on the floor: of its attitude the
-heading is taken, of its position x and y.
+A pose (x, y, theta) has X forward and Y left, as in ROS; a STEP has X left and Y backward, in the
+robot's frame before the step. Rotations are the same in both. Poses come from TUM trajectories,
+rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from wheel encoders, rows
+``t left right``. The robot moves on the floor, so only heading, x and y are used.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import Step, wrap_angle
 from redetect.storage.bounded import rows_of_numbers
 
-#: Limit of distances from the start (m), such that products of two remain finite.
+#: Limit of distances from the start (m), so that products of two remain finite.
 FARTHEST = 1e12
-#: Between poses farther apart than this (s), nothing is interpolated.
+#: Longest interval between poses that is interpolated (s).
 LARGEST_GAP_S = 1.0
-#: Takes (forward, left, turn) to (left, backward, turn).
+#: Maps (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-# A covariance of a step is none where its smallest eigenvalue is below this share of its largest,
-# or lost in the rounding of the pose's own.
+# A step's covariance is invalid if its smallest eigenvalue is below this share of its largest, or
+# of the rounding errors of the pose's own.
 _INDEFINITE, _ROUNDING = 1e-8, 1e-12
-# How far the length of a trajectory's quaternions may be from 1.
+# Tolerance of the length of a trajectory's quaternions.
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
@@ -43,7 +42,7 @@ _END_SLACK_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """Where a robot was: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
+    """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
     The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
     """
@@ -56,7 +55,7 @@ class TimedPose:
 
 
 class PoseStream(NamedTuple):
-    """Poses of the robot over time: their name in messages, their file, and how to read them."""
+    """Poses of the robot over time: their name in messages, their file, and their reader."""
 
     name: str
     path: Path
@@ -66,9 +65,9 @@ class PoseStream(NamedTuple):
 def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     """The STEP row of a robot's movement from one pose to another.
 
-    The covariances of poses are assumed to grow with the path: that of the later pose is that
-    of the earlier, carried along, plus that of the movement, independent of it. Where that is
-    missing or singular, the covariance of the step is not stated: zero.
+    The covariances of poses are assumed to grow with the path: that of the later pose is that of
+    the earlier one, propagated, plus that of the movement, independent of it. If that is missing
+    or singular, the covariance of the step is zero, which means unknown.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
@@ -89,14 +88,14 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
 def carried(
     covariance: FloatArray, before: TimedPose, after: TimedPose, share: float = 1.0
 ) -> FloatArray:
-    """A pose's covariance after a share of an exact movement to another one."""
+    """A pose's covariance, propagated by a share of an exact movement to another one."""
     carry = np.eye(3)  # an error of theta moves the positions after it
     carry[:2, 2] = share * (before.y - after.y), share * (after.x - before.x)
     return np.asarray(carry @ covariance @ carry.T)
 
 
 def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPose:
-    """The pose at a time between two: linear, the heading the shorter way round."""
+    """The pose at a time between two, by linear interpolation, the heading the shorter way."""
     share = (time_s - before.time_s) / (after.time_s - before.time_s)
     grown = after.covariance - carried(before.covariance, before, after)
     return TimedPose(
@@ -109,7 +108,7 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 
 
 class PosesOverTime:
-    """Poses in order, read once; what is asked for must be in order, too."""
+    """Poses in order, read once; requests must be in order, too."""
 
     def __init__(self, poses: Iterator[TimedPose], name: str) -> None:
         self._poses = poses
@@ -154,7 +153,7 @@ def tum_poses(path: Path) -> Generator[TimedPose, None, None]:
 def tick_poses(
     path: Path, wheel_base_m: float, metres_per_tick: float
 ) -> Generator[TimedPose, None, None]:
-    """The poses of a robot with two driven wheels by its counters; arcs from row to row."""
+    """The poses of a differential-drive robot from wheel ticks; arcs from row to row."""
     x = y = theta = 0.0
     last: tuple[float, float] | None = None
     rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
@@ -163,7 +162,7 @@ def tick_poses(
             ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
             way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
             if not max(abs(way), abs(half_turn)) <= FARTHEST:
-                raise DetectError(f"{place}: expected a way and a turn of at most {FARTHEST:g}")
+                raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
             chord = way * float(np.sinc(half_turn / math.pi))
             x += chord * math.cos(theta + half_turn)
             y += chord * math.sin(theta + half_turn)
@@ -173,15 +172,15 @@ def tick_poses(
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
-    """The heading of a quaternion: where the robot's X axis points, seen from above (rad)."""
+    """The heading of a quaternion: direction of the robot's X axis, seen from above (rad)."""
     return math.atan2(2.0 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
 
 
 class FramesAlongPoses(Frames):
-    """The frames of a source whose robot's poses are known over time.
+    """The frames of a source with known poses of the robot over time.
 
-    The pose of an image is that between the two poses before and after it. Images without a pose
-    at their time are no part of the run; the first one's step is zero.
+    The pose of an image is interpolated between those before and after it. Images without a pose at
+    their time are not part of the run; the first one's step is zero.
     """
 
     def __init__(self, source: Source, stream: PoseStream) -> None:
@@ -206,7 +205,7 @@ class FramesAlongPoses(Frames):
 
 
 class SomeFrames(Frames):
-    """Of the first `count` frames of others (0: of all) every n-th."""
+    """Every n-th of the first `count` frames of another source (0: of all)."""
 
     def __init__(self, frames: Frames, count: int = 0, every: int = 1) -> None:
         self._frames, self._count, self._every = frames, count, every

@@ -1,8 +1,7 @@
 """A video file, and a live camera, as sources: frames by OpenCV, decoded on demand.
 
 An image of a live camera has the time of its arrival. The first Ctrl-C ends the stream: the images
-so far are processed and the results written. A second one ends the program, which then writes
-nothing.
+so far are processed and the results written. A second one ends the program without output.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class VideoFile(Source):
                 if not there:
                     break
                 time_s = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
-                if time_s <= last_s and per_second > 0.0:  # a container without time stamps
+                if time_s <= last_s and per_second > 0.0:  # a container without timestamps
                     time_s = number / per_second
                 prefix = numbered_prefix(self.path.stem, number)
                 gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
@@ -68,7 +67,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
                 f"{path}: no video that OpenCV can read: expected a run folder, images, a video "
                 "(avi, mp4, mkv), or a bag (.bag, .mcap, or the folder of a ROS 2 bag)"
             )
-        # A calibration is of the sensor's pixels, whichever way up a telephone would show them.
+        # A calibration refers to the sensor's pixels, however a player would rotate them.
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture
     finally:
@@ -77,7 +76,7 @@ def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Suppress messages of OpenCV, and of FFmpeg in it, for errors that are reported here."""
+    """Suppress messages of OpenCV and its FFmpeg on errors that are reported here."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
     before = levels.getLogLevel()
@@ -114,7 +113,7 @@ class LiveCamera(Source):
                     if stop.is_set():
                         return
                     if not there:
-                        _log.info("the camera gives no more images: the results so far are written")
+                        _log.info("the camera yields no more images: writing the results so far")
                         return
                     prefix = numbered_prefix(f"camera{self._index}", number)
                     gray = gray_of_pixels(pixels, prefix)
@@ -131,5 +130,5 @@ def _open_camera(index: int) -> cv2.VideoCapture:
             f"camera:{index}: no camera of that number answers: "
             "expected one that is plugged in, not in use, and open to you (often camera:0)"
         )
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # an image that waited is older than its time
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # buffered images are older than their arrival
     return capture

@@ -1,1 +1,1 @@
-"""Verticals of the building: filter, tracks, fitted lines, bearings, and the tilt they agree on."""
+"""Verticals of the building: filter, tracks, fitted lines, bearings, and the consensus tilt."""

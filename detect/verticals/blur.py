@@ -1,8 +1,8 @@
-"""Images whose edges are all blurred: the amount of blur, and settings for it.
+"""Estimates the blur of an image, and adapts the settings to it.
 
-Turning robots and soft optics blur all edges of an image alike. If the blur is wider than the
-filter, an edge has no unique steepest place: rotation turns a step into a ramp of constant slope,
-in which tracks drift. A filter as wide as the blur finds the middle of the ramp.
+Rotation of the robot and soft optics blur all edges of an image alike. If the blur is wider than
+the filter, the steepest point of an edge is not unique: motion blur turns a step into a ramp of
+constant slope, in which tracks drift. A filter as wide as the blur finds the middle of the ramp.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits
 
-#: A filter of this share of the blur's width is wide enough.
+#: Least width of the filter, as a share of the blur's width.
 _WIDE_ENOUGH = 0.68
-#: Refinement has no steps wider than this, pixels.
+#: Largest filter width of a refinement step, pixels.
 _WIDEST_STEP_PX = 19.0
 #: Least number of edges from which the blur of an image is estimated.
 _LEAST_EDGES = 3
-#: Settings that grow with the width of the filter: pixels across an edge. They include a line's
-#: standard deviation: other edges within the blur displace it by a part of that.
+#: Settings that scale with the width of the filter: pixels across an edge. They include a line's
+#: standard deviation, since other edges within the blur displace it in proportion.
 _ACROSS = (
     "sigma_across_px", "guided_reach_px", "fine_scale_px", "coarse_scale_px",
     "largest_scatter_px", "largest_shift_px", "largest_noise_px", "bend_px", "largest_lean_px",
@@ -32,11 +32,11 @@ _ACROSS = (
 
 
 def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> float:
-    """Standard deviation of the Gaussian blur of a step edge that has some sharpness, pixels.
+    """Standard deviation of the Gaussian blur of a step edge with a given sharpness, pixels.
 
-    The derivative of a Gaussian of width s sees a step that is blurred by b with the contrast
-    s / sqrt(s^2 + b^2); sharpness is the ratio of that for two widths. Infinite for less sharpness
-    than endless blur leaves, fine_px / coarse_px.
+    The derivative of a Gaussian of width s measures a step blurred by b with the contrast
+    s / sqrt(s^2 + b^2); sharpness is the ratio of that for two widths. Infinite if the sharpness is
+    below its limit for large blur, fine_px / coarse_px.
     """
     ratio = (sharpness * coarse_px / fine_px) ** 2
     if ratio <= 1.0:
@@ -45,7 +45,7 @@ def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> flo
 
 
 def width_for(sharpness: float, settings: LineSettings) -> float:
-    """The least of `blurred_widths` that suits edges of a sharpness, or the largest."""
+    """The smallest of `blurred_widths` that suits edges of a sharpness, or the largest."""
     blur_px = blur_of_sharpness(sharpness, settings.fine_scale_px, settings.coarse_scale_px)
     enough = [
         width
@@ -57,7 +57,7 @@ def width_for(sharpness: float, settings: LineSettings) -> float:
 
 @lru_cache(maxsize=32)
 def widened(settings: LineSettings, width: float) -> LineSettings:
-    """The settings for edges `width` times as wide; of `blurred_widths`, larger ones remain."""
+    """The settings for edges `width` times as wide; only larger `blurred_widths` remain."""
     across = {name: width * getattr(settings, name) for name in _ACROSS}
     steps = tuple(
         (min(width * scale, _WIDEST_STEP_PX), width * most)
@@ -68,9 +68,9 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
 
 
 def median_sharpness(fits: LineFits) -> float:
-    """Median sharpness of the edges that were refined, lines or not; 1 where there are too few.
+    """Median sharpness of all refined edges, lines or not; 1 if there are too few.
 
-    Of an even number the lower of the two in the middle.
+    For an even number, the lower median.
     """
     sharpness = np.sort(fits.sharpness[~np.isnan(fits.contrast)])
     return 1.0 if len(sharpness) < _LEAST_EDGES else float(sharpness[(len(sharpness) - 1) // 2])

@@ -1,9 +1,9 @@
-"""Joining: one line for each edge, close ones together; their bearings, inclinations and ends.
+"""Joins tracks to lines, one for each edge, and computes bearings, inclinations and ends.
 
-Of accepted tracks, from the strongest on, those of the same edge as a stronger one and those beside
-a much stronger one are left out; neighbours closer than `join_px` are one line. Its bearing is the
-mean of the mixture of its tracks' Gaussians, sum of w_k N(alpha_k, noise_k^2 + (sigma_px pixel)^2),
-and its standard deviation that of the mixture.
+From the strongest on, accepted tracks suppress others of the same edge and much weaker ones beside
+them; of the rest, neighbours closer than `join_px` become one line. Its bearing is the mean of the
+mixture of its tracks' Gaussians, sum of w_k N(alpha_k, noise_k^2 + (sigma_px pixel)^2), and its
+standard deviation that of the mixture.
 
 A line's row holds its ends in undistorted normalised image coordinates. The plane through the
 camera's centre and both ends has a unit normal n in the robot frame; beta = asin(n_z). alpha is the
@@ -45,7 +45,7 @@ class Lines(NamedTuple):
 def lines_of_tracks(
     strip: Strip, tracks: LineTracks, judged: Judgement, numbers: JoiningNumbers
 ) -> Lines:
-    """Lines of accepted tracks; the fate of tracks that are left out or joined is changed."""
+    """Lines of accepted tracks; updates the fates of tracks that are suppressed or joined."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
     if judged.tilt is None or not numbers.level:
         numbers = numbers._replace(building_deg=math.inf)
@@ -64,7 +64,7 @@ def _join(
     chosen = chosen[accepted_tracks(fate[chosen])]
     count = len(chosen)
     group = chain_neighbours(alpha[chosen], numbers.join_px * fits.pixel_rad[chosen])
-    # The strongest of each line stays its first.
+    # The strongest track of each line stays its first.
     bounds = np.zeros(count + 1, np.int64)
     members, lines, n = np.empty(count, np.int64), 0, 0
     while n < count:
@@ -112,9 +112,8 @@ def _bearings(
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
-    The measured lean b is replaced by its best estimate, given that it should be that of a vertical
-    under the tilt up to the standard deviation `building_deg`, and a, which is correlated with it,
-    follows.
+    The measured lean b is combined with its prior, the lean of a vertical under the tilt with the
+    standard deviation `building_deg`; a, which is correlated with b, is updated accordingly.
     """
     alpha, noise = np.empty(len(fits.line)), np.empty(len(fits.line))
     turn = 1.0 if numbers.level else -1.0
@@ -124,7 +123,7 @@ def _bearings(
         a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]
         gain = covariance[0, 1] / (covariance[1, 1] + math.radians(numbers.building_deg) ** 2)
         a -= gain * (b - (tilt[0] * sine - tilt[1] * cosine))
-        # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
+        # Of the plane's two level directions, (n_y, -n_x) is the one ahead of the camera.
         n_x, n_y = cosine - a * sine, sine + a * cosine
         x = rotation[0, 0] * n_x + rotation[0, 1] * n_y - rotation[0, 2] * b
         y = rotation[1, 0] * n_x + rotation[1, 1] * n_y - rotation[1, 2] * b
@@ -138,7 +137,7 @@ def _leave_out(
     tracks: IntArray, alpha: FloatArray, polarity: FloatArray, fits: LineFits,
     evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Leave out tracks, from the strongest on, on the same edge as a stronger one or beside it."""
+    """Suppress tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast = fits.pixel_rad, fits.contrast
     for k in range(len(tracks)):
         t = tracks[k]
@@ -157,9 +156,9 @@ def _leave_out(
 
 @kernel()
 def chain_neighbours(alpha: FloatArray, distance: FloatArray) -> IntArray:
-    """(N,) groups of bearings (N,), counted from 0 at the largest one (leftmost in the image).
+    """(N,) group indices of bearings (N,), from 0 at the largest one (leftmost in the image).
 
-    Two neighbours belong together if they are closer than the smaller of their distances (N,).
+    Neighbours are in the same group if they are closer than the smaller of their distances (N,).
     """
     group, order = np.zeros(len(alpha), np.int64), strongest_first(alpha)
     for k in range(1, len(order)):
@@ -175,8 +174,8 @@ def join_mixtures(
 ) -> tuple[FloatArray, FloatArray]:
     """(N,) means and standard deviations of mixtures of Gaussians of bearings (rad).
 
-    Of the (M,) components, ``bounds[n] : bounds[n + 1]`` are those of mixture n; their means are
-    within half a turn, their weights not negative, of any sum.
+    Mixture n has the components ``bounds[n] : bounds[n + 1]`` of the (M,); their means are within
+    half a turn, their weights not negative and not necessarily normalised.
     """
     mean, deviation = np.empty(len(bounds) - 1), np.empty(len(bounds) - 1)
     for n in range(len(mean)):
@@ -197,7 +196,7 @@ def join_mixtures(
 def _end_of_line(
     strip: Strip, tracks: LineTracks, fits: LineFits, t: int, end: int
 ) -> tuple[float, float]:
-    """Undistorted normalised coordinates of where a line crosses the first or last row it has."""
+    """Undistorted normalised coordinates of a line's crossing with its first or last row."""
     bearing, elevation, rotation = strip.bearing, strip.rise, strip.robot_from_camera
     phi, a, b = fits.reference_rad[t], fits.line[t, 0], fits.line[t, 1]
     last = len(bearing) - 1
@@ -211,7 +210,7 @@ def _end_of_line(
         # At the verticals' own ends the neighbouring column may end a row earlier.
         if math.isfinite(moved):
             rise = moved
-        # Z depends on X in second order only: one repetition settles it.
+        # Z depends on X in second order only: one repetition suffices.
         x = a + b * rise
         z = rise * math.sqrt(1.0 + x * x)
         x = a + b * z

@@ -1,9 +1,9 @@
-"""Selects the tracks that can be verticals, by themselves and by the tilt on which most agree.
+"""Selects the tracks that can be verticals, individually and by the tilt consensus.
 
-A track's evidence is its response summed over its length in pixel widths, weakened by the square of
-its sharpness: soft edges are shadows and glare more often than the building's. A line at an angle b
-to the vertical is accepted if b^2 is at most the sum of the squares of the largest lean, of a
-number of standard deviations of its noise, and of some pixels over its length
+A track's evidence is its response summed over its length in pixel widths, times the square of its
+sharpness: soft edges are more often shadows and glare than edges of the building. A line at an
+angle b to the vertical is accepted if b^2 is at most the sum of the squares of the largest lean, a
+number of standard deviations of its noise, and some pixels over its length
 (`detect.line_settings.LineSettings`).
 """
 
@@ -26,7 +26,7 @@ from redetect.compiled import kernel
 
 
 class Fate(IntEnum):
-    """What became of a track: a line of its own, joined to another one, or why it was rejected."""
+    """Fate of a track: a line of its own, joined to another one, or the reason for rejection."""
 
     ACCEPTED = 0
     JOINED = 1
@@ -43,10 +43,10 @@ class Fate(IntEnum):
     BESIDE_A_STRONGER_EDGE = 12
 
 
-#: The same in words.
+#: The fates in words.
 FATES = tuple(fate.name.lower().replace("_", " ") for fate in Fate)
 
-#: Tracks of these fates might be lines if followed otherwise,
+#: Tracks with these fates might be lines if tracked again,
 _DOUBTFUL = (
     Fate.NO_MAXIMUM,
     Fate.OFF_THE_TRACK,
@@ -54,35 +54,34 @@ _DOUBTFUL = (
     Fate.UNCERTAIN,
     Fate.SOFT,
 )
-#: and those with at least this part of the least evidence might have more if followed otherwise.
+#: and those with at least this share of the evidence threshold might exceed it.
 _NEARLY = 0.7
 
 
 class Judgement(NamedTuple):
     """Lines through tracks, and their fates."""
 
-    fits: LineFits  # a line for each track; those too short or too faint to be lines have none
-    #: (T,) response summed over the track's length in pixel widths, weakened by the square of its
+    fits: LineFits  # a line for each track, unless that is too short or too faint
+    #: (T,) response summed over the track's length in pixel widths, times the square of its
     #: sharpness
     evidence: FloatArray
-    #: (T,) places in `FATES`; lines that disagree with the tilt are "not vertical"
+    #: (T,) indices of `FATES`; lines that disagree with the tilt are "not vertical"
     fate: NDArray[np.int8]
-    #: (T,) tracks that are no lines, but may have gone on beyond the edge's end or lost it early
+    #: (T,) rejected tracks that may have continued beyond the edge's end, or lost it early
     doubtful: BoolArray
-    #: That most lines agree with; None where too few do. Its covariance is that of least squares.
+    #: Consensus tilt; None if too few lines agree. Its covariance is that of least squares.
     tilt: TiltEstimate | None
-    verticals: Verticals  # what the lines that may be verticals by themselves say about the tilt
-    edge: IntArray  # (N,) the first of these that is of the same edge, for each
+    verticals: Verticals  # constraints of the tilt by lines that may individually be verticals
+    edge: IntArray  # (N,) for each of these, the first one on the same edge
 
 
 def fit_and_judge(
     image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
     numbers: LineNumbers, before: Judgement | None = None,
 ) -> Judgement:  # fmt: skip
-    """Fit lines to tracks, select them one by one, and estimate the tilt on which most agree.
+    """Fit lines to tracks, select them individually, and estimate the consensus tilt.
 
-    Of tracks of which only those were followed again that had been doubtful before, only these are
-    fitted.
+    If only the doubtful tracks of an earlier pass were tracked again, only these are fitted.
     """
     own = numbers.judgement
     least = own.least_points, own.least_evidence / strip.row_aspect
@@ -100,7 +99,7 @@ def fit_and_judge(
     )  # fmt: skip
 
 
-# Kernels that are launched one after the other compile faster than one in another.
+# Kernels that are launched one after the other compile faster than nested ones.
 
 
 @kernel()
@@ -109,7 +108,7 @@ def _judge(
 ) -> tuple[
     FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray
 ]:  # fmt: skip
-    """Evidence and fates of tracks by themselves, which are doubtful; planes and edges of lines."""
+    """Evidence and individual fates of tracks, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
     evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
     _judge_each(strip, tracks, fits, numbers, evidence, fate)
@@ -138,7 +137,7 @@ def _judge_each(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers,
     evidence: FloatArray, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Evidence of each track, and whether it can be a vertical, by itself."""
+    """Evidence of each track, and whether it can individually be a vertical."""
     score = tracks.score
     for t in range(len(fate)):
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
@@ -169,7 +168,7 @@ def _judge_each(
 
 @kernel()
 def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
-    """(N,) the tracks that are accepted so far."""
+    """(N,) indices of the tracks accepted so far."""
     accepted, count = np.empty(len(fate), np.int64), 0
     for t in range(len(fate)):
         if fate[t] == Fate.ACCEPTED:
@@ -183,7 +182,7 @@ def _reject_soft(
     fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: JudgementNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Reject lines that are soft and faint among the accepted ones."""
+    """Reject lines that are soft and faint compared to the other accepted ones."""
     if len(accepted) == 0:
         return
     # How sharp an edge can be depends on the image's focus and motion.
@@ -212,7 +211,7 @@ def _quantile(values: FloatArray, chosen: IntArray, share: float) -> float:
 def _weigh(
     fits: LineFits, accepted: IntArray, votes: FloatArray, numbers: JudgementNumbers
 ) -> Verticals:
-    """The tilt's constraints by accepted lines, with some votes each."""
+    """The tilt's constraints by accepted lines, with their votes."""
     count = len(accepted)
     normal, variance, tolerance = np.empty((count, 3)), np.empty(count), np.empty(count)
     for k in range(count):
@@ -241,7 +240,7 @@ def _weigh(
 
 @kernel()
 def share_edges(lines: Verticals, edge: IntArray) -> None:
-    """Let the lines of one edge say together as much about the tilt as one."""
+    """Give the lines on one edge together the votes and information of a single line."""
     members = np.zeros(len(edge), np.int64)
     for k in range(len(edge)):
         members[edge[k]] += 1

@@ -1,16 +1,16 @@
-"""Refinement: straight lines through tracks, moved to where the grey values are steepest.
+"""Refinement: moves straight lines through tracks to the steepest grey value gradient.
 
-Lines are described in the chart round a reference bearing phi: a direction at bearing phi + d whose
+Lines are described in a chart around a reference bearing phi: a direction at bearing phi + d whose
 elevation has tangent e is X = tan(d), Z = e / cos(d). There every line is straight, X = a + b Z; a
 is the tangent of its bearing at the horizon relative to phi, b its lean.
 
-A step of the grey value at u is seen by H(u) = sum of d G(d) I / sigma^2 over the pixels, d their
-distances from u and G a Gaussian: its height, if u is where the step is. H is largest there; its
-first and second derivatives, times sigma^2, have the weights (q - 1) G and (q - 3) d / sigma^2 G,
+The filter H(u) = sum of d G(d) I / sigma^2 over the pixels, d their distances from u and G a
+Gaussian, measures the height of a step of the grey value at u. H has its maximum there; its first
+and second derivatives, times sigma^2, have the weights (q - 1) G and (q - 3) d / sigma^2 G,
 q = d^2 / sigma^2. Newton's method moves a line to the maximum of the sum of H over its rows, each
-evaluated at the sub-pixel column at which the line crosses it. The covariance is that of the
-maximum under noise that is independent from row to row, taken from the rows' own gradients (a
-sandwich estimator), so it needs no model of the noise.
+evaluated at the sub-pixel column at which the line crosses it. The covariance of the maximum
+assumes that noise is independent from row to row and uses the rows' own gradients (a sandwich
+estimator), so it needs no noise model.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from detect.verticals.tracking import LineTracks
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Positions in a pixel for which weights are tabulated; between them the derivative helps out.
+#: Sub-pixel positions for which weights are tabulated; between them, the derivative interpolates.
 SUBPIXELS = 64
 #: Standard deviations beyond which the Gaussian is negligible.
 _REACH = 4.4
-#: A step is not repeated where it moved no row farther than this, pixels.
+#: A step is not repeated if it moved all rows by less than this, pixels.
 _STILL_PX = 0.02
 
 
 class LineFits(NamedTuple):
-    """Straight lines through tracks, each in the chart round a reference bearing."""
+    """Straight lines through tracks, each in the chart around a reference bearing."""
 
     reference_rad: FloatArray  # (T,) bearing of the chart's origin
-    pixel_rad: FloatArray  # (T,) width of a pixel's column at the horizon there
-    line: FloatArray  # (T, 2) a, b; NaN where there is no line
+    pixel_rad: FloatArray  # (T,) width of a pixel at the horizon there
+    line: FloatArray  # (T, 2) a, b; NaN without a line
     covariance: FloatArray  # (T, 2, 2) covariance of a, b, due to noise
     #: (T,) root-mean-square distance of the tracked points from their straight line, pixels
     scatter_px: FloatArray
-    shift_px: FloatArray  # (T,) how far the refinement took the line's middle, pixels
+    shift_px: FloatArray  # (T,) displacement of the line's middle by the refinement, pixels
     spread: FloatArray  # (T,) variance of the points' Z
-    #: (T,) height of the step in grey values, as the fine filter sees it; NaN without refinement
+    #: (T,) height of the step in grey values, at the fine scale; NaN without refinement
     contrast: FloatArray
     #: (T,) contrast at the fine scale relative to the coarse one, at most 1; 1 without refinement
     sharpness: FloatArray
@@ -55,15 +55,15 @@ class LineFits(NamedTuple):
 class StepFilters(NamedTuple):
     """The K steps of the refinement, and tables of their filters."""
 
-    #: (K,) the filter at a place in pixels i to i + 1 covers 2 half pixels, from i - half + 1
+    #: (K,) the filter between pixels i and i + 1 covers 2 half pixels, from i - half + 1
     half: IntArray
-    #: (K, 2, SUBPIXELS, N) of the first and the second derivative of the step's height, times
-    #: sigma^2, at places in the pixel; of N those of the 2 half pixels come first
+    #: (K, 2, SUBPIXELS, N) weights of the first and second derivative of the step's height, times
+    #: sigma^2, at sub-pixel positions; those of the 2 half pixels come first, then zeros
     weights: Float32Array
-    #: (2, SUBPIXELS, M) of the height itself, at the fine and the coarse scale that are compared
+    #: (2, SUBPIXELS, M) weights of the height itself, at the fine and the coarse scale
     heights: Float32Array
-    #: (K,) largest displacement of the middle of a line by a step, pixels; a larger step is not
-    #: made, nor any after it. Without steps the lines stay as tracked.
+    #: (K,) largest displacement of a line's middle by a step, pixels; a larger step ends the
+    #: refinement and is not made. Without steps the lines stay as tracked.
     farthest: FloatArray
     same: BoolArray  # (K,) whether a step has the filter of the one before it
 
@@ -77,7 +77,7 @@ def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilter
     weights = np.zeros((len(some), 2, SUBPIXELS, widest))
     for own, sigma, h in zip(weights, sigmas, half):
         own[..., : 2 * h] = gaussian_steps(sigma, h)[1:]
-    # Both contrasts are of the same pixels; those of weight 0 do not count.
+    # Both contrasts use the same pixels, some with weight 0.
     scales = settings.fine_scale_px, settings.coarse_scale_px
     heights = [gaussian_steps(sigma, _half(sigma))[0] for sigma in scales]
     taps = max(table.shape[1] for table in heights)
@@ -92,7 +92,7 @@ def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilter
 
 
 def _half(sigma: float) -> int:
-    """Half the number of pixels that a filter covers; a number that is whole in vectors."""
+    """Half the number of pixels that a filter covers, rounded up to whole vectors."""
     return 4 * math.ceil(_REACH * sigma / 4.0)
 
 
@@ -110,7 +110,7 @@ def gaussian_steps(sigma: float, half: int) -> FloatArray:
 
 
 class Crossings(NamedTuple):
-    """Where a line crosses the N rows of its track: columns, NaN for none, and derivatives."""
+    """Crossings of a line with the N rows of its track: columns, NaN for none, and derivatives."""
 
     row: NDArray[np.int32]
     column: FloatArray
@@ -119,7 +119,7 @@ class Crossings(NamedTuple):
 
 
 class NewtonStep(NamedTuple):
-    """A step of Newton's method: how a and b change, and their covariance after that."""
+    """A step of Newton's method: changes of a and b, and their covariance after that."""
 
     change_a: float
     change_b: float
@@ -140,7 +140,7 @@ class Eigenline(NamedTuple):
 
 @kernel(inline="always")
 def _no_fits(count: int) -> LineFits:
-    """Places for the lines of tracks: none yet."""
+    """Empty arrays for the lines of tracks."""
     return LineFits(
         np.empty(count),
         np.empty(count),
@@ -159,11 +159,11 @@ def _fit_points(
     strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
     fits: LineFits, k: int,
 ) -> Eigenline:  # fmt: skip
-    """Fit a line to track t by the eigen-decomposition of its points' scatter.
+    """Fit a line to track t by the eigen-decomposition of its points' scatter matrix.
 
-    Tracks of fewer points or a lower sum of scores than `least` have none. `chart`, (2, N), gets X
-    and Z of the points, `fits` the line at place k; the covariance is that of independent points
-    with the scatter that the track shows.
+    Tracks with fewer points or a lower sum of scores than `least` get none. X and Z of the points
+    are written to `chart` (2, N), the line to index k of `fits`; the covariance is that of
+    independent points with the observed scatter.
     """
     begin, end = tracks.bounds[t], tracks.bounds[t + 1]
     n, row, column, score = end - begin, tracks.row, tracks.column, tracks.score
@@ -195,9 +195,9 @@ def fit_lines(
     image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
     least: tuple[int, float], first: int,
 ) -> LineFits:  # fmt: skip
-    """Fit lines to tracks from the `first` on, and refine them on the grey values in some steps.
+    """Fit lines to tracks from `first` on, and refine them on the grey values in some steps.
 
-    Tracks of fewer points or a lower sum of scores than `least` have no line.
+    Tracks with fewer points or a lower sum of scores than `least` have no line.
     """
     fits = _no_fits(len(tracks.polarity) - first)
     height = image.shape[0]
@@ -272,19 +272,19 @@ def _cross_rows(
     strip: Strip, tracked: FloatArray, x: FloatArray, z: FloatArray, line: Eigenline,
     crossings: Crossings,
 ) -> None:  # fmt: skip
-    """Where a line crosses the rows of its track, whose points are near it."""
+    """Compute the crossings of a line with the rows of its track, near the track's points."""
     bearing, column = strip.bearing, strip.column
     row, crossing, by_a, by_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
     last = len(bearing) - 1
     for i in range(len(x)):
         v = row[i]
         j = min(int(tracked[i]), last - 1)
-        # In the strip; by X in first order, d atan(X) = dX / (1 + X^2).
+        # In the strip, to first order in X: d atan(X) = dX / (1 + X^2).
         by_x = 1.0 / ((1.0 + x[i] * x[i]) * (bearing[j + 1] - bearing[j]))
         place = tracked[i] + (line.a + line.b * z[i] - x[i]) * by_x
         j = min(max(int(place), 0), last - 1)
         du_dc = column[j + 1, v] - column[j, v]
-        # Beside it a vertical may have ended.
+        # The neighbouring vertical may have ended.
         if place >= 0.0 and place <= last and math.isfinite(du_dc):
             crossing[i] = column[j, v] + (place - j) * du_dc
             by_a[i] = by_x * du_dc
@@ -299,7 +299,7 @@ def _climb(
     image: GreyImage, crossings: Crossings, filters: StepFilters, sign: float,
     middle: float, pixel: float,
 ) -> NewtonStep:  # fmt: skip
-    """All steps of a line together, as far as they lead, and its covariance after the last.
+    """The sum of all steps of a line, and its covariance after the last.
 
     The steps move the crossings in proportion to their derivatives.
     """
@@ -312,7 +312,7 @@ def _climb(
             continue
         weights, half = filters.weights[step], filters.half[step]
         newton = newton_step(image, crossings, weights, half, sign)
-        # Where there is no maximum at this scale, the result of the coarser ones is kept.
+        # Without a maximum at this scale, the result of the coarser ones is kept.
         if not abs(newton.change_a + newton.change_b * middle) <= filters.farthest[step] * pixel:
             break
         a += newton.change_a
@@ -332,12 +332,12 @@ def _climb(
 def newton_step(
     image: GreyImage, crossings: Crossings, weights: Float32Array, half: int, sign: float
 ) -> NewtonStep:
-    """The step to where a line's rows have the largest response together.
+    """One Newton step towards the maximum of the sum of the responses of a line's rows.
 
-    `weights` and `half` are those of a step in `StepFilters`, the sign is 1 where the image is
-    brighter on the right, else -1. NaN where there is no maximum at this scale.
+    `weights` and `half` are those of a step in `StepFilters`; the sign is 1 if the image is
+    brighter on the right, else -1. NaN if there is no maximum at this scale.
     """
-    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    # Unpacked once, since Numba counts references at every access to an array in a tuple.
     row, column, to_a, to_b = crossings.row, crossings.column, crossings.by_a, crossings.by_b
     used = 0
     g_a = g_b = h_aa = h_ab = h_bb = m_aa = m_ab = m_bb = 0.0
@@ -376,7 +376,7 @@ def newton_step(
 def _contrasts(
     image: GreyImage, crossings: Crossings, heights: Float32Array
 ) -> tuple[int, float, float]:
-    """How many rows are seen, and the sums of their heights at two scales."""
+    """The number of visible rows, and the sums of their heights at two scales."""
     row, column, half = crossings.row, crossings.column, heights.shape[2] // 2
     rows, fine, coarse = 0, 0.0, 0.0
     for i in range(len(row)):
@@ -388,14 +388,14 @@ def _contrasts(
     return rows, fine, coarse
 
 
-# Sums in any order become vectors; inlined, their order is that of the kernel that has them.
+# Sums in any order are vectorised; inlined, so that each kernel has its own fixed order.
 @kernel(fastmath={"contract", "reassoc"}, forceinline=True)
 def _see(
     image: GreyImage, v: int, u: float, weights: Float32Array, half: int
 ) -> tuple[bool, float, float, float]:
-    """What two filters see at a place; its distance from where they are tabulated for.
+    """Whether the window at a position is inside the image; the values of two filters there.
 
-    First of all whether their window is inside the image.
+    Finally the distance from the nearest tabulated position.
     """
     if not (u > half and u < image.shape[1] - 1 - half):
         return False, 0.0, 0.0, 0.0

@@ -1,7 +1,7 @@
-"""Response: how much a step of the grey value along a vertical explains.
+"""Response: how well a step edge along a vertical explains the grey values.
 
-With Gaussian weights g round a place on a vertical and h, the distance across the vertical in units
-of its weighted standard deviation, the response is the sign of the covariance times
+With Gaussian weights g around a point on a vertical and h, the distance across the vertical in
+units of its weighted standard deviation, the response is the sign of the covariance times
 
     Cov_g(h, I)^2 / (Var_g(I) + regulariser),
 
@@ -9,9 +9,9 @@ the squared correlation of grey value and distance (DLR Spatial Cognition data s
 detection). Affine changes of brightness change it only through the regulariser.
 
 It is evaluated in a *stripe* along a path: a row of the stripe has the grey values and their
-squares at whole pixels' distance from the path in a row of the image, interpolated between pixels.
-Both are averaged along the path as far as that is seen (normalised convolution: H. Knutsson and
-C.-F. Westin, CVPR 1993), then across it.
+squares at integer distances from the path in an image row, interpolated between pixels. Both are
+averaged along the visible part of the path (normalised convolution: H. Knutsson and C.-F. Westin,
+CVPR 1993), then across it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from lut.verticals import VerticalTable
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Grey values about 0 keep small variances exact in single precision.
+#: Subtracted from grey values, so that small variances are accurate in single precision.
 MIDDLE_GREY = np.float32(128.0)
 #: Rows of a stripe in which the response is evaluated.
 STRIPE_ROWS = 16
-#: Least number of columns in which it is evaluated, and what the stripe's width is a multiple of.
+#: Least number of columns in which it is evaluated; the stripe's width is a multiple of `_VECTOR`.
 _LEAST_COLUMNS, _VECTOR = 8, 8
 #: Weights along the path that are applied at a time.
 _TOGETHER = 7
@@ -40,25 +40,25 @@ class LineFilter(NamedTuple):
     """Weights of the filter."""
 
     reach: int  # r: the window across the line covers r pixels on either side
-    #: (2, T) across the line: 2r + 1 weights of sum 1, and the same times h; behind them zeros
+    #: (2, T) across the line: 2r + 1 weights of sum 1, and the same times h; padded by zeros
     across: Float32Array
     half_length: int  # s: the window along the line covers s rows on either side
-    along: Float32Array  # (L,) along the line: 2s + 1 weights of sum 1, and behind them zeros
+    along: Float32Array  # (L,) along the line: 2s + 1 weights of sum 1; padded by zeros
     regulariser: np.float32  # added to the variance in the window (grey values squared)
 
 
 class Strip(NamedTuple):
-    """A table of verticals as compiled code reads it, vertical by vertical."""
+    """A table of verticals in the layout for kernels, vertical by vertical."""
 
     #: (W, H) column at which each vertical crosses each row, and the tangent of the elevation
-    #: there; NaN where it is not seen
+    #: there; NaN where it is not visible
     column: Float32Array
     rise: Float32Array
     #: (W,) of their bearings
     sine: FloatArray
     cosine: FloatArray
     columns_per_rad: FloatArray  # (W,) columns per bearing there; NaN at the ends
-    # As of `lut.verticals.VerticalTable`:
+    # As in `lut.verticals.VerticalTable`:
     bearing: FloatArray
     anchor_row: FloatArray
     robot_from_camera: FloatArray
@@ -66,23 +66,23 @@ class Strip(NamedTuple):
 
 
 class Stripe(NamedTuple):
-    """A stripe of C columns and B rows, and what is behind it."""
+    """A stripe of C columns and B rows, and its intermediate results."""
 
     window: LineFilter
-    #: (B + 2s,) columns of the image at which the path crosses rows, from s rows above the first
-    #: one on; NaN where it is not seen
+    #: (B + 2s,) image columns at which the path crosses rows, from s rows above the first one on;
+    #: NaN where it is not visible
     path: FloatArray
-    #: (2, (B + L) C) grey values about the middle one and their squares, row by row
+    #: (2, (B + L) C) grey values relative to the middle grey and their squares, row by row
     samples: Float32Array
     means: Float32Array  # (2, B C + T) averages of these along the path
     moments: Float32Array  # (3, B C) mean, covariance and mean square in windows across it
-    #: (B, C) from the left, those r pixels inside the stripe; the last 2r columns mean nothing
+    #: (B, C) the first column is r pixels inside the stripe; the last 2r columns are invalid
     response: Float32Array
     middle: int  # the column of the response that is on the path
 
 
 def weights_across(sigma_px: float, spacing_px: float = 1.0) -> FloatArray:
-    """(2, 2r + 1) weights of samples that are a distance apart, and the same times the lever."""
+    """(2, 2r + 1) weights of samples with some spacing, and the same times the distance h."""
     reach = math.ceil(3.0 * sigma_px)
     distance = spacing_px * np.arange(-reach, reach + 1)
     weight = np.exp(-0.5 * (distance / sigma_px) ** 2)
@@ -104,7 +104,7 @@ def line_filter(settings: LineSettings) -> LineFilter:
 
 
 def padded(weights: FloatArray) -> Float32Array:
-    """With zeros behind them (last axis) up to a number that is summed together."""
+    """Pad weights with zeros (last axis) to a number that is summed together."""
     behind = [(0, 0)] * (weights.ndim - 1) + [(0, -weights.shape[-1] % _TOGETHER)]
     return np.pad(weights, behind).astype(np.float32)
 
@@ -129,8 +129,8 @@ def strip_of(table: VerticalTable) -> Strip:
 def line_response(image: GreyImage, table: VerticalTable, settings: LineSettings) -> Float32Array:
     """(H, W) responses in an image (H, W) along the verticals of its camera's table.
 
-    At (v, c) that of row v of the vertical that crosses the horizon at column c: in [-1, 1],
-    positive where the image is brighter on the right; 0 where it is not defined.
+    The response at (v, c) is that in row v of the vertical that crosses the horizon at column c: in
+    [-1, 1], positive if the image is brighter on the right; 0 where it is not defined.
     """
     column = np.ascontiguousarray(table.column.T)
     return _respond_everywhere(np.ascontiguousarray(image), column, line_filter(settings)).T
@@ -161,7 +161,7 @@ def empty_stripe(window: LineFilter) -> Stripe:
     return Stripe(
         window,
         np.empty(STRIPE_ROWS + 2 * window.half_length),
-        # Behind the filter's weights are zeros: what they are multiplied by must be finite.
+        # Finite, since the padding of the filter's weights multiplies these values by zero.
         np.zeros((2, size + length * columns), np.float32),
         np.zeros((2, size + taps), np.float32),
         np.empty((3, size), np.float32),
@@ -178,7 +178,7 @@ def respond(image: GreyImage, top: int, stripe: Stripe) -> None:
     columns = response.shape[1]
     left = stripe.middle + reach
     inside = _sample(image, top - window.half_length, left, path, stripe.samples)
-    # Loops, since each call is compiled anew.
+    # Loops, since each inlined call is compiled separately.
     for k in range(2):
         correlate(stripe.samples[k], window.along, columns, stripe.means[k, : response.size])
     for k in range(3):
@@ -192,7 +192,7 @@ def respond(image: GreyImage, top: int, stripe: Stripe) -> None:
 
 @kernel(forceinline=True)
 def _leave_out(path: FloatArray, left: int, last: int, response: Float32Array) -> None:
-    """No response where a path is not seen or windows leave the image."""
+    """Set the response to 0 where the path is not visible or windows leave the image."""
     columns = response.shape[1]
     for b in range(STRIPE_ROWS):
         first = last if math.isnan(path[b]) else math.floor(path[b]) - left
@@ -209,13 +209,13 @@ def _sample(
     """Grey values and their squares along a path; whether all are inside the image."""
     grey, square = samples[0], samples[1]
     pixels, width = image.reshape(-1), image.shape[1]
-    # Behind the rows are as many as the filter has weights.
+    # The rows are followed by as many as the filter has weights.
     columns = 2 * left
     inside = True
     for i in range(len(path)):
         seen = not math.isnan(path[i])
         j = math.floor(path[i]) - left if seen else 0
-        # Past the ends of the array there are no pixels, past those of a row others.
+        # Beyond the array there are no pixels, beyond a row those of the next one.
         begin = (first_row + i) * width + j
         first, after = max(-j, 0), min(width - 1 - j, columns)
         if not seen or begin < 0 or begin + columns >= len(pixels):
@@ -240,7 +240,7 @@ def _sample(
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def correlate(values: Float32Array, weights: Float32Array, stride: int, sums: Float32Array) -> None:
-    """Weighted sums of values a stride apart; several at a time, for which one pass suffices."""
+    """Weighted sums of values a stride apart, several weights in one pass."""
     for c in range(len(sums)):
         sums[c] = 0.0
     step = np.uint64(stride)
@@ -254,7 +254,7 @@ def correlate(values: Float32Array, weights: Float32Array, stride: int, sums: Fl
 
 @kernel(forceinline=True)
 def _normalise(path: FloatArray, along: Float32Array, moments: Float32Array) -> None:
-    """Divide moments by the weights of the rows on which the path is seen."""
+    """Divide moments by the weights of the rows on which the path is visible."""
     columns = moments.shape[1] // STRIPE_ROWS
     for b in range(STRIPE_ROWS):
         share = np.float32(0.0)
@@ -268,7 +268,7 @@ def _normalise(path: FloatArray, along: Float32Array, moments: Float32Array) -> 
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def divide(moments: Float32Array, regulariser: np.float32, response: Float32Array) -> None:
-    """The response by mean, covariance and mean square."""
+    """Compute the response from mean, covariance and mean square."""
     mean, cov, mean_square = moments[0], moments[1], moments[2]
     for c in range(len(response)):
         # Rounding can make a vanishing variance negative.

@@ -1,13 +1,13 @@
 """Starts of tracks: maxima of the response on rows parallel to the horizon.
 
 Every vertical crosses the horizon, or the anchor that replaces it (`lut.verticals`). On a few rows
-round it the response is evaluated at all columns, with the filter applied to the strip itself:
-there the strip's columns are a pixel wide, and it hardly matters whether moments are taken in the
-image and interpolated, or grey values and their squares are interpolated first. The latter is
-separable: first along the verticals, then across.
+around it the response is evaluated at all columns, with the filter applied to the strip itself:
+there the strip's columns are a pixel wide, and it hardly matters whether moments are computed in
+the image and then interpolated, or grey values and their squares are interpolated first. The latter
+is separable: first along the verticals, then across.
 
-An edge has a maximum on each of these rows. Such maxima, one below the other, are a *chain*. A
-maximum that is on none is no start, and long chains are short tracks that cost nothing to follow.
+An edge has a maximum on each of these rows. Such maxima, one below the other, form a *chain*.
+Maxima outside chains are dropped, and long chains already are short tracks.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Starts must be on chains if each line crosses at least this many rows of the band.
+#: Starts have to be on chains if each line crosses at least this number of rows of the band.
 _CROSSED = 3
-#: Maxima of a chain on neighbouring rows of the band are closer than this, columns.
+#: Largest distance of a chain's maxima on neighbouring rows of the band, columns.
 _APART = 1.5
-#: Least number of maxima of a chain where starts must be on chains.
+#: Least number of maxima of a chain if starts have to be on chains.
 _LEAST = 2
 
 
@@ -38,7 +38,7 @@ class StartBand(NamedTuple):
     The filter is evaluated on row s (half its length) of R rows, and every `spacing` rows after it.
     """
 
-    #: (K, W) image row of each position at which the filter is evaluated; -1 where tracks may not
+    #: (K, W) image row of each position at which the filter is evaluated; -1 where no track may
     #: start
     row: NDArray[np.int32]
     #: (R, W) index into the flat image of the pixel on the left of each pixel of the band
@@ -47,16 +47,16 @@ class StartBand(NamedTuple):
     #: beyond the ends of the vertical
     left: Float32Array
     right: Float32Array
-    #: (K, W) one over the sum of the weights that are on the vertical; 0 where there are none
+    #: (K, W) one over the sum of the weights that are on the vertical; 0 if there are none
     scale: Float32Array
     #: (K, 2, T) the filter's weights across the vertical, for the strip's columns, which are a
     #: pixel apart on the horizon only
     across: Float32Array
-    #: (L,) those along it. Behind 2r + 1 and 2s + 1 weights there are zeros, as in `LineFilter`.
+    #: (L,) those along it. 2r + 1 and 2s + 1 weights are followed by zeros, as in `LineFilter`.
     along: Float32Array
     reach: int  # r, pixels
     spacing: int
-    #: Whether each line crosses several of these rows, so that starts must be on chains
+    #: Whether each line crosses several of these rows, so that starts have to be on chains
     chained: bool
 
 
@@ -115,7 +115,7 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
 
 
 def _typical_spacing(x: FloatArray, seen: BoolArray) -> float:
-    """Median distance of neighbouring verticals in a row, pixels; 1 where there are none."""
+    """Median distance of neighbouring verticals in a row, pixels; 1 if there are none."""
     both = seen[1:] & seen[:-1]
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
 
@@ -129,7 +129,7 @@ def band_response(image: GreyImage, band: StartBand, regulariser: float) -> Floa
     return response
 
 
-# Loops that become vectors have functions of their own, which take arrays one by one.
+# Vectorised loops have functions of their own, which take arrays as separate arguments.
 
 
 @kernel()
@@ -138,7 +138,7 @@ def _filter_band(
 ) -> None:
     levels, width = response.shape
     rows, taps = len(band.pixel), band.across.shape[2]
-    # Grey values and their squares. What weights behind the filter's are multiplied by is finite.
+    # Grey values and their squares, followed by finite values for the padding of the weights.
     between = np.empty((rows + len(band.along), 2 * width), np.float32)
     means = np.empty(2 * width + taps, np.float32)
     between[rows:] = means[2 * width :] = np.float32(0.0)
@@ -192,14 +192,14 @@ def _interpolate(
 def line_starts(response: Float32Array, band: StartBand, threshold: float) -> LineStarts:
     """Chains of maxima of the response (K, W) of at least a threshold on the rows of the band.
 
-    Where each line crosses several of these, a chain has at least two maxima.
+    If each line crosses several of these, a chain has at least two maxima.
     """
     rows, least = band.row, _LEAST if band.chained else 1
     levels, width = response.shape
     size = response.size
     row, column, value = np.empty(size, np.int64), np.empty(size), np.empty(size, np.float32)
     below = np.empty(size, np.int64)
-    # Of each maximum the first one of its chain, of that one the chain's length and strength.
+    # For each maximum the first one of its chain; for that one, the chain's length and strength.
     chain, length, strength = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size)
     n = above = begin = 0
     for k in range(levels):
@@ -217,7 +217,7 @@ def line_starts(response: Float32Array, band: StartBand, threshold: float) -> Li
             place = c + 0.5 * float(left - right) / float(left - here - here + right)
             row[n], column[n], value[n], below[n] = rows[k, c], place, here, -1
             chain[n], length[n], strength[n] = n, 1, abs(here)
-            # Each goes on the chain of the nearest one above that none has continued yet.
+            # Each continues the chain of the nearest maximum above that has no successor yet.
             while above < begin and column[above] <= place - 2.0 * _APART:
                 above += 1
             nearest, link = _APART, -1

@@ -1,30 +1,29 @@
-"""Tilt consensus: the camera's tilt from the verticals that it sees, and its mean square error.
+"""Tilt consensus: the camera's tilt from the visible verticals, and its mean square error.
 
 A calibration gives the mounting of the camera on the robot, not the robot's tilt: the robot pitches
-and rolls on its springs, and the mounting itself drifts. Real verticals show the tilt. The plane
-through the camera's centre and a vertical line contains the vertical, so its normal n, rotated by
-the tilt, is level:
+and rolls on its springs, and the mounting itself drifts. Verticals determine the tilt. The plane
+through the camera's centre and a vertical line contains the vertical direction, so its normal n,
+rotated by the tilt, is level:
 
     (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
 
-R takes directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data
+R maps directions measured with the calibrated mounting to level ones. (DLR Spatial Cognition data
 set report, line detection; the data set's own rows apply the inverse of this rotation.) The tilt is
-the one on which most lines agree, refined by least squares with Cauchy's weights.
+the one on which most lines agree, refined by least squares with Cauchy weights.
 
-Least squares assume that errors of lines are independent. Lines of a real building have common
-errors: both edges of a board that leans, the folds of a curtain, a row of trees. And some frames
-show carpentry, others clutter. The mean square error of a tilt t is therefore taken over a
-posterior
+Least squares assumes that errors of lines are independent. Lines of a real building have common
+errors: both edges of a leaning board, the folds of a curtain, a row of trees. And some frames show
+carpentry, others clutter. The mean square error of a tilt t is therefore taken over a posterior
 
     p(t, s) ~ p(t) p(s) prod_k [(1 - q) T3(z_k(t); v_k + s^2) + q Cauchy(z_k(t); c)]
 
 of the tilt and of the scatter s of verticals about the vertical, where z_k(t) is the inclination
-of line k levelled by t, v_k the variance of its measurement, T3 Student's density of three degrees
-of freedom, and q the share of lines that are no verticals. For s each edge counts by itself; given
-s, all lines within `TOGETHER_RAD` of bearing count as a single one, since they lean together. The
-sums are over a polar grid round the tilt, stretched according to the information.
+of line k levelled by t, v_k the variance of its measurement, T3 the density of Student's t with
+three degrees of freedom, and q the share of lines that are not vertical. For s each edge counts
+separately; given s, all lines within `TOGETHER_RAD` of bearing count as one, since they lean
+together. Sums are over a polar grid around the tilt, stretched according to the information.
 
-Student's density for errors whose scale is not known: K. L. Lange, R. J. A. Little and J. M. G.
+Student's t distribution for errors of unknown scale: K. L. Lange, R. J. A. Little and J. M. G.
 Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989).
 """
 
@@ -39,25 +38,25 @@ from detect.line_settings import TiltNumbers
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
-#: How often the tilt is estimated again from the lines that agree with it.
+#: Number of times the tilt is estimated again from the lines that agree with it.
 REFINEMENTS = 6
-#: Standard deviations from which on a line's pull no longer grows.
+#: Scale of the Cauchy weights, standard deviations.
 SOFTENING = 2.0
 
-#: Scatter of verticals about the vertical (rad), and how often it is about that.
+#: Values of the scatter of verticals about the vertical (rad), and their prior probabilities.
 SCATTER_RAD = (math.radians(0.05), math.radians(0.2), math.radians(0.6))
 SCATTER_SHARE = (0.2, 0.4, 0.4)
 #: Lines whose bearings differ less than this lean together (rad).
 TOGETHER_RAD = 0.15
-#: Half width at half height of the inclinations of lines that are no verticals (rad).
+#: Half width at half maximum of the inclinations of lines that are not vertical (rad).
 STRAY_RAD = math.radians(1.0)
 
 
 def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) -> FloatArray:
-    """(3, N) places x, y of a grid round 0 and the areas of its cells."""
+    """(3, N) positions x, y of a grid around 0 and the areas of its cells."""
     growth = (farthest / nearest) ** (1.0 / (radii - 1))
     radius = nearest * growth ** np.arange(radii)
-    # Cells are bounded half way between radii.
+    # Cells are bounded halfway between radii.
     bound = nearest * growth ** (np.arange(radii + 1) - 0.5)
     area = np.pi * np.diff(bound**2) / directions
     angle = 2.0 * np.pi * np.arange(directions) / directions
@@ -67,19 +66,19 @@ def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) ->
 
 
 _GRID = _polar_grid(12, 10, math.radians(0.02), math.radians(6.0))
-#: The grid is stretched by no more than this.
+#: Least ratio of the axes of the stretched grid.
 _SLENDEREST = 0.1
 
 
 class TiltEstimate(NamedTuple):
     """Pitch and roll of one frame."""
 
-    #: Rotation vector (pitch, roll, 0) about the robot's X and Y that turns measured directions
-    #: level
+    #: Rotation vector (pitch, roll, 0) about the robot's X and Y that levels measured directions
+    #: (rad)
     pitch_rad: float
     roll_rad: float
     covariance: FloatArray  # (2, 2) of (pitch, roll) (rad^2)
-    lines: int  # how many verticals agree with it
+    lines: int  # number of verticals that agree with it
 
 
 class Verticals(NamedTuple):
@@ -88,8 +87,8 @@ class Verticals(NamedTuple):
     #: (N, 3) unit normals, in the calibrated robot frame, of the planes through the camera and each
     #: line
     normal: FloatArray
-    variance: FloatArray  # (N,) of the normals' inclinations that verticals show (rad^2)
-    #: (N,) largest inclinations that the lines may have and be verticals (rad)
+    variance: FloatArray  # (N,) of the normals' inclinations, for verticals (rad^2)
+    #: (N,) largest inclinations with which the lines count as vertical (rad)
     tolerance: FloatArray
     weight: FloatArray  # (N,) votes of each line, at least 0
 
@@ -97,9 +96,9 @@ class Verticals(NamedTuple):
 def with_error(
     tilt: TiltEstimate, lines: Verticals, edge: IntArray, numbers: TiltNumbers
 ) -> TiltEstimate:
-    """The tilt with its mean square error as covariance, unless settings leave that out.
+    """The tilt with its mean square error as covariance, unless the settings disable that.
 
-    `edge` is one of the lines for each, the same for all of an edge.
+    `edge` gives each line a representative line, the same for all lines on an edge.
     """
     if numbers.stray_share == 0.0:
         return tilt
@@ -111,7 +110,7 @@ def with_error(
 
 @kernel()
 def strongest_first(strength: FloatArray) -> IntArray:
-    """Places of some values, the largest first; of equal ones the first."""
+    """Indices of values in decreasing order; of equal values the first comes first."""
     order = np.empty(len(strength), np.int64)
     for i in range(len(strength)):
         k = i
@@ -126,8 +125,8 @@ def strongest_first(strength: FloatArray) -> IntArray:
 def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, BoolArray]:
     """Estimate the tilt from the largest consistent set of lines.
 
-    Its covariance is that of least squares; it is of 0 lines where too few agree. Returns as well
-    (N,) whether lines are vertical under that tilt; without an estimate, under no tilt.
+    Its covariance is that of least squares; `lines` is 0 if too few agree. Also returns (N,)
+    whether lines are vertical under that tilt or, without an estimate, under zero tilt.
     """
     agrees, covariance = np.empty(len(lines.weight), np.bool_), np.empty((2, 2))
     pitch, roll = _vote_for_tilt(lines, numbers)
@@ -144,11 +143,11 @@ def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate,
 
 @kernel()
 def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float]:
-    """Pitch and roll that the largest weight of lines agrees with; of equal ones the first.
+    """Pitch and roll on which lines of the largest total weight agree; of equal ones the first.
 
-    Each pair of proposers gives the tilt that makes both vertical; a line votes for it with its
-    weight, less the farther it is from vertical. A tilt t loses t^2 / (2 prior^2) votes. No tilt is
-    tried as well.
+    Each pair of proposing lines gives the tilt that makes both vertical; a line votes for it with
+    its weight, less the farther it is from vertical. A tilt t loses t^2 / (2 prior^2) votes. Zero
+    tilt is tried as well.
     """
     normal, weight = lines.normal, lines.weight
     limit, prior = math.radians(numbers.largest_tilt_deg), math.radians(numbers.tilt_prior_deg)
@@ -189,7 +188,7 @@ def _refine_tilt(
     lines: Verticals, pitch: float, roll: float, prior: float, covariance: FloatArray,
     agrees: BoolArray,
 ) -> tuple[float, float]:  # fmt: skip
-    """Least squares of a tilt over the lines that agree with it, repeated."""
+    """Refine a tilt by repeated least squares over the lines that agree with it."""
     normal, variance, tolerance = lines.normal, lines.variance, lines.tolerance
     for repetition in range(REFINEMENTS + 1):
         rotation = level_matrix(pitch, roll)
@@ -204,7 +203,7 @@ def _refine_tilt(
                 z += rotation[2, k] * normal[i, k]
             agrees[i] = abs(z) <= tolerance[i]
             if agrees[i]:
-                # A line of furniture or a shadow among few lines must not pull.
+                # Among few lines, one of furniture or a shadow must not bias the tilt.
                 weight = 1.0 / (variance[i] + (z / SOFTENING) ** 2)
                 pp += weight * y * y
                 pr -= weight * y * x
@@ -246,10 +245,10 @@ def level_matrix(pitch: float, roll: float) -> FloatArray:
 def gather(
     place: FloatArray, reach: FloatArray, strength: FloatArray, kind: FloatArray
 ) -> IntArray:
-    """Groups of lines of one kind near the strongest of those that are in no group yet.
+    """Group lines of one kind around the strongest line that is in no group yet.
 
-    Of (N,) places, how near others belong to each, strengths and kinds, returns (N,) the first line
-    of the group of each.
+    Parameters are (N,) positions, radii of the groups, strengths and kinds. Returns (N,) the first
+    line of each line's group.
     """
     group = np.full(len(place), -1)
     for strongest in strongest_first(strength):
@@ -269,8 +268,8 @@ def gather(
 def merge_lines(lines: Verticals, group: IntArray) -> FloatArray:
     """(G, 4) mean normals of groups of lines, and the variances of their inclinations.
 
-    Lines are weighed by how well they are measured beside the middle scatter; the variances are
-    without scatter.
+    Lines are weighted by the inverse of their variance plus the middle scatter; the returned
+    variances do not include scatter.
     """
     merged, total = np.zeros((len(group), 4)), np.zeros(len(group))
     for k in range(len(group)):
@@ -294,7 +293,7 @@ def _error_of_tilt(
     lines: Verticals, edge: IntArray, tilt: tuple[float, float], prior: float,
     stray_share: float, grid: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """(2, 2) mean square error of a tilt, over what its lines and those that disagree say."""
+    """(2, 2) mean square error of a tilt over the posterior of all lines."""
     count = len(edge)
     bearing = np.empty(count)
     for k in range(count):
@@ -330,7 +329,7 @@ def _error_of_tilt(
 def _stretch(
     groups: FloatArray, tilt: tuple[float, float], prior: float
 ) -> tuple[float, float, float]:
-    """Symmetric matrix that turns a circle into the posterior's ellipse, its larger axis 1."""
+    """Symmetric matrix that maps a circle to the posterior's ellipse, its larger axis 1."""
     pp = rr = 1.0 / (prior * prior)
     pr = 0.0
     for k in range(len(groups)):
@@ -354,14 +353,14 @@ def _posterior(
     before: FloatArray, pitch: FloatArray, roll: FloatArray, lines: FloatArray, scatter: float,
     stray_share: float, density: FloatArray,
 ) -> float:  # fmt: skip
-    """Densities of tilts by the prior and by lines of some scatter; returns their sum."""
+    """Densities of tilts from the prior and from lines with some scatter; returns their sum."""
     for i in range(len(before)):
         density[i] = before[i]
     of_stray = stray_share / (math.pi * STRAY_RAD) * SCATTER_RAD[1]
     per_stray = 1.0 / STRAY_RAD**2
     for k in range(len(lines)):
         per_variance = 1.0 / (3.0 * (lines[k, 3] + scatter * scatter))
-        # In units in which products of a hundred stay in range.
+        # Scaled so that products of a hundred factors stay in range.
         of_vertical = (1.0 - stray_share) * 2.0 / math.pi * math.sqrt(per_variance) * SCATTER_RAD[1]
         x, y, z = lines[k, 0], lines[k, 1], lines[k, 2]
         for i in range(len(density)):

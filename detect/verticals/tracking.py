@@ -1,21 +1,21 @@
-"""Tracking: edges followed up and down from where they cross the horizon.
+"""Tracking: follows edges up and down from the horizon.
 
-In each row the highest of the three responses round the expected place of an edge, and the parabola
-through this and its neighbours, give the point. From row to row the expected place moves like a
-vertical, and by the lean of the edge against that; both yield to the point's offset, the place by a
-share of it and the lean, per row, by another one. The shares fall with the number n of points as
-those of a straight line through n points fitted by least squares do,
+In each row the parabola through the highest of the three responses around the predicted position of
+an edge and its neighbours gives the point. From row to row the prediction moves along the vertical,
+and by the lean of the edge against that. Position and lean (per row) are both corrected by a share
+of the point's offset from the prediction. The gains decrease with the number n of points like those
+of a straight line fitted to n points by least squares,
 
     2 (2 n - 1) / (n (n + 1))    and    6 / (n (n + 1)),
 
 down to constants (alpha-beta filter: P. R. Kalata, The Tracking Index, IEEE Transactions on
-Aerospace and Electronic Systems 20, 1984). So a track needs no tilt to follow leaning verticals,
-and does not leave them where other edges cross. The response is evaluated in stripes along the
-places expected.
+Aerospace and Electronic Systems 20, 1984). So a track follows leaning verticals without knowing the
+tilt, and does not leave them where other edges cross. The response is evaluated in stripes along
+the predictions.
 
-Where an edge ends and another one goes on beside it, such a track bends. Once the tilt is known,
-the lean of verticals is, too: tracks that are no lines as they are can be followed again along the
-verticals, where only the place yields, by 1 / n.
+Where an edge ends and another one continues beside it, such a track bends. Once the tilt is known,
+the lean of verticals is known, too: rejected tracks can be followed again along the verticals,
+where only the position is corrected, by 1 / n.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from detect.verticals.starts import LineStarts
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
-#: Points that the prior counts for: an edge leans no more than verticals of a tilted camera.
+#: Number of points that the prior counts for: edges lean only as verticals of a tilted camera do.
 _UPRIGHT_POINTS = 5
-#: Largest offset of a point from the place expected along verticals of known lean, pixels.
+#: Largest offset of a point from the prediction along verticals of known lean, pixels.
 _VERTICAL_REACH_PX = 1.0
 
 
@@ -44,21 +44,21 @@ class LineTracks(NamedTuple):
     Track t's points are ``bounds[t] : bounds[t + 1]`` of the point arrays, from top to bottom.
     """
 
-    #: (T,) 1 where the image is brighter on the right of the edge, -1 on the left
+    #: (T,) 1 if the image is brighter on the right of the edge, -1 if on the left
     polarity: FloatArray
     bounds: IntArray  # (T + 1,)
     row: NDArray[np.int32]  # (P,) image row of each point
-    #: (P,) column in the strip: of the horizon, where the vertical through the point crosses it
+    #: (P,) strip column: the column at which the vertical through the point crosses the horizon
     column: FloatArray
     score: Float32Array  # (P,) absolute response at the point
 
 
 class Before(NamedTuple):
-    """Tracks that were followed before, and how some of them are followed again."""
+    """Tracks of an earlier pass, and how some of them are followed again."""
 
     tracks: LineTracks
     again: BoolArray  # (T,) which of them are followed again
-    #: Pitch and roll (rad) along whose verticals these are followed; NaN: leans are to be found
+    #: Pitch and roll (rad) that give the lean of their verticals; NaN: leans are estimated
     tilt: tuple[float, float]
 
 
@@ -71,8 +71,8 @@ NOTHING_BEFORE = Before(_NO_TRACKS, np.empty(0, np.bool_), (math.nan, math.nan))
 class _Path(NamedTuple):
     """The path of a stripe from row `first` on.
 
-    At `row` it is at column `place` of the strip; it leans by `lean` columns per tangent of
-    elevation, as measured at the vertical `column`.
+    At `row` it is at strip column `place`; it leans by `lean` columns per tangent of elevation,
+    measured at the vertical `column`.
     """
 
     first: int
@@ -83,9 +83,9 @@ class _Path(NamedTuple):
 
 
 class _Edge(NamedTuple):
-    """Where an edge is, how it leans (as a path does), and from how many points that is known.
+    """Position and lean of an edge (see `_Path`), and the number of points they are based on.
 
-    The lean of a vertical is known beforehand.
+    The lean of a vertical may be known beforehand.
     """
 
     place: float
@@ -99,9 +99,9 @@ def follow_edges(
     image: GreyImage, strip: Strip, window: LineFilter, starts: LineStarts,
     numbers: TrackingNumbers, before: Before,
 ) -> LineTracks:  # fmt: skip
-    """Follow edges up and down from starts; a start on an edge already followed is left out.
+    """Follow edges up and down from starts; starts on edges already followed are skipped.
 
-    Tracks that were followed before, and are not again, come first in the result.
+    Tracks of an earlier pass that are not followed again come first in the result.
     """
     tracks, again, tilt = before
     height, width = image.shape
@@ -130,7 +130,7 @@ def follow_edges(
         bounds[count] = n
     stripe = empty_stripe(window)
     vertical = not math.isnan(tilt[0])
-    # Of the edge that is followed, by row; no score where there is no point.
+    # The edge being followed, by row; score 0 without a point.
     column, score = np.empty(height), np.zeros(height, np.float32)
     for start in starts.first:
         sign = np.float32(1.0) if starts.value[start] > 0.0 else np.float32(-1.0)
@@ -182,7 +182,7 @@ def follow_edges(
 
 @kernel(inline="always")
 def _mark(marks: BoolArray, row: int, column: float) -> None:
-    """Mark the columns round a point as followed, if its row has starts."""
+    """Mark the columns around a point as followed, if its row has starts."""
     if 0 <= row < len(marks):
         j = math.floor(column + 0.5)
         for k in range(max(0, j - 1), min(marks.shape[1], j + 2)):
@@ -222,8 +222,8 @@ def _follow(
     image: GreyImage, strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
     start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: Float32Array,
 ) -> tuple[int, _Edge]:  # fmt: skip
-    """Follow an edge of some polarity from a row on in a direction; the last row as well."""
-    # Numba counts references to arrays in tuples wherever they are taken out of these.
+    """Follow an edge of some polarity from a row on in one direction; also returns the last row."""
+    # Unpacked once, since Numba counts references at every access to an array in a tuple.
     at, rise, response, middle = strip.column, strip.rise, stripe.response, stripe.middle
     width, height = rise.shape
     pull, reach, threshold = numbers.guided_pull, numbers.guided_reach_px, numbers.threshold
@@ -241,7 +241,7 @@ def _follow(
             break
         climb = rise[path.column, v] - rise[path.column, v - direction]
         place += lean * climb
-        # Beyond the first and the last vertical there is none; nor where this one is not seen.
+        # Beyond the first and the last vertical, or where this one is not visible, it ends.
         if not 0.0 <= place <= width - 1.0:
             break
         per_column = _pixels_per_column(at, path.column, v)
@@ -265,7 +265,7 @@ def _follow(
                     stripe.path[i] = at[j, row] + part * _pixels_per_column(at, j, row)
             respond(image, path.first, stripe)
             near, beside = middle, np.float64(0.0)
-        # Once to the side if the highest of the three is not the one in the middle.
+        # One column to the side if the highest of the three is not the one in the middle.
         left, here, right = _three(response, v - path.first, near, sign)
         if left > here or right > here:
             near += -1 if left > right else 1
@@ -274,7 +274,7 @@ def _follow(
         bend = left - here - here + right
         # The top of the parabola through the three.
         off += 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-        # The start of a vertical is known to a column only.
+        # The start of a vertical is known only to a column.
         expected = abs(off) <= reach or points == 0
         if here >= threshold and here >= left and here >= right and expected:
             points += 1
@@ -297,7 +297,7 @@ def _follow(
 
 @kernel(inline="always")
 def _pixels_per_column(at: Float32Array, j: int, v: int) -> float:
-    """Distance of verticals in a row, on the side on which there are more of them."""
+    """Spacing of verticals in a row, on the side on which there are more of them."""
     if 2 * j < len(at):
         return float(at[j + 1, v] - at[j, v])
     return float(at[j, v] - at[j - 1, v])
@@ -305,7 +305,7 @@ def _pixels_per_column(at: Float32Array, j: int, v: int) -> float:
 
 @kernel(inline="always")
 def _place_on(path: _Path, rise: Float32Array, v: int) -> float:
-    """Where a path crosses a row, as a column of the strip."""
+    """Strip column at which a path crosses a row."""
     return path.place + path.lean * float(rise[path.column, v] - rise[path.column, path.row])
 
 

@@ -53,5 +53,5 @@ def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
     assert main(command(run, output, "--resume", *flags)) == 3
     shown = capsys.readouterr()
     assert f"{FRAMES} frames" in shown.out
-    taken = [line for line in shown.err.splitlines() if "are taken over" in line]
+    taken = [line for line in shown.err.splitlines() if "are reused" in line]
     return int(taken[0].split()[0]) if taken else 0

@@ -132,7 +132,7 @@ def test_rows_state_what_is_assumed(
     added = after[:, 2] + after[:, 4] - before[:, 2] - before[:, 4]
     common = common_covariance(unstated, before[:, :2], 0.15, by_verticals=False)
     np.testing.assert_allclose(added, np.trace(common, axis1=1, axis2=2), rtol=0.3, atol=1e-9)
-    assert "taken to be wrong by 0.15 px (--calibration-px)" in told
+    assert "error is assumed to be 0.15 px (--calibration-px)" in told
 
 
 def _has_tilt(run: Path) -> bool:

@@ -457,7 +457,7 @@ def test_a_table_of_the_other_detector_is_refused(published_camera: Camera) -> N
     image = np.zeros((published_camera.height, published_camera.width), np.uint8)
     for asked, other, whose in (
         (DEFAULT, REPORT, "the published detector"),
-        (REPORT, DEFAULT, "the detector by rims"),
+        (REPORT, DEFAULT, "the default detector"),
     ):
         with pytest.raises(DetectError, match=whose):
             detect_circles(image, published_camera, table_of(published_camera, other), asked)

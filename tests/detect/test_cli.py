@@ -136,7 +136,7 @@ def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> 
         (small_run / "images" / f"z{number}.png").touch()
     assert main(["markers", str(small_run)]) == 3
     lines = capsys.readouterr().err.splitlines()
-    assert "14 frames could not be worked on:" in lines
+    assert "14 frames could not be processed:" in lines
     assert sum("is empty" in line for line in lines) == 10
     assert lines[-1] == "  and 4 more"
 
@@ -225,11 +225,11 @@ def test_outputs_into_no_folder(small_run: Path, capsys: Captured, flag: str) ->
         (["circles", "RUN", "-o", "X/rows", "--json", "X/./rows"], "rows: named for two results"),
         (["circles", "RUN", "-o", "X/r", "--json", "X/r.log.json"], "r.log.json: named for two"),
         (["lines", "RUN", "-o", "X/rows.tilt"], "rows.tilt: named for two results"),
-        (["circles", "RUN", "-o", ""], "is a folder: expected the file to write"),
-        (["lines", "RUN", "-o", "."], "is a folder: expected the file to write"),
-        (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is no folder"),
-        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is no folder"),
-        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is no folder"),
+        (["circles", "RUN", "-o", ""], "is a folder: expected an output file"),
+        (["lines", "RUN", "-o", "."], "is a folder: expected an output file"),
+        (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is not a folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is not a folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is not a folder"),
     ],
 )
 @pytest.mark.parametrize("force", [(), ("--force",)])
@@ -362,7 +362,7 @@ def test_demands_decide_the_exit_code(
     shown = capsys.readouterr()
     lines = shown.err.splitlines()
     assert len(lines) == unmet
-    assert all(line.startswith("recall is 0.7500: at least 0.") for line in lines)
+    assert all(line.startswith("recall is 0.7500: expected at least 0.") for line in lines)
     assert "0.75" in shown.out or "75" in shown.out
 
 

@@ -160,9 +160,9 @@ def test_images_of_another_size_are_told_once(
     command = ["level", str(tmp_path), "--camera", str(run / "e.cam")]
     assert main([*command, "-o", str(tmp_path / "level.cam")]) == 1
     *failures, error = capsys.readouterr().err.splitlines()
-    assert failures[0] == "2 frames could not be worked on:"
+    assert failures[0] == "2 frames could not be processed:"
     assert all("expected 768x288" in line for line in failures[1:])
-    assert error == f"error: {tmp_path}: none of its images could be worked on"
+    assert error == f"error: {tmp_path}: none of its images could be processed"
 
 
 def test_an_existing_file_is_found_first(tmp_path: Path) -> None:

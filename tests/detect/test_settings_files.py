@@ -69,7 +69,7 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
         ("[]", 'no "settings"'),
         ('{"settings": 3}', 'no "settings"'),
         ('{"settings": {"circles": 3}}', "names and values"),
-        ('{"settings": {"circles": {"radius": 1}}}', "radius is no parameter of CircleSettings"),
+        ('{"settings": {"circles": {"radius": 1}}}', "radius is not a parameter of CircleSettings"),
         ('{"settings": {"circles": {"radius_m": "1"}}}', "expected a number"),
         ('{"settings": {"circles": {"refine": 1}}}', "expected True or False"),
         ('{"settings": {"circles": {"radius_m": -1}}}', "radius_m"),

@@ -93,4 +93,4 @@ def test_a_live_camera_shows_something_else_by_now(
         pytest.importorskip("rerun")
     arguments = [command, "camera:0", "-o", str(small_run / "output")]
     arguments += ["--vary", "threshold=0.5"] if command == "tune" else []
-    assert_refused(arguments, small_run, "camera:0: shows other images now", capsys)
+    assert_refused(arguments, small_run, "camera:0: its images are not those of the rows", capsys)

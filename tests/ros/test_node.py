@@ -210,7 +210,7 @@ def test_an_image_that_cannot_be_read_costs_itself(
     assert node.ros.published == []
     assert node.ros.node is not None
     (warning,) = node.ros.node.warnings
-    assert "the JPEG is cut off" in warning
+    assert "the JPEG is truncated" in warning
     node.send("/image/compressed", format="jpeg", data=array.array("B", content))
     demand_found(node.ros, found)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, vote_shape
-from detect.discs.evidence import lost_by_paleness, lost_by_sign
+from detect.discs.evidence import paleness_penalty, sign_penalty
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
@@ -141,7 +141,7 @@ def test_a_pool_of_light_is_no_disc(published_camera: Camera, table: VoteTable) 
 def test_signs_are_as_likely_as_they_are_seen(light: int, dark: int) -> None:
     contrast = np.array([50.0] * light + [-50.0] * dark + [20.0, -20.0])
     sure = np.abs(contrast) > 30.0
-    lost = lost_by_sign(contrast, sure)[-2:]
+    lost = sign_penalty(contrast, sure)[-2:]
     np.testing.assert_allclose(np.exp(-lost).sum(), 1.0)
     assert np.exp(-lost[0]) == pytest.approx((light + 1) / (light + dark + 2))
 
@@ -150,7 +150,7 @@ def lost(contrast: float, floor_grey: float, clear: int = 3) -> float:
     """What one more disc loses beside clear ones of 100 grey levels on a floor of 80."""
     contrasts = np.array([100.0] * clear + [contrast])
     floors = np.array([80.0] * clear + [floor_grey])
-    losses = lost_by_paleness(contrasts, floors, np.arange(clear + 1) < clear)
+    losses = paleness_penalty(contrasts, floors, np.arange(clear + 1) < clear)
     assert (losses[:clear] == 0.0).all()
     return float(losses[clear])
 

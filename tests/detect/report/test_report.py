@@ -267,7 +267,7 @@ def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path)
     page = reported(judged_run, tmp_path / "r.html")
     figures = [image["alt"] or "" for image in page.of("img")]
     assert [words.split(",")[0].split(" (")[0] for words in figures] == [
-        "Where on the floor the two sides put the same disc",
+        "Positions of the same disc on the floor",
         "Residuals in units of the covariance that the rows state",
         "Frame s.0000",
     ]

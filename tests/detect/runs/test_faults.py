@@ -97,7 +97,7 @@ def test_bad_frames_cost_themselves(spoilt_run: Path, capsys: Captured) -> None:
     output = spoilt_run / "detected.circles"
     assert main(["circles", str(spoilt_run)]) == 3
     shown = capsys.readouterr().err.splitlines()
-    assert f"{len(REASONS)} frames could not be worked on:" in shown
+    assert f"{len(REASONS)} frames could not be processed:" in shown
     frames = list(read_frames(output))
     assert [frame.step for frame in frames] == list(read_steps(spoilt_run / "s.txt"))
     for frame in frames:

@@ -173,7 +173,7 @@ def test_a_lens_that_folds_in_the_corners_is_used_where_it_sees(
     begin = text.index("coef:")
     (run / "s.cam").write_text(text[:begin] + "coef: { 0 -0.33 0 0 0 } }\n")
     assert main(["all", str(run), "--force"]) == 0
-    assert "67 % of the pixels see anything" in capsys.readouterr().err
+    assert "only 67 % of the pixels are used" in capsys.readouterr().err
     assert main(["draw", str(run), "-o", str(tmp_path / "drawn")]) == 0
     assert main(["report", str(run), "-o", str(tmp_path / "report.html")]) == 0
 

@@ -108,7 +108,7 @@ def test_frames_after_one_that_changed_are_done_again(
     assert main(command(own.run, other)) == 0
     capsys.readouterr()
     assert main(command(own.run, own.output, "--resume")) == 0
-    assert "11 frames of an unfinished run are taken over" in capsys.readouterr().err
+    assert "11 frames of an unfinished run are reused" in capsys.readouterr().err
     assert results(own.output) == results(other)
 
 
@@ -119,7 +119,7 @@ def test_a_new_image_in_between_is_seen(own: Kept, tmp_path: Path, capsys: Captu
     assert main(command(own.run, other)) == 3
     capsys.readouterr()
     assert main(command(own.run, own.output, "--resume")) == 3
-    assert "6 frames of an unfinished run are taken over" in capsys.readouterr().err
+    assert "6 frames of an unfinished run are reused" in capsys.readouterr().err
     assert results(own.output) == results(other)
 
 

@@ -109,14 +109,14 @@ def test_frames_that_count_as_level_are_told(
     cv2.imwrite(str(short_run / "images" / "e.0002.jpg"), np.full((288, 768), 90, np.uint8))
     assert main(["all", str(short_run), "--tilt", "frame", "--force"]) == 3
     assert (
-        "the tilt of 2 frames; the other 1 count as level within 0.3 degrees"
+        "the tilt of 2 frames; the other 1 are assumed level within 0.3 degrees"
         in capsys.readouterr().out
     )
     assert (
         main(["all", str(short_run), "--tilt", "frame", "--force", "--circles.tilt-sigma-deg", "0"])
         == 3
     )
-    assert "the other 1 count as level beyond doubt" in capsys.readouterr().out
+    assert "the other 1 are assumed exactly level" in capsys.readouterr().out
 
 
 def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -157,7 +157,7 @@ def test_ticks_of_wheels_give_the_path(tmp_path: Path) -> None:
     [
         ("1 2\n", (0.4, 0.01), r"a\.ticks:1: '1 2': expected 3 numbers: t left right"),
         ("1 2 3\n", (0.0, 0.01), "expected --wheel-base-m and --metres-per-tick above 0"),
-        ("1 0 0\n2 1e200 0\n", (0.4, 0.01), r"a\.ticks:2: expected a way and a turn of at most"),
+        ("1 0 0\n2 1e200 0\n", (0.4, 0.01), r"a\.ticks:2: expected distance and turn of at most"),
     ],
 )
 def test_malformed_ticks(

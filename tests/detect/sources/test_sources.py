@@ -207,7 +207,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
     "no match": (lambda tmp_path, run: [str(run / "images" / "*.jpg")], "no image matches"),
     "wildcards in folders": (
         lambda tmp_path, run: [str(run / "*" / "a.png")],
-        "wildcards in the folder's name: expected them in the last part only",
+        "wildcards in a folder's name: expected them in the last part only",
     ),
     "no such camera": (
         lambda tmp_path, run: ["camera:97", "--camera", str(run / "s.cam")],

@@ -96,8 +96,8 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("radius", "1", "radius is no parameter of CircleSettings: .* radius_m"),
-        ("least_rows", "1", "no parameter of CircleSettings"),
+        ("radius", "1", "radius is not a parameter of CircleSettings: .* radius_m"),
+        ("least_rows", "1", "not a parameter of CircleSettings"),
         ("threshold", "0.3:0.7", "FROM:TO:STEP"),
         ("threshold", "0.7:0.3:0.1", "FROM:TO:STEP"),
         ("threshold", "0.3:0.7:0", "FROM:TO:STEP"),
