@@ -44,7 +44,7 @@ from detect.options import (
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
-from detect.terminal import interrupts_noted, show_announcements
+from detect.terminal import show_announcements
 from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
 from redetect.storage.messages import is_quiet
 
@@ -84,12 +84,8 @@ PROGRAM = Program(
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
 
-    def work() -> int:
-        with interrupts_noted():
-            given = sys.argv[1:] if arguments is None else arguments
-            return PROGRAM.run(given, parsed, carry_out)
-
-    code = exit_code_of(work)
+    given = sys.argv[1:] if arguments is None else arguments
+    code = exit_code_of(lambda: PROGRAM.run(given, parsed, carry_out))
     if code == EXIT_INTERRUPTED and arguments is None:
         # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
         # it was caught.

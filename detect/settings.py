@@ -23,14 +23,10 @@ from redetect.storage.bounds import (
     whole,
 )
 
-<<<<<<< HEAD
 #: Standard deviation of the pitch and the roll of a robot on an even floor, degrees.
 USUAL_TILT_DEG = 0.3
 
-#: Tilt by which positions are corrected.
-=======
 #: Tilt for which positions are corrected.
->>>>>>> english
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]
 
@@ -83,16 +79,10 @@ class CircleSettings:
     #: Error of a calibration without a covariance, pixels: commands add it to the covariance of
     #: refined positions. Calibrations commonly have residuals of 0.1-0.3 px.
     calibration_px: NotNegative = 0.15
-<<<<<<< HEAD
-    #: Standard deviation of the robot's pitch and of its roll about level, degrees: added to a
-    #: refined position's covariance if the frame's tilt is unknown. By default 0.3, and as much as
-    #: the camera leans, where a run shows that.
-    tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
-=======
     #: Standard deviation of the robot's pitch and roll, degrees: added to the covariance of refined
-    #: positions if the frame's tilt is unknown.
-    tilt_sigma_deg: Annotated[float, from_to(0.0, 90.0)] = 0.3
->>>>>>> english
+    #: positions if the frame's tilt is unknown. By default 0.3, combined with the camera's lean
+    #: where a run shows one.
+    tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)

@@ -1,4 +1,9 @@
-"""Interrupts from the keyboard, kept from where Numba hands over the results of a kernel.
+"""Interrupts from the keyboard: never lost, and raised where they do no harm.
+
+Python raises an interrupt as an exception wherever it is executing. While a kernel is compiled, the
+exception may be swallowed: it is printed and ignored, or replaced by another one. So interrupts are
+recorded, and the record is checked now and then. While processes are started or ended, an exception
+could leave a process half started: there an interrupt is deferred until that is done.
 
 Python calls the handler of a signal between two of its own instructions. While a kernel runs there
 are none; the first ones after it are often those by which Numba makes its results. An exception
@@ -14,13 +19,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 Handler = Callable[[int, FrameType | None], Any]
 
 #: Functions that compiled code calls to hand over its results, and the ends of their files' names:
 #: Numba's own, and the one that makes a named tuple.
 _HANDING_OVER = {("_numba_unpickle", "serialize.py"), ("<lambda>", "<string>")}
+
+_received = threading.Event()
+_waiting = threading.Event()
 
 
 def outside_kernels(handler: Handler) -> Handler:
@@ -52,19 +60,72 @@ def _hands_over(frame: FrameType) -> bool:
 
 
 @contextmanager
-def interrupts_outside_kernels() -> Iterator[None]:
-    """Raise interrupts during a block as always, but outside kernels.
+def interrupts_call(note: Handler) -> Iterator[None]:
+    """Have interrupts call something during a block, but not in kernels.
 
-    Nothing changes in threads but the main one, and where interrupts are handled otherwise or
-    ignored.
+    Nothing changes in threads but the main one, and where interrupts are ignored.
     """
-    before = signal.getsignal(signal.SIGINT)
-    usual = before is signal.default_int_handler
-    if not usual or threading.current_thread() is not threading.main_thread():
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored or threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, outside_kernels(signal.default_int_handler))
+    before = signal.signal(signal.SIGINT, outside_kernels(note))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_noted() -> Iterator[None]:
+    """Record interrupts during a block; any later exception in it becomes a KeyboardInterrupt."""
+    _received.clear()
+
+    def note(*_: object) -> NoReturn:
+        _received.set()
+        raise KeyboardInterrupt
+
+    with interrupts_call(note):
+        try:
+            yield
+        except BaseException:
+            raise_if_interrupted()
+            raise
+
+
+@contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Defer interrupts to the end of a block, which should be short.
+
+    Processes started meanwhile inherit the blocked signal. Blocking alone is not sufficient: a
+    signal blocked in this thread is delivered to another one, and still raised in this one. Long
+    blocks call `raise_if_interrupt_waits` now and then.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    handled = threading.current_thread() is threading.main_thread() and callable(before)
+    if handled:
+        signal.signal(signal.SIGINT, lambda *_: _waiting.set())
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if handled:
+            signal.signal(signal.SIGINT, before)
+        waiting = _waiting.is_set()
+        _waiting.clear()
+    if waiting:
+        _received.set()
+        raise KeyboardInterrupt
+
+
+def raise_if_interrupted() -> None:
+    """Raise an interrupt that was lost, if there was one."""
+    if _received.is_set():
+        raise KeyboardInterrupt
+
+
+def raise_if_interrupt_waits() -> None:
+    """Raise a deferred interrupt, if there is one."""
+    if _waiting.is_set() or signal.SIGINT in signal.sigpending():
+        raise KeyboardInterrupt

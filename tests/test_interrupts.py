@@ -13,7 +13,7 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.compiled import kernel
-from redetect.interrupts import interrupts_outside_kernels, outside_kernels
+from redetect.interrupts import interrupts_noted, outside_kernels
 
 
 class _AlarmError(Exception):
@@ -71,13 +71,13 @@ def test_elsewhere_they_are_raised_at_once() -> None:
         signal.raise_signal(signal.SIGALRM)
 
 
-def test_other_handlers_of_interrupts_are_left_as_they_are() -> None:
+def test_ignored_interrupts_stay_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with interrupts_outside_kernels():
+        with interrupts_noted():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        with interrupts_outside_kernels(), pytest.raises(KeyboardInterrupt):
+        with interrupts_noted(), pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
@@ -88,7 +88,7 @@ def test_other_threads_leave_interrupts_alone() -> None:
     seen = []
 
     def work() -> None:
-        with interrupts_outside_kernels():
+        with interrupts_noted():
             seen.append(signal.getsignal(signal.SIGINT))
 
     before = signal.getsignal(signal.SIGINT)

@@ -225,16 +225,10 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     others = summary.frames - summary.failed - summary.found["tilts"]
     if plan.circles is None or plan.levelling == "none" or others == 0:
         return ""
-<<<<<<< HEAD
     sigma_deg = math.degrees(plan.circles.tilt_sigma_rad)
     if sigma_deg == 0.0:
-        return f"; the other {others} count as level beyond doubt (see --circles.tilt-sigma-deg)"
-    return f"; the other {others} count as level within {sigma_deg:g} degrees"
-=======
-    if plan.circles.tilt_sigma_deg == 0.0:
         return f"; the other {others} are assumed exactly level (see --circles.tilt-sigma-deg)"
-    return f"; the other {others} are assumed level within {plan.circles.tilt_sigma_deg:g} degrees"
->>>>>>> english
+    return f"; the other {others} are assumed level within {sigma_deg:g} degrees"
 
 
 def _hints(job: Job, summary: RunSummary) -> Iterator[str]:

@@ -48,9 +48,9 @@ from detect.runs.plan import (
 from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
-from detect.terminal import interrupts_deferred
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
 from redetect.array_types import FloatArray, GreyImage
+from redetect.interrupts import interrupts_deferred
 from redetect.landmarks import (
     CircleLandmark,
     FrameTilt,

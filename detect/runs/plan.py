@@ -217,16 +217,10 @@ class RunSummary:
     rejected: Counter[str] = field(default_factory=Counter)
     failed: int = 0
     failures: list[str] = field(default_factory=list)
-<<<<<<< HEAD
-    images_without_step: int = 0  # the odometry does not have them
-    lean: Lean | None = None  # of the camera, with which discs were searched
-    unlevelled_deg: float | None = None  # sigma of pitch and roll, enlarged by the camera's lean
-    tilt: RunTilt | None = None  # that discs were levelled by, if by the run's
-=======
     images_without_step: int = 0  # missing in the odometry
     lean: Lean | None = None  # of the camera in the search for discs
+    unlevelled_deg: float | None = None  # sigma of pitch and roll, enlarged by the camera's lean
     tilt: RunTilt | None = None  # used for levelling, if that was by the run
->>>>>>> english
 
     def add(self, rows: FrameRows) -> None:
         """Count a frame."""

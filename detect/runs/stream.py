@@ -222,13 +222,8 @@ def detect_run(
     return summary
 
 
-<<<<<<< HEAD
 def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
-    """The plan with the camera's lean, by some frames of a run: to search with, and as unknown."""
-=======
-def _lean_of(run: ImageRun, plan: FramePlan, crew: Crew) -> Lean | None:
-    """The camera's lean for the search for discs, from some frames of a run."""
->>>>>>> english
+    """The plan with the camera's lean, estimated from some frames of a run."""
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan

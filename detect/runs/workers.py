@@ -33,12 +33,11 @@ from detect.errors import WorkerError, imported_for
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 from detect.terminal import (
     announcements_are_shown,
-    interrupts_deferred,
     on_compilation,
-    raise_if_interrupt_waits,
     say_compiling,
     show_announcements,
 )
+from redetect.interrupts import interrupts_deferred, raise_if_interrupt_waits
 
 if TYPE_CHECKING:
     from distributed import Client

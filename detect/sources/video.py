@@ -22,7 +22,7 @@ import cv2
 
 from detect.errors import DetectError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
-from detect.terminal import interrupts_call
+from redetect.interrupts import interrupts_call
 
 _log = logging.getLogger("redetect")
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Union, cast, get_type_hints
 import tyro
 from tyro.conf import Suppress, arg, subcommand
 
-from redetect.interrupts import interrupts_outside_kernels
+from redetect.interrupts import interrupts_noted
 from redetect.storage import __version__
 from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
 
@@ -57,7 +57,7 @@ def exit_code_of(work: Callable[[], int]) -> int:
     """
     try:
         try:
-            with interrupts_outside_kernels():
+            with interrupts_noted():
                 return work()
         finally:
             # Flushing can fail, too, if the output is a closed pipe.

@@ -14,15 +14,24 @@ import pytest
 
 from detect import cli
 from detect.cli import main
-from detect.terminal import (
+from detect.terminal import progress_bar
+from redetect.interrupts import (
     interrupts_deferred,
     interrupts_noted,
-    progress_bar,
     raise_if_interrupt_waits,
     raise_if_interrupted,
 )
 
 
+@pytest.fixture
+def caught() -> Iterator[None]:
+    """Interrupts are raised, whatever this process was started to do with them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("caught")
 @pytest.mark.parametrize("other", [SystemError, ValueError, OSError])
 def test_what_an_interrupt_turned_into(
     tmp_path: Path,
@@ -44,6 +53,7 @@ def test_what_an_interrupt_turned_into(
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.usefixtures("caught")
 def test_a_swallowed_interrupt_comes_back_after_the_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,14 +76,6 @@ def test_a_swallowed_interrupt_comes_back_after_the_frame(
     assert frames == [0, 1, 2, 0, 1, 2]
 
 
-@pytest.fixture
-def caught() -> Iterator[None]:
-    """Interrupts are raised, whatever this process was started to do with them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def interrupted_block(done: list[str], patience_s: float) -> None:
     """Interrupted half-way; some time is left for another thread to run and take the interrupt."""
     told, telling = os.pipe()
@@ -90,6 +92,7 @@ def interrupted_block(done: list[str], patience_s: float) -> None:
         os.close(telling)
 
 
+@pytest.mark.usefixtures("caught")
 def test_an_interrupt_waits_for_the_end_of_what_must_not_be_torn() -> None:
     before = signal.getsignal(signal.SIGINT)
     done: list[str] = []
