@@ -163,7 +163,8 @@ class Fit(NamedTuple):
     radius_information: float
 
 
-_NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
+#: Of a disc that cannot be fitted.
+NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
 
 
 class Edge(NamedTuple):
@@ -201,7 +202,7 @@ def eliminate(matrices: FloatArray, k: int) -> None:
                 matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
 
 
-@kernel()
+@kernel(forceinline=True)
 def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
     """Fit a disc; `work` is the working space, a `WORK`."""
     patch, rows, by_parts = work.patch, work.rows, settings.by_parts
@@ -210,7 +211,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         scene.image, scene.floor_xy, candidate, scene.blur_ratio, settings.reach, begin, patch
     )
     if ends[SECTORS] == 0:
-        return _NO_FIT
+        return NO_FIT
     per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
     level = float(scene.image[candidate.v, candidate.u])
     most_blur = _MOST_BLUR
@@ -237,9 +238,9 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
         if by_parts:
             if _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
-                return _NO_FIT
+                return NO_FIT
         elif not abs(levels.contrast[0]) > 0.0:
-            return _NO_FIT
+            return NO_FIT
         if by_parts:
             _trust(patch, rows, ends, grouped, levels, scene.noise)
         _scale(grouped, levels)
@@ -263,7 +264,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     information *= (noise[0] + noise[2]) / (xx + yy)
     near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # adjacent sectors alone fix no centre
-        return _NO_FIT
+        return NO_FIT
     floor_xy = scene.floor_xy[candidate.v, candidate.u]
     unit = settings.radius**2
     return Fit(

@@ -147,7 +147,7 @@ def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio
     return View(shape, along_u, along_v, (xu, yu, xv, yv))
 
 
-@kernel()
+@kernel(forceinline=True)
 def gather(
     image: GreyImage,
     floor_xy: Float32Array,

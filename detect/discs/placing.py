@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from detect.discs.fit import Fit, FitSettings, Scene, Start, fit_disc
+from detect.discs.fit import NO_FIT, Fit, FitSettings, Scene, Start, fit_disc
 from detect.discs.patch import Reach
 from detect.discs.rim import Rim, follow_rim, median, profiles
 from redetect.array_types import FloatArray
@@ -42,6 +42,8 @@ _WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.97
 _EXPLAINS_ALL = 0.99
 #: If the blur reaches this share of a patch's bound, the fit is repeated in a wider patch.
 _AT_BOUND, _MOST_REFITS = 0.98, 2
+#: Stages of fits: whole discs, up to as often; then parts of discs; then again with a better size.
+_PARTS, _LAST = _MOST_REFITS + 1, _MOST_REFITS + 2
 #: Initial blur, pixels.
 _BLUR_PX = 1.0
 #: Share of two rims' squared difference that is added to the covariance.
@@ -85,30 +87,45 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
         Square metres.
     """
     count = len(discs.step)
-    floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
-    whole = [_fit_whole(scene, discs, k, work) for k in range(count)]
+    whole = [NO_FIT for _ in range(count)]
+    parts, last = whole.copy(), whole.copy()
+    # Of each disc: its radius, and one over the variance of that.
     radii = np.zeros((count, 2))
-    for k, fit in enumerate(whole):
-        if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
-            radii[k] = _radius_seen(fit, Size(scene.radius, RADIUS_SIGMA * scene.radius))
-    # Partly hidden discs contribute to the size, too, and are then fitted once more.
-    parts, radii_of_whole = list(whole), radii.copy()
+    known = radii
+    # All stages share one call of the fit, whose code is inlined there: only then a kernel that has
+    # just been compiled and one loaded from the cache agree to the last digit.
+    for stage in range(_LAST + 1):
+        if stage == _PARTS:
+            for k, fit in enumerate(whole):
+                if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
+                    nominal = Size(scene.radius, RADIUS_SIGMA * scene.radius)
+                    radii[k] = _radius_seen(fit, nominal)
+            parts, known = whole.copy(), radii.copy()
+        elif stage == _LAST:
+            known = radii  # those of partly hidden discs included
+        for k in range(count):
+            wanted, start, size = _start_of(scene, discs, k, stage, (whole[k], parts[k]), known)
+            if not wanted:
+                continue
+            reach = WHOLE if stage < _PARTS else EDGE_ALONE
+            settings = FitSettings(stage >= _PARTS, size.radius, size.sigma / size.radius, reach)
+            fit = fit_disc(scene, start, settings, work)
+            if stage < _PARTS:
+                whole[k] = fit
+            elif stage == _PARTS:
+                parts[k] = fit
+                radii[k] = _radius_seen(fit, size)
+            else:
+                last[k] = fit
+    floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
     for k, fit in enumerate(whole):
         if not _explains(fit, discs, k):
-            size = size_of_disc(scene.radius, radii_of_whole, k)
-            rim = _rim_of(scene, discs, k, size.radius)
-            start = Start(rim.x, rim.y, rim.radius, _BLUR_PX)
-            parts[k] = fit_disc(scene, start, _by_parts(size), work)
-            radii[k] = _radius_seen(parts[k], size)
-    for k, fit in enumerate(whole):
-        size = size_of_disc(scene.radius, radii, k)
-        if not _explains(fit, discs, k):
-            place = _place_by_rim(scene, discs, k, parts[k], size, work)
+            size = size_of_disc(scene.radius, radii, k)
+            place = _place_by_rim(scene, discs, k, last[k] if last[k].arrived else parts[k], size)
         else:
             place = _place_of(fit)
             if fit.explained < _EXPLAINS_ALL:
-                again = fit_disc(scene, _start_at(fit), _by_parts(size), work)
-                place = _more_certain(_place_of(again), place)
+                place = _more_certain(_place_of(last[k]), place)
         floor_xy[k, 0], floor_xy[k, 1] = place.x, place.y
         covariance[k, 0, 0], covariance[k, 1, 1] = place.cov_xx, place.cov_yy
         covariance[k, 0, 1] = covariance[k, 1, 0] = place.cov_xy
@@ -116,13 +133,32 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
 
 
 @kernel(inline="always")
-def _by_parts(size: Size) -> FitSettings:
-    return FitSettings(True, size.radius, size.sigma / size.radius, EDGE_ALONE)
-
-
-@kernel(inline="always")
-def _start_at(fit: Fit) -> Start:
-    return Start(fit.x, fit.y, fit.radius, fit.blur)
+def _start_of(
+    scene: Scene, discs: Judgement, k: int, stage: int, fits: tuple[Fit, Fit], radii: FloatArray
+) -> tuple[bool, Start, Size]:
+    """Whether a disc is fitted in a stage, from where, and its size; by its fits so far."""
+    fit, by_parts = fits
+    x, y, radius, blur_px = discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX
+    size, wanted = Size(scene.radius, RADIUS_SIGMA * scene.radius), True
+    if stage < _PARTS:
+        if stage > 0:  # too blurred for its patch: once more, in a wider one
+            wanted = fit.arrived and fit.blur > _AT_BOUND * fit.blur_bound
+            x, y, radius, blur_px = fit.x, fit.y, fit.radius, fit.blur_bound
+    elif stage == _PARTS:
+        wanted = not _explains(fit, discs, k)
+        if wanted:
+            size = size_of_disc(scene.radius, radii, k)
+            rim = _rim_of(scene, discs, k, size.radius)
+            x, y, radius = rim.x, rim.y, rim.radius
+    else:
+        explained = _explains(fit, discs, k)
+        wanted = not explained or fit.explained < _EXPLAINS_ALL
+        if wanted:
+            size = size_of_disc(scene.radius, radii, k)
+            before, radius = fit if explained else by_parts, size.radius
+            if before.arrived:
+                x, y, radius, blur_px = before.x, before.y, before.radius, before.blur
+    return wanted, Start(x, y, radius, blur_px), size
 
 
 @kernel(inline="always")
@@ -159,21 +195,6 @@ def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
 
 
 @kernel(inline="always")
-def _fit_whole(scene: Scene, discs: Judgement, k: int, work: Any) -> Fit:
-    """Fit disc k as a whole."""
-    settings = FitSettings(False, scene.radius, RADIUS_SIGMA, WHOLE)
-    start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX)
-    fit = fit_disc(scene, start, settings, work)
-    for _ in range(_MOST_REFITS):
-        if not fit.arrived or fit.blur <= _AT_BOUND * fit.blur_bound:
-            break
-        # Too blurred for its patch: fit again in a wider one.
-        start = Start(fit.x, fit.y, fit.radius, fit.blur_bound)
-        fit = fit_disc(scene, start, settings, work)
-    return fit
-
-
-@kernel(inline="always")
 def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
     """Whether the fit of a whole disc explains the image."""
     least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
@@ -182,16 +203,8 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 
 
 @kernel(inline="always")
-def _place_by_rim(
-    scene: Scene, discs: Judgement, k: int, before: Fit, size: Size, work: Any
-) -> Place:
-    """Locate a disc by its sectors or, if these disagree, by the points of its rim."""
-    start = Start(discs.floor_xy[k, 0], discs.floor_xy[k, 1], size.radius, _BLUR_PX)
-    if before.arrived:
-        start = _start_at(before)
-    fit = fit_disc(scene, start, _by_parts(size), work)
-    if not fit.arrived:
-        fit = before
+def _place_by_rim(scene: Scene, discs: Judgement, k: int, fit: Fit, size: Size) -> Place:
+    """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, size.radius)
     if fit.arrived:
         place = _place_of(fit)
