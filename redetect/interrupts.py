@@ -63,10 +63,9 @@ def _hands_over(frame: FrameType) -> bool:
 def interrupts_call(note: Handler) -> Iterator[None]:
     """Have interrupts call something during a block, but not in kernels.
 
-    Nothing changes in threads but the main one, and where interrupts are ignored.
+    Outside the main thread it does nothing.
     """
-    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    if ignored or threading.current_thread() is not threading.main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = signal.signal(signal.SIGINT, outside_kernels(note))
