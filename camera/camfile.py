@@ -1,10 +1,10 @@
 """Reading and writing ``.cam`` files (``SmRadialDistortedCamera``).
 
 The grammar is the data set's, read tolerantly: any white space, commas or none, keys in any order,
-``#`` comments. Keys that mean nothing here are kept and written back. Three keys are this
-project's: ``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens
-that has such terms, and ``covariance: { ... }``, how well the parameters are known
-(`camera.uncertainty`): the lower triangle of their covariance.
+``#`` comments. Unknown keys are kept and written back. Three keys are specific to this project:
+``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
+such terms, and ``covariance: { ... }``, the lower triangle of the parameters' covariance
+(`camera.uncertainty`).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def camera_in(folder: Path, stem: str = "") -> Camera | None:
 
 
 def parse_camera(text: str, name: str = "<text>") -> Camera:
-    """Parse the text of a ``.cam`` file; `name` is what errors call the file."""
+    """Parse the text of a ``.cam`` file; `name` is the file's name in errors."""
     entries = _split(text, name)
 
     def numbers(key: str, count: int) -> list[float]:

@@ -1,7 +1,6 @@
 """The command ``camera``.
 
-Exit codes: 0 all went well; 1 the command could not be carried out; 2 the command line was wrong;
-130 it was interrupted, and wrote nothing.
+Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupted, without output.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "camera",
-    "Print boards, calibrate a camera, place it on the floor, convert its calibration.\n\n"
+    "Print boards, calibrate a camera, estimate its pose, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
         Board: "camera.boards.board",

@@ -1,13 +1,13 @@
-"""A lens's distortion: forward, derivative, where it folds, and its inverse.
+"""Lens distortion: forward, derivative, the fold, and the inverse.
 
-A ray with undistorted normalised radius r is seen at the distorted radius
+A ray with undistorted normalised radius r has the distorted radius
 
     g(r) = r f(r),    f(r) = 1 + (a2 r + a3 r^2) / (1 + b1 r + b2 r^2 + b3 r^3)
 
 (DLR Spatial Cognition data set report, camera calibration). ``coef`` is always
-``(a2, a3, b1, b2, b3)``, the order of the ``.cam`` file. Lenses of other programs also have Brown's
-terms: an even polynomial, k1 r^2 + k2 r^4 + k3 r^6 added to f, and, for a lens whose elements are
-not on one axis, tangential terms that move points across their radius, too: (x, y) is seen at
+``(a2, a3, b1, b2, b3)``, the order of the ``.cam`` file. Models of other programs also have Brown's
+terms: an even polynomial, k1 r^2 + k2 r^4 + k3 r^6 added to f, and, for decentred lenses,
+tangential terms that also move points across their radius: (x, y) is distorted to
 
     x (f(r) + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
     y (f(r) + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -43,16 +43,16 @@ Tangential = tuple[float, float]
 NO_POLYNOMIAL: Polynomial = (0.0, 0.0, 0.0)
 NOT_TANGENTIAL: Tangential = (0.0, 0.0)
 
-#: Coefficients beyond this are no distortion; it also keeps all that follows finite.
+#: Largest plausible coefficient; it also keeps all computations finite.
 LARGEST_COEFFICIENT = 1e6
 
 #: Largest undistorted radius (tangent of the angle to the optical axis) that is inverted: 89.9 deg.
 RADIUS_LIMIT = 573.0
 
-# So fine that the table's linear interpolation needs but one step of Newton's method.
+# So fine that after linear interpolation in the table one step of Newton's method suffices.
 _TABLE_NODES = 16384
 _NEWTON_STEPS = 60
-# Coefficients of a polynomial in r that make no difference even at `RADIUS_LIMIT`.
+# Coefficients of a polynomial in r that are negligible even at `RADIUS_LIMIT`.
 _NEGLIGIBLE = 1e-30
 # Folds farther out than 89.994 deg are rounding, not distortion.
 _SMALLEST_INVERSE = 1e-4
@@ -203,7 +203,7 @@ def polynomial_of(brown: Brown) -> Polynomial:
 
 
 def brown_shift(xy: FloatArray, brown: Brown) -> FloatArray:
-    """By how much Brown's terms move (..., 2) points, beside the rational distortion."""
+    """Displacement of (..., 2) points by Brown's terms, in addition to the rational distortion."""
     k1, k2, p1, p2, k3 = brown
     q = np.array([p2, p1])
     squared = np.sum(xy * xy, axis=-1)
@@ -243,7 +243,7 @@ def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def one_to_one_radius(coef: Coef, brown: Brown) -> float:
-    """r_max: the undistorted radius up to which no two rays are seen at the same place.
+    """r_max: the undistorted radius up to which no two rays have the same image.
 
     Without Brown's terms the rational distortion's `fold_radius`; with them the largest radius
     below which the Jacobian is positive definite in all directions, and at most `RADIUS_LIMIT`.

@@ -6,15 +6,15 @@ from redetect.storage.messages import OneLineError
 
 
 class CameraError(OneLineError, ValueError):
-    """A camera that cannot be, or a calibration file that cannot be read.
+    """An impossible camera, or a calibration file that cannot be read.
 
-    The message names the file and line where there is one, the quantity, its value and what was
+    The message names the file and line if there is one, the quantity, its value and what was
     expected.
     """
 
 
 class CalibrationError(CameraError):
-    """A calibration that the pictures do not allow; the message says what to do next."""
+    """A calibration that fails with these pictures; the message states what to do."""
 
 
 class ConversionError(CameraError):

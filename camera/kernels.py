@@ -1,6 +1,6 @@
-"""Single points through a camera and back, compiled, for tables that need millions of them.
+"""Compiled projection of single points and its inverse, for tables that need millions of them.
 
-`camera.model` and `camera.distortion` are the definitions; tests hold both together.
+`camera.model` and `camera.distortion` are the definitions; tests compare both.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SMALLEST_SHARE = 1e-6
 
 
 def camera_numbers(camera: Camera) -> FloatArray:
-    """All that a projection needs, as one vector, the form in which kernels take a camera.
+    """All parameters of a projection as one vector, the form of a camera for kernels.
 
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
     robot -> camera row by row; the camera's centre in the robot frame; k1, k2, p1, p2, k3.
@@ -40,7 +40,7 @@ def camera_numbers(camera: Camera) -> FloatArray:
 def published_camera_numbers(camera: Camera) -> FloatArray:
     """`camera_numbers` of the data set's own detector.
 
-    It turns by the transpose of a rotation that its file gives in few digits, not by the inverse.
+    It uses the transpose of the rotation, which the file gives in few digits, not the inverse.
     """
     numbers = camera_numbers(camera)
     numbers[10:19] = camera.rotation.T.ravel()
@@ -51,7 +51,7 @@ def published_camera_numbers(camera: Camera) -> FloatArray:
 def brown_shift_point(
     k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
 ) -> tuple[float, float]:
-    """By how much Brown's terms move a point; all normalised."""
+    """Displacement of a point by Brown's terms; all normalised."""
     squared = x * x + y * y
     along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
     return along * x + squared * p2, along * y + squared * p1
@@ -74,7 +74,7 @@ def straightened_point(
     x_seen, y_seen : float
         The distorted point, normalised.
     x, y : float
-        Where to begin: the radial inverse, or what a neighbour sees.
+        Initial values: the radial inverse, or a neighbour's result.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def straightened_point(
     if r > r_max:
         x *= 0.999 * r_max / r
         y *= 0.999 * r_max / r
-    # The residual where the last step began; at first none is worse.
+    # The residual before the last step; initially infinite.
     least = math.inf
     x_kept, y_kept, x_step, y_step = x, y, 0.0, 0.0
     share = 1.0
@@ -128,7 +128,7 @@ def straightened_point(
             # Newton's error squares with each step: after one this small nothing is left to gain.
             last = length <= _LAST_STEP * max(1.0, r)
         else:
-            # Back, and less far.
+            # Go back, and make a smaller step.
             share *= 0.5
             last = False
             if not share > _SMALLEST_SHARE:

@@ -1,13 +1,12 @@
-"""Tables on disk, so that they are computed once per calibration.
+"""Caches tables on disk, so that they are computed once per calibration.
 
-A cached table is a file named by the hash of everything that decides its content. It begins with
-a hash of that name and of the bytes that follow, so damage of any kind is noticed, and so is a
-table under another's name. Tables that another user forged would pass, so only files and folders
-are used that belong to the user and that no one else can write to. Rejected tables are computed
-again, with a warning.
+A cached table is a file named by the hash of everything that determines its content. It begins with
+a hash of that name and of the bytes that follow, so that damage and renamed files are detected.
+Since that does not detect forgery by another user, only files and folders are used that belong to
+the user and that no one else can write to. Rejected tables are computed again, with a warning.
 
 Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
-be written to is no error: the next run just computes again.
+be written to is not an error: the next run just computes again.
 """
 
 from __future__ import annotations
@@ -39,12 +38,12 @@ Table = TypeVar("Table", DiscTable, VerticalTable, VoteTable)
 _log = logging.getLogger("redetect")
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
-#: The largest table that is read; that of a 20-megapixel camera has a tenth of it.
+#: The largest table that is read; that of a 20-megapixel camera has a tenth of this size.
 _LARGEST_FILE_BYTES = 1 << 32
 
 
 def cache_folder() -> Path:
-    """Where tables are kept: ``$REDETECT_CACHE``, else ``redetect`` in the user's cache folder."""
+    """Folder of the cache: ``$REDETECT_CACHE``, else ``redetect`` in the user's cache folder."""
     chosen = os.environ.get("REDETECT_CACHE")
     if chosen:
         return Path(chosen)
@@ -53,21 +52,21 @@ def cache_folder() -> Path:
 
 
 def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = None) -> DiscTable:
-    """The disc table of a camera, from the cache if it is there and sound, else computed and kept.
+    """The disc table of a camera, from the cache if valid, else computed and cached.
 
-    Equal to that of `lut.build_disc_table`, whose parameters and errors these are; `folder` is the
-    cache, by default `cache_folder`.
+    Result, parameters and errors as for `lut.build_disc_table`; `folder` is the cache, by default
+    `cache_folder`.
     """
     return _cached(DiscTable, "discs", (camera, shape), build_disc_table, folder)
 
 
 def cached_vote_table(camera: Camera, shape: VoteShape, folder: Path | None = None) -> VoteTable:
-    """The table of votes of a camera, equal to `lut.build_vote_table`'s; as above."""
+    """The table of votes of a camera, as `lut.build_vote_table` computes it; see above."""
     return _cached(VoteTable, "votes", (camera, shape), build_vote_table, folder)
 
 
 def cached_vertical_table(camera: Camera, folder: Path | None = None) -> VerticalTable:
-    """The table of verticals of a camera, equal to `lut.build_vertical_table`'s; as above."""
+    """The table of verticals of a camera, as `lut.build_vertical_table` computes it; see above."""
     return _cached(VerticalTable, "verticals", (camera,), build_vertical_table, folder)
 
 
@@ -95,7 +94,7 @@ def _key(camera: Camera, shape: DiscShape | VoteShape | None = None) -> str:
 
 
 def _read(path: Path, kind: type[Table]) -> Table | None:
-    """The table that a file holds; None if there is no file, or one that must not be used."""
+    """The table in a file; None if there is no file, or it must not be used."""
     content = _own_content(path)
     if content is None:
         return None
@@ -108,12 +107,12 @@ def _read(path: Path, kind: type[Table]) -> Table | None:
             return kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
     except Exception:
         pass  # a damaged or forged archive can raise anything
-    _log.info("%s: is damaged: it is computed again", path)
+    _log.info("%s: is damaged: computing it again", path)
     return None
 
 
 def _own_content(path: Path) -> bytes | None:
-    """The bytes of a file that only the user can have written; None if there is none."""
+    """The bytes of a file that only the user can have written; None if there is no such file."""
     try:
         why = writable_by_others(path.parent.stat())
         if why is None:
@@ -122,14 +121,14 @@ def _own_content(path: Path) -> bytes | None:
     except FileNotFoundError:
         pass
     except OSError as error:
-        # A file that somebody writes into while it is read is damaged like any other.
+        # A file that changes while it is read counts as damaged, like any other.
         level = logging.INFO if error.errno == errno.EBUSY else logging.WARNING
-        _log.log(level, "%s: %s: it is computed again", path, error.strerror)
+        _log.log(level, "%s: %s: computing it again", path, error.strerror)
     return None
 
 
 def _digest(path: Path, payload: bytes) -> bytes:
-    """The hash that begins a file: of its name and of the bytes that follow."""
+    """The hash at the beginning of a file: of its name and of the bytes that follow."""
     digest = hashlib.sha256(path.name.encode() + b"\0")
     digest.update(payload)
     return digest.digest()
@@ -138,7 +137,7 @@ def _digest(path: Path, payload: bytes) -> bytes:
 def _keep(path: Path, table: DiscTable | VerticalTable | VoteTable) -> None:
     buffer = io.BytesIO()
     names = table._fields if isinstance(table, VoteTable) else [f.name for f in fields(table)]
-    # NumPy before 2.1 would take `allow_pickle` for an array; these are numbers all.
+    # NumPy before 2.1 would store `allow_pickle` as an array; all arrays are numeric.
     np.savez(buffer, **{name: getattr(table, name) for name in names})
     payload = buffer.getvalue()
     try:

@@ -1,12 +1,11 @@
-"""Table of the outlines' pixels around the centres of discs that are tested.
+"""Table of the outlines' pixels around the tested centres of discs.
 
-A disc on the floor centred where pixel (u, v) meets it has an inner outline (inside the disc's
-edge) and an outer one (outside). Where their equally spaced samples fall in the image depends on
-the calibration alone, so it is computed ahead of time (DLR Spatial Cognition data set report,
-circle detection).
+A disc centred at the floor position of pixel (u, v) has an inner outline (inside the disc's edge)
+and an outer one (outside). The pixels of their equally spaced samples depend on the calibration
+only, so they are computed in advance (DLR Spatial Cognition data set report, circle detection).
 
-A centre is usable if enough of each outline's samples are inside the image, it keeps its distance
-from the border, and the floor there moves by no more than a given length per image row.
+A centre is usable if enough of each outline's samples are inside the image, it is not too close to
+the border, and the floor there moves by no more than a given length per image row.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from redetect.compiled import kernel
 from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.storage.messages import OneLineError
 
-#: Part of an outline's samples that must lie inside the image.
+#: Least share of an outline's samples inside the image.
 MIN_SHARE_INSIDE = 0.5
 #: Samples of each outline that the centres of a group share, and columns that it covers.
 GROUP_SAMPLES, GROUP_COLUMNS = 10, 16
 
 
 class TableError(OneLineError, ValueError):
-    """A table that cannot be computed; the message names the quantity and what was expected."""
+    """A table that cannot be computed; the message names the quantity and the expectation."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +40,19 @@ class DiscShape:
 
     inner_radius_m: Positive = 0.06  #: Radius of the inner outline on the floor, metres.
     outer_radius_m: Positive = 0.14  #: Radius of the outer one.
-    #: Equally spaced samples on each outline; the first lies in the robot's +X direction.
+    #: Equally spaced samples on each outline; the first is in the robot's +X direction.
     samples: Annotated[int, whole(3, 128)] = 16
     border_px: Annotated[int, whole(0)] = 12  #: Least distance from the image's border.
-    #: The floor moves at most this far from one image row to the next; infinite: however far.
+    #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: Limit = 0.05
-    #: Samples are counted in pairs, an inner and an outer one, at least this many of which must be
-    #: inside the image; 0: samples are counted singly.
+    #: Least number of sample pairs (an inner and an outer one) inside the image; 0: samples are
+    #: counted singly.
     least_pairs: Annotated[int, whole(0)] = 0
-    #: Samples of a pair that fall on the same pixel are moved inwards and outwards by the length on
-    #: the floor of this many pixels down the image.
+    #: Samples of a pair on the same pixel are moved inwards and outwards by the length on the floor
+    #: of this many image rows.
     apart_px: NotNegative = 0.0
-    #: Centres along a row are left out that are nearer than this to a usable one, in pixels as long
-    #: as one down the image, rounded up. 0: none is.
+    #: Least distance of usable centres in a row, converted to pixels by the length of an image row
+    #: on the floor and rounded up; 0: every pixel is a centre.
     stride_m: NotNegative = 0.0
 
     def __post_init__(self) -> None:
@@ -67,41 +66,41 @@ class DiscShape:
 
 
 class CentreGroups(NamedTuple):
-    """Neighbouring centres that have some samples at the same place beside themselves.
+    """Neighbouring centres with some samples at the same offset from each centre.
 
     A group's centres are in one row, within `GROUP_COLUMNS` of each other.
     """
 
-    first: NDArray[np.int32]  # (G,) the first centre of each
-    #: (G,) the columns of its centres, counted from the first: a bit each.
+    first: NDArray[np.int32]  # (G,) the first centre of each group
+    #: (G,) bit mask of the columns of its centres, counted from the first
     columns: NDArray[np.int32]
-    #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and of the outer outline for
-    #: the first centre, each `GROUP_COLUMNS` or more before the end of the image; all `begin` for a
-    #: centre that sees fewer.
+    #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and the outer outline for the
+    #: first centre, each `GROUP_COLUMNS` or more before the end of the image; all `begin` for a
+    #: centre with fewer samples
     samples: NDArray[np.uint32]
-    begin: int  # The pixels of all columns of all samples are from this one
-    end: int  # to the one before this.
+    begin: int  # first pixel of all columns of all samples
+    end: int  # one past their last pixel
 
 
 @dataclass(frozen=True, eq=False)
 class DiscTable:
-    """The centres that are tested, and the pixels of their outlines; compared by identity."""
+    """The tested centres, and the pixels of their outlines; compared by identity."""
 
     #: (N, K, 2) index in scan order of the pixel of the inner and of the outer sample in each
-    #: direction, every second direction first; H * W outside the image, or where it does not count
+    #: direction, every second direction first; H * W outside the image, or if it does not count
     samples: NDArray[np.uint32]
     pixels: NDArray[np.int32]  # (N, 2) pixel (u, v) of each centre, in scan order
-    #: (H, W, 2) floor position (robot X, Y, m) that each pixel sees; NaN above the horizon
+    #: (H, W, 2) floor position (robot X, Y, m) of each pixel; NaN above the horizon
     floor_xy: Float32Array
 
     @cached_property
     def groups(self) -> CentreGroups:
-        """Neighbouring centres, by samples that they share."""
+        """Groups of neighbouring centres with shared samples."""
         return _groups(self.samples, self.pixels, self.floor_xy[..., 0].size)
 
     @cached_property
     def usable(self) -> BoolArray:
-        """(H, W) the centres that are tested."""
+        """(H, W) mask of the tested centres."""
         usable = np.zeros(self.floor_xy.shape[:2], np.bool_)
         usable[self.pixels[:, 1], self.pixels[:, 0]] = True
         return usable
@@ -115,7 +114,7 @@ def ring(radius_m: float, samples: int) -> FloatArray:
 
 @lru_cache(maxsize=2)
 def floor_positions(camera: Camera) -> FloatArray:
-    """(H, W, 2) floor position (robot X, Y, metres) that each pixel sees; NaN above the horizon."""
+    """(H, W, 2) floor position (robot X, Y, metres) of each pixel; NaN above the horizon."""
     return camera.floor_from_pixel(camera.pixel_grid())
 
 
@@ -124,15 +123,15 @@ def demand_above_floor(camera: Camera) -> None:
     if not camera.centre[2] > 0.0:
         raise TableError(
             f"the camera is {camera.centre[2]:g} m above the floor: expected more than 0; "
-            "`camera floor` says where it is"
+            "`camera floor` estimates its pose"
         )
 
 
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
-    """Compute the outlines' pixels around the centres that are tested.
+    """Compute the outlines' pixels around the tested centres.
 
-    A camera that sees no usable floor (looking up, say) gets a table without centres; one that is
-    not above the floor raises a TableError.
+    A camera that sees no usable floor (looking up, say) gets a table without centres; a camera that
+    is not above the floor raises a TableError.
     """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
@@ -171,7 +170,7 @@ def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int
     if samples.shape[1] < GROUP_SAMPLES or n == 0:
         single = np.arange(n, dtype=np.int32), np.ones(n, np.int32)
         return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32), 0, GROUP_COLUMNS)
-    # The first centre that sees a sample elsewhere beside itself, or where a group would overrun.
+    # A group ends at the first centre with a sample at another offset, or if it would overrun.
     beside = samples.astype(np.int32) - column[:, None, None]
     moves = (beside[1:] != beside[:-1]) | (row[1:] != row[:-1])[:, None, None]
     in_image = samples <= outside - GROUP_COLUMNS
@@ -201,12 +200,12 @@ def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int
 
 
 class _Outlines(NamedTuple):
-    """Where the samples are about a centre."""
+    """Positions of the samples relative to a centre."""
 
     inner: float  # radii, metres
     outer: float
     unit: FloatArray  # (K, 2) directions, every second one first
-    paired: bool  # samples count in pairs, which are moved apart where they are the same pixel
+    paired: bool  # whether samples count in pairs, which are moved apart if on the same pixel
     apart_px: float
 
 
@@ -242,7 +241,7 @@ def _sample_pixels(
 
 
 def size_down(floor_xy: FloatArray) -> FloatArray:
-    """(H, W) how far the floor moves per image row, metres, from (H, W, 2) positions."""
+    """(H, W) step of the floor per image row, metres, from (H, W, 2) positions."""
     if len(floor_xy) == 1:
         return np.full(floor_xy.shape[:2], np.nan)
     by_row = np.gradient(floor_xy, axis=0)
@@ -260,10 +259,9 @@ def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> B
 
 
 def _strided(columns: IntArray, step: FloatArray) -> list[int]:
-    """Which of some columns keep the distance that the one before them asks for.
+    """Indices of columns that are at least the previous one's step apart.
 
-    Where pixels grow fast along a row, in a very wide lens, twice the distance that they themselves
-    ask for is enough.
+    If steps grow fast along a row, with a very wide lens, twice a column's own step is sufficient.
     """
     kept: list[int] = []
     last, following = 0, 0

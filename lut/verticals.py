@@ -1,12 +1,12 @@
-"""Where the building's vertical lines appear: the horizon and the verticals through it.
+"""Table of the curves of vertical lines in the image: the horizon and the verticals through it.
 
-A vertical plane through the camera's centre is seen as one curve in the image. All points on it
-share their bearing, so the curve is named by the one pixel at which it crosses the horizon: for
-each image column the table holds the row of the horizon and the vertical through that point, as a
-column for each row, through the distortion (DLR Spatial Cognition data set report, line detection).
+A vertical plane through the camera's centre appears as one curve in the image. All points on it
+have the same bearing, so the curve is identified by the pixel at which it crosses the horizon: for
+each image column the table has the row of the horizon and the vertical through that point, as a
+column for each row, including distortion (DLR Spatial Cognition data set report, line detection).
 
-A camera that looks down so far that it does not see the horizon still sees verticals. There a line
-of constant elevation near the border of the image replaces the horizon; both are called *anchor*.
+A camera that looks down so far that it does not see the horizon still sees verticals. Then a line
+of constant elevation near the image border replaces the horizon; both are called *anchor*.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from camera.kernels import camera_numbers, project_direction
 from redetect.array_types import BoolArray, Float32Array, FloatArray
 from redetect.compiled import kernel
 
-#: Verticals farther than this from the image's vertical are not followed: du/dv of 45 deg.
+#: Largest abs(du/dv) at which verticals are followed: 45 deg from the image's vertical.
 STEEPEST_SLOPE = 1.0
 
 _NEWTON_STEPS, _STEP_RAD, _TOLERANCE_PX = 12, 1e-7, 1e-9
 
-#: The horizon is the anchor where at least this share of the columns see it.
+#: The horizon is the anchor if it is visible in at least this share of the columns.
 _LEAST_SEEN = 0.5
-#: Else the anchor is, in most columns, at least this share of the height from the border,
+#: Otherwise the anchor is, in most columns, at least this share of the height from the border,
 _MARGIN = 1.0 / 12.0
-#: and no farther from the horizon than this: cameras that look farther down see only the floor.
+#: and at most this far from the horizon: cameras that look farther down see only the floor.
 _LARGEST_ELEVATION = math.radians(45.0)
 
 
@@ -39,19 +39,19 @@ _LARGEST_ELEVATION = math.radians(45.0)
 class VerticalTable:
     """The anchor and the verticals of a calibration; hashed and compared by identity."""
 
-    anchor_elevation_rad: float  # elevation of the anchor: 0 where that is the horizon
-    #: (W,) row at which the anchor crosses each column; NaN where not inside the image
+    anchor_elevation_rad: float  # elevation of the anchor: 0 for the horizon
+    #: (W,) row at which the anchor crosses each column; NaN outside the image
     anchor_row: FloatArray
     #: (W,) bearing of that point, positive to the left; NaN as above
     bearing_rad: FloatArray
-    #: (W,) rows over which the vertical through it is seen without a break, inside the image and
-    #: within 45 deg of the image's vertical; first > last where there are none
+    #: (W,) rows over which the vertical through it is continuously visible, inside the image and
+    #: within 45 deg of the image's vertical; first > last if there are none
     first_row: NDArray[np.int32]
     last_row: NDArray[np.int32]
-    #: (H, W) column at which the vertical named by the second index crosses each row; NaN outside
-    #: those rows. In Fortran order, so that following a vertical reads memory in sequence.
+    #: (H, W) column at which the vertical of the second index crosses each row; NaN outside those
+    #: rows. In Fortran order, so that following a vertical reads memory sequentially.
     column: Float32Array
-    #: (H, W) tangent of the elevation at which it does so; NaN as `column`
+    #: (H, W) tangent of the elevation at that crossing; NaN as `column`
     elevation_tan: Float32Array
     robot_from_camera: FloatArray  # (3, 3) rotation
     #: height of a row in widths of a column (2 for single fields of interlaced frames)
@@ -59,7 +59,7 @@ class VerticalTable:
 
     @property
     def usable(self) -> BoolArray:
-        """(W,) bool, the columns that have a vertical."""
+        """(W,) mask of the columns that have a vertical."""
         return self.first_row <= self.last_row
 
 
@@ -88,7 +88,7 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
         elevation_tan=np.asfortranarray(
             np.where(seen, np.tan(elevation), np.nan), dtype=np.float32
         ),
-        # Like those of a table that is read: kernels are compiled for one kind of array only.
+        # Like arrays of a cached table, since kernels are compiled for one kind of array only.
         robot_from_camera=np.array(camera.rotation),
         row_aspect=camera.scale_x / camera.scale_y,
     )
@@ -106,7 +106,7 @@ def _anchor(camera: Camera, normalised: FloatArray) -> tuple[float, FloatArray]:
         sine = sine[np.isfinite(sine)]
         if not len(sine):
             continue
-        # Farther from the horizon is farther inside the image.
+        # A larger distance from the horizon is farther inside the image.
         past = float(np.quantile(sine, 0.1 if np.median(sine) < 0.0 else 0.9))
         if abs(past) < abs(nearest):
             nearest = past
@@ -119,9 +119,9 @@ def _anchor(camera: Camera, normalised: FloatArray) -> tuple[float, FloatArray]:
 def anchor_rows(camera: Camera, normalised: FloatArray, elevation_rad: float) -> FloatArray:
     """(W,) rows at which a line of constant elevation (0: the horizon) crosses each column.
 
-    `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN where the line does not cross
-    the column inside the image; where it does so more than once (a camera rolled far over), the
-    crossing nearest to the image's middle row.
+    `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN if the line does not cross the
+    column inside the image; of several crossings (for a camera with a large roll), the one nearest
+    to the image's middle row.
     """
     height, width = camera.height, camera.width
     above = _above(camera, normalised, math.sin(elevation_rad))
@@ -137,7 +137,7 @@ def anchor_rows(camera: Camera, normalised: FloatArray, elevation_rad: float) ->
 
 
 def _above(camera: Camera, normalised: FloatArray, sine: float) -> FloatArray:
-    """How far rays (x, y, 1) end above the cone whose elevation has this sine."""
+    """Signed height of the ends of rays (x, y, 1) above the cone of elevation arcsin(`sine`)."""
     toward_up = camera.rotation[2]
     rise = normalised @ toward_up[:2] + toward_up[2]
     return np.asarray(rise - sine * np.sqrt(1.0 + np.sum(normalised * normalised, axis=-1)))
@@ -150,7 +150,7 @@ def _roots(
     before: NDArray[np.intp],
     above: FloatArray,
 ) -> FloatArray:
-    """Rows between `before` and the next at which columns see the elevation of this sine."""
+    """Sub-pixel rows between `before` and the next at which columns have that elevation."""
     low, high = before.astype(np.float64), before + 1.0
     rises = above[before, columns] <= 0.0
     for _ in range(50):
@@ -173,7 +173,7 @@ def trace_verticals(
     """Follow (N,) verticals from the anchor up and down, row by row, through a camera.
 
     Results are (H, N) `column` and `elevation` (rad) of each vertical in each row; NaN where it is
-    not seen, or not without a break from the anchor on.
+    not visible, or not continuously from the anchor on.
     """
     column[:] = elevation[:] = math.nan
     for n in range(len(bearing)):
@@ -185,7 +185,7 @@ def trace_verticals(
             angle, orientation = anchor_elevation, 0.0
             while 0 <= v < len(column):
                 u, angle, slope = _crossing(numbers, bearing[n], v, angle)
-                # A vertical that turns back would show a row twice.
+                # A vertical that turns back would cross a row twice.
                 if not math.isfinite(slope) or orientation * slope < 0.0:
                     break
                 column[v, n], elevation[v, n] = u, angle
@@ -198,9 +198,9 @@ def trace_verticals(
 def _crossing(
     numbers: FloatArray, bearing: float, row: float, angle: float
 ) -> tuple[float, float, float]:
-    """Column and elevation at which a row shows a vertical, and its rows per radian there.
+    """Column and elevation at which a vertical crosses a row, and its rows per radian there.
 
-    By Newton's method from an elevation nearby; no numbers where it does not show it.
+    By Newton's method from an elevation nearby; NaN if there is no crossing.
     """
     for _ in range(_NEWTON_STEPS):
         u, v = _seen(numbers, bearing, angle)
@@ -222,7 +222,7 @@ def _seen(numbers: FloatArray, bearing: float, elevation: float) -> tuple[float,
 def _unbroken(
     column: FloatArray, anchor_row: FloatArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], BoolArray]:
-    """First and last of the rows round the anchor over which verticals are seen; those rows."""
+    """First and last row around the anchor over which verticals are visible; mask of these rows."""
     height, width = column.shape
     with np.errstate(invalid="ignore"):
         seen = (column >= 0.0) & (column <= width - 1.0)

@@ -1,8 +1,8 @@
-"""Table of the cells of the floor in which edges vote for centres of discs (`detect.discs.hough`).
+"""Table of the floor cells in which edges vote for centres of discs (`detect.discs.hough`).
 
-Which point of the floor a pixel sees, in which direction its gradient points there, and which share
-of a rim it stands for, depend on the calibration and the discs' radius alone. Cells are a quarter
-of the radius across, and at least a pixel ahead.
+The floor position of a pixel, the direction of its gradient there, and the share of a rim that it
+covers depend on the calibration and the discs' radius only. Cells are a quarter of the radius wide,
+and at least a pixel long in the viewing direction.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from lut.outlines import TableError, demand_above_floor, floor_positions, pixels
 from redetect.array_types import Float32Array, FloatArray, IntArray
 from redetect.storage.bounds import Limit, Positive, demand_fields, whole
 
-#: Width of a cell, radii, and at least ahead, pixels.
+#: Width of a cell, radii, and its least length ahead, pixels.
 _CELL_RADII, _CELL_PX = 0.25, 0.8
-#: Steps in which it is looked up how far ahead a cell is, for each radius.
+#: Resolution of the lookup from distance ahead to row of cells, steps per radius.
 _STEPS_PER_RADIUS = 16.0
-#: Where every disc is this wide (pixels), columns are added in pairs; where it is this high, every
-#: second row votes, and so on.
+#: If every disc is this wide (pixels), columns are added in pairs; if it is this high, every second
+#: row votes, and so on.
 _WIDE_PX, _HIGH_PX = 9.0, 6.0
 
 
 @dataclass(frozen=True)
 class VoteShape:
-    """Which discs votes are for, and the nearest and farthest centres."""
+    """Size of the discs, and the nearest and farthest centres."""
 
-    radius_m: Positive = 0.10  #: Of the discs, metres.
+    radius_m: Positive = 0.10  #: Radius of the discs, metres.
     border_px: Annotated[int, whole(0)] = 6  #: Least distance from the image's border.
-    #: The floor moves at most this far from one image row to the next; infinite: however far.
+    #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: Limit = 0.12
 
     def __post_init__(self) -> None:
@@ -41,24 +41,24 @@ class VoteShape:
 
 
 class VoteTable(NamedTuple):
-    """Which pixels vote, and the cells in which their votes are counted; lengths in metres."""
+    """The voting pixels, and the cells in which their votes are counted; lengths in metres."""
 
-    #: (H, W, 2) floor position (robot X, Y) that each pixel sees; NaN above the horizon
+    #: (H, W, 2) floor position (robot X, Y) of each pixel; NaN above the horizon
     floor_xy: Float32Array
-    paired: bool  # columns of the image are added in pairs
+    paired: bool  # whether columns of the image are added in pairs
     image_row: IntArray  # (R,) rows of the image that vote; none without centres
-    #: (R, W, 6) of each pixel (or pair) its place, cells across and steps ahead, and B / (2 pi r)
-    #: by rows; all 0 where no floor is seen
+    #: (R, W, 6) for each pixel (or pair) its position, cells across and steps ahead, and
+    #: B / (2 pi r) row by row; all 0 where no floor is visible
     pixel: Float32Array
     row_of_step: IntArray  # (S,) row of cells at each step ahead
     ahead: FloatArray  # (M,) middle of each row of cells
-    first: IntArray  # (M,) columns of cells between which each row is in view
+    first: IntArray  # (M,) columns of cells between which each row is visible
     last: IntArray
     columns: int
-    cell: float  # width of cells,
-    step: float  # of steps ahead,
-    left: float  # and where column 0 begins
-    foot: FloatArray  # (2,) of the camera
+    cell: float  # width of a cell
+    step: float  # length of a step ahead
+    left: float  # left end of column 0
+    foot: FloatArray  # (2,) floor position below the camera
     turn: FloatArray  # (2, 2) the directions across and ahead
 
 
@@ -86,7 +86,7 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)
     per_column = np.linalg.norm(np.gradient(place, axis=1), axis=-1)
     edges = _edges_ahead(place[usable, 1], per_row[usable], radius)
-    # Up to the image's border, nearer than the first centres are.
+    # Up to the image border, which is nearer than the first centres.
     seen = (place[..., 1] >= edges[0]) & (place[..., 1] < edges[-1])
     across, ahead = np.moveaxis(place[seen], -1, 0)
     cell, step = _CELL_RADII * radius, radius / _STEPS_PER_RADIUS
@@ -139,7 +139,7 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:
-    """Distances between rows of cells: a cell of the floor apart, and at least a pixel."""
+    """Distances of the edges between rows of cells: a cell apart, and at least a pixel."""
     order = np.argsort(ahead)[:: max(len(ahead) // 512, 1)]
     edges = [float(ahead.min()) - radius]
     while edges[-1] < ahead.max() + radius:

@@ -34,19 +34,19 @@ from redetect.storage import demand_place, write_bytes
 class Board:
     """A printed board, as its flags describe it (`camera.options.BoardFlags`).
 
-    Raises CalibrationError if there can be no such board.
+    Raises CalibrationError if such a board is impossible.
     """
 
     kind: BoardKind
     columns: int
     rows: int
-    #: Side of a square, or distance of neighbouring circles in a symmetric grid; of an asymmetric
-    #: one half the distance of neighbours in a row, which is that of rows. Metres.
+    #: Side of a square, or spacing of circles in a symmetric grid; for an asymmetric one half the
+    #: spacing in a row, which is the distance between rows. Metres.
     square_m: float
     marker_m: float = 0.0
     dictionary: str = "DICT_5X5_100"
     #: Diameter of the circles, metres; 0 if unknown. With it, the shift of a circle's image against
-    #: the image of its centre is taken into account.
+    #: the image of its centre is corrected.
     circle_m: float = 0.0
 
     def __post_init__(self) -> None:
@@ -103,10 +103,10 @@ class Board:
         return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
 
 
-# What is larger is taken for millimetres.
+# Larger values are assumed to be millimetres.
 _LARGEST_SQUARE_M = 10.0
 
-# How far apart neighbouring circles are, in `square_m`; those of an asymmetric grid across.
+# Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
 _NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
 
 _WHAT_IS_COUNTED: dict[str, str] = {
@@ -118,7 +118,7 @@ _WHAT_IS_COUNTED: dict[str, str] = {
 
 
 def board_of(flags: BoardFlags) -> Board:
-    """The board that flags describe; not `discs`, which are none."""
+    """The board that flags describe, except `discs`."""
     return Board(
         flags.board, flags.columns, flags.rows, flags.square_m, flags.marker_m, flags.dictionary,
         flags.circle_m,
@@ -126,7 +126,7 @@ def board_of(flags: BoardFlags) -> Board:
 
 
 def charuco_of(board: Board) -> cv2.aruco.CharucoBoard:
-    """A ChArUco board as OpenCV has it."""
+    """OpenCV's object for a ChArUco board."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
         raise CalibrationError(
@@ -164,7 +164,7 @@ def perform(command: options.Board) -> int:
 
 
 class Sheet(NamedTuple):
-    """What is printed black, and the width and height that it takes up, metres."""
+    """The black shapes of a print, and its width and height, metres."""
 
     shapes: Sequence[Patch]
     width: float

@@ -35,7 +35,7 @@ def find_board(
     board : Board
     window : float
         Half the side of the window in which a checkerboard's corner is refined, as a share of its
-        squares in the image: a larger one averages more, and follows the lens's bending more.
+        squares in the image: a larger one averages more, but is more affected by distortion.
 
     Returns
     -------
@@ -81,9 +81,9 @@ def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
 
 
 def corners_counted(image: GreyImage) -> tuple[int, int] | None:
-    """How many inner corners a checkerboard in an image has, the larger number first.
+    """Count the inner corners of a checkerboard in an image, the larger number first.
 
-    None if none of at least 3 x 3 is found. Part of a board may be taken for all of it.
+    None if none of at least 3 x 3 is found. A part of a board may be mistaken for all of it.
     """
     reduced = next(_reductions(image), image)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -96,7 +96,7 @@ def corners_counted(image: GreyImage) -> tuple[int, int] | None:
 
 
 def _reductions(image: GreyImage) -> Iterator[GreyImage]:
-    """The image as small as it is searched, smallest first."""
+    """The image in the reduced sizes that are searched, smallest first."""
     height, width = image.shape
     for longest in _SEARCHED_PX:
         if longest >= max(height, width):
@@ -109,10 +109,10 @@ def _reductions(image: GreyImage) -> Iterator[GreyImage]:
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
-    """Saddle points, from as much round each as holds nothing else.
+    """Refine saddle points, each in a window without other features.
 
-    The window is small, and a corner's own: a larger one follows the lens's bending of the edges,
-    and one that reaches the next corner is drawn to it. Corners that are NaN stay so.
+    Each corner has a small window of its own: a larger one is affected by distortion of the edges,
+    and one that reaches the next corner is attracted by it. Corners that are NaN stay so.
     """
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW

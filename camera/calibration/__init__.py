@@ -1,6 +1,6 @@
-"""Calibration of a camera by views of boards, and its pose over the floor.
+"""Calibration of a camera from views of boards, and its pose above the floor.
 
-`calibrate` goes from points to a camera: `start` by homographies, `adjustment` by least squares of
-the `model`, `choice` of the lens's free coefficients, and checks of the result. `floor` finds the
-camera's pose by known places on the floor; `command` is `camera calibrate`.
+`calibrate` computes a camera from points: `start` by homographies, `adjustment` by least squares of
+the `model`, `choice` of the lens's free coefficients, and checks of the result. `floor` estimates
+the camera's pose from known points on the floor; `command` is `camera calibrate`.
 """

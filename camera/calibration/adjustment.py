@@ -1,7 +1,7 @@
 """Bundle adjustment of one camera and many views of boards whose points are known.
 
-Views meet only in the intrinsics, which they share; the solver is `redetect.least_squares`. Circles
-are fitted by where the middles of their images are.
+Views share only the intrinsics; the solver is `redetect.least_squares`. Circles are fitted by the
+centroids of their images.
 """
 
 from __future__ import annotations
@@ -37,12 +37,11 @@ from redetect.least_squares.solver import (
     robust as robustified,
 )
 
-#: Huber's constant, in standard deviations: beyond it a residual pulls no harder.
+#: Huber's constant, in standard deviations: the influence of larger residuals is constant.
 HUBER = 2.0
 
-#: Standard deviation of the distortion coefficients' prior, each times the power of the radius at
-#: the image's corner that it goes with: far wider than any lens, but it bounds what the points
-#: leave open.
+#: Standard deviation of the distortion coefficients' prior, each times its power of the radius at
+#: the image's corner: far wider than any lens, but it bounds undetermined coefficients.
 PRIOR_SIGMA = 10.0
 
 _DAMPING = 1e-3
@@ -68,11 +67,11 @@ class Points:
         return np.bincount(self.views)
 
     def of(self, views: IntArray) -> Points:
-        """The points of some views, ascending, only; these are numbered anew."""
+        """Only the points of some views, ascending, which are renumbered."""
         return self.where(np.isin(self.views, views))
 
     def where(self, chosen: BoolArray) -> Points:
-        """Some of the points only; the views left are numbered anew."""
+        """Only some of the points; the remaining views are renumbered."""
         views = np.unique(self.views[chosen], return_inverse=True)[1]
         return replace(self, board=self.board[chosen], pixels=self.pixels[chosen], views=views)
 
@@ -91,7 +90,7 @@ class Estimate:
         return Estimate(self.intrinsics, self.rotations[views], self.translations[views])
 
     def with_poses(self, views: IntArray, other: Estimate) -> Estimate:
-        """With another one's poses, which are of some views, in the place of its own."""
+        """With the poses of some views replaced by another estimate's."""
         rotations, translations = self.rotations.copy(), self.translations.copy()
         rotations[views], translations[views] = other.rotations, other.translations
         return replace(self, rotations=rotations, translations=translations)
@@ -99,7 +98,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An `Estimate` that fits best, and how well."""
+    """The best `Estimate`, with residuals and covariances."""
 
     estimate: Estimate
     sigma_px: float  # noise of a coordinate that the residuals show (robust, by degrees of freedom)
@@ -215,7 +214,7 @@ def adjust(
 
 
 def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
-    """Standard deviation of a coordinate by the median of the residuals, which outliers spare."""
+    """Standard deviation of a coordinate from the median residual, robust against outliers."""
     residuals = points.pixels - project_estimate(estimate, points)[0]
     unknown = free + 6 * len(points.counts)
     share = max(1.0 - unknown / residuals.size, 0.1)
@@ -272,7 +271,7 @@ def fit_to_centres(
 ) -> tuple[Adjusted, Points]:
     """Fit to points; with circles, repeatedly, corrected for the shifts by the previous fit.
 
-    `adjusted` fits points from an estimate to begin with. Also returned are the points as corrected
+    `adjusted` fits points, starting from an estimate. Also returns the corrected points
     (`circle_shifts`).
     """
     fit = adjusted(start, points)

@@ -1,4 +1,4 @@
-"""Calibration of a camera by views of a board: from points to intrinsics and how good they are."""
+"""Calibration of a camera from views of a board: intrinsics, their uncertainty, and checks."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ _LARGEST_RMS_WIDTHS = 1.0 / 2000.0
 
 
 def largest_rms_px(width: int) -> float:
-    """RMS residual up to which points are explained: they are found to some tenths of a pixel.
+    """Largest RMS residual of a good fit: points are accurate to some tenths of a pixel.
 
-    In large images, which are softer, less well.
+    It is larger for large images, which are softer.
     """
     return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
 def demand_enough(count: int, without: str = "") -> None:
-    """Refuse fewer pictures than a calibration takes; `without` says what was left out."""
+    """Raise an error for too few pictures; `without` states what was excluded."""
     if count < FEWEST_VIEWS:
         raise CalibrationError(
             f"{count} pictures of the board{without}: at least {FEWEST_VIEWS} are needed, and 15 "
@@ -56,13 +56,13 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
     warnings = []
     if fit.rms_px > largest_rms_px(points.width):
         warnings.append(
-            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained: is "
+            f"an RMS residual of {fit.rms_px:.2f} px means that the points do not fit: is "
             "the board flat, are --board, --columns and --rows right, and does the lens see less "
             "than 90 deg off its axis in the image's corners?"
         )
     views = len(points.counts)
     if views < 10:
-        warnings.append(f"only {views} pictures: 15 to 40 make the result firmer")
+        warnings.append(f"only {views} pictures: 15 to 40 give a more reliable result")
     if spread_deg < 20.0:
         warnings.append(
             f"the boards' normals differ by at most {spread_deg:.0f} deg: tilt the board by 20 to "
@@ -186,7 +186,7 @@ def calibrate(
     demand_different_views(adjusted)
     warnings = warnings_of(adjusted, points, normals_spread_deg(adjusted.estimate.rotations))
     if wrong:
-        warnings.insert(0, f"{wrong} points left out: they lie far from where the others say")
+        warnings.insert(0, f"{wrong} points excluded: they are far from their expected positions")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
     return Calibration(adjusted, points, names, outliers, lens, holdout, tuple(warnings))
 
@@ -214,7 +214,7 @@ def calibrate_freely(
 ) -> Calibration:
     """As `calibrate`, with scales independent of each other if the views determine their ratio.
 
-    Else it is that of the settings, and a warning says so.
+    Otherwise it is that of the settings, with a warning.
     """
     try:
         free = calibrate(views, board, size, replace(settings, aspect=None))
@@ -225,7 +225,7 @@ def calibrate_freely(
         return free
     fixed = calibrate(views, board, size, settings)
     warning = (
-        f"the pictures leave scaleY / scaleX open by {sigma:.2g}: it is taken to be "
+        f"the pictures leave scaleY / scaleX uncertain by {sigma:.2g}: it is assumed to be "
         f"{settings.aspect:g}; hold the board upright and across, and tilt it more"
     )
     return replace(fixed, warnings=(*fixed.warnings, warning))
@@ -249,7 +249,7 @@ def _without_wrong_points(
     settings: CalibrationSettings,
     radius_m: float,
 ) -> tuple[Points, int]:
-    """Leave out points that were found wrongly; the second result says how many."""
+    """Exclude points that were found wrongly; the second result is their number."""
     if not settings.robust:
         return points, 0
     seen = points.pixels
@@ -258,6 +258,6 @@ def _without_wrong_points(
         seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
     residuals = seen - project_estimate(estimate, points)[0]
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
-    # A picture with too few points left is unchanged: the robust loss deals with it.
+    # A picture with too few remaining points is unchanged: the robust loss handles it.
     right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
     return points.where(right), int(np.sum(~right))

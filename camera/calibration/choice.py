@@ -1,4 +1,4 @@
-"""Which coefficients of a lens are free: those that explain pictures that were held out."""
+"""Chooses the free coefficients of a lens by the error in held-out pictures."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ Fitted = Callable[[Estimate, Iterable[FreeLens]], Candidates]
 def choose_lens(
     start: Estimate, points: Points, settings: CalibrationSettings, radius_m: float
 ) -> tuple[FreeLens, Candidates]:
-    """Fit with more and more coefficients free, and choose.
+    """Fit with an increasing number of free coefficients, and choose.
 
-    Chosen are the fewest radial coefficients whose hold-out error is not worse than the best.
+    The choice is the fewest radial coefficients whose hold-out error is not worse than the best.
     Tangential terms are added if they lower that error by more than they would by chance and are
     significant; then the radial coefficients are chosen again. The polynomial replaces the rational
     function if, with the same tangential terms, it needs fewer coefficients for an error that is
@@ -62,7 +62,7 @@ def choose_lens(
     others = [FreeLens(0, chosen.tangential, count) for count in counts]
     polynomials = fitted(start, others)
     other = _fewest_needed(polynomials)
-    # Coefficients that the pictures do not need make the projection unsure where nothing was seen.
+    # Unnecessary coefficients make the projection uncertain where there are no points.
     worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
     if _is_lower(polynomials[other], tried[chosen], worth):
         chosen = other
@@ -87,7 +87,7 @@ def _chosen_of_a_kind(
 def _with_tangential(
     fitted: Fitted, start: Estimate, settings: CalibrationSettings, radial: Candidates
 ) -> tuple[FreeLens, Candidates]:
-    """Choose among radial lenses, and tangential terms where they are worth it."""
+    """Choose among radial lenses, and add tangential terms if they pay off."""
     chosen = _fewest_needed(radial)
     if settings.tangential is False:
         return chosen, radial

@@ -33,9 +33,9 @@ from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_
 from redetect.array_types import GreyImage
 from redetect.storage import __version__, demand_place, write_bytes
 
-#: How many pictures are looked through for the true size of a checkerboard, and how many agree.
+#: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.
 _COUNTED_PICTURES, _VOTES = 8, 2
-#: What is looked at first where a board is in no picture, by its kind.
+#: Advice if a board is in no picture, by its kind.
 _RIGHT = {
     "checkerboard": "--rows right? A board of 10 x 7 squares has 9 x 6 inner corners",
     "charuco": "--rows right, and the --dictionary?",
@@ -94,7 +94,7 @@ def perform(options: Calibrate) -> int:
 
 
 def report_text(options: Calibrate, calibration: Calibration) -> str:
-    """What the calibration was made from, and how well that fits, as JSON."""
+    """The inputs of the calibration, and its residuals, as JSON."""
     adjusted, points = calibration.adjusted, calibration.points
     rms = view_rms(adjusted.residuals, points).tolist()
     views = zip(calibration.names, points.counts.tolist(), rms, strict=True)
@@ -120,10 +120,10 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
 
 
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
-    """The board with as many corners as pictures show, where they contradict what is given.
+    """The board with the number of corners in the pictures, if that contradicts the given one.
 
-    A larger board contains the given one. A smaller one may be part of a board that is badly seen:
-    it counts if the given one is in none of the pictures that are looked through.
+    A larger board contains the given one. A smaller one may be part of a poorly visible board: it
+    counts if the given one is in none of the pictures examined.
     """
     given = max(board.columns, board.rows), min(board.columns, board.rows)
     votes: Counter[tuple[int, int]] = Counter()
@@ -144,7 +144,7 @@ def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     columns, rows = counted if board.columns >= board.rows else counted[::-1]
     print(
         f"the board has {columns} x {rows} inner corners, by {count} of the first {len(seen)} "
-        f"pictures: taken for that instead of {board.columns} x {board.rows}",
+        f"pictures: used instead of {board.columns} x {board.rows}",
         file=sys.stderr,
     )
     return replace(board, columns=columns, rows=rows)
@@ -203,8 +203,8 @@ def camera_of(calibration: Calibration) -> Camera:
         return with_covariance(camera, covariance)
     except CameraError as error:
         raise CalibrationError(
-            f"the calibration is no possible camera: {error}; take pictures out to the image's "
-            "corners, or fewer --coefficients"
+            f"the calibration is not a possible camera: {error}; take pictures that cover the "
+            "image's corners, or use fewer --coefficients"
         ) from None
 
 
@@ -234,9 +234,9 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     )
     for name, rms in calibration.outliers:
         lines.append(
-            f"left out: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)"
+            f"excluded: {name}, residuals of {rms:.2f} px (--keep-outliers keeps it)"
             if np.isfinite(rms)
-            else f"left out: {name}, where no pose of the board is seen as it was found"
+            else f"excluded: {name}, where no pose of the board explains its points"
         )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)

@@ -1,8 +1,7 @@
-"""Which pictures one camera explains, and which contradict them.
+"""Finds the pictures that one camera explains, and those that contradict them.
 
-A board that was found a square off, or another board, must neither end a calibration nor bend it:
-such pictures are left out of the fit, and taken in again where they agree with the others after
-all.
+A board that was found a square off, or another board, must neither abort a calibration nor bias it:
+such pictures are excluded from the fit, and included again if they agree with the others after all.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from redetect.array_types import BoolArray, FloatArray
 # A view contradicts the others by so many times their median residual: with one coefficient of the
 # lens, which leaves residuals of its own in the image's corners, and with all of them.
 _FAR_AT_FIRST, _FAR = 10.0, 3.0
-# Of a view's points the farthest off don't count for that: single ones are left out by themselves.
+# A view's farthest points are ignored for that, since single outliers are excluded separately.
 _COUNTED_SHARE = 0.95
 _ROUNDS = 3
 ALL_THE_SAME = (
@@ -37,7 +36,7 @@ _WIDE_SPREAD_DEG = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """A camera that was fitted to some views, and how well it explains each."""
+    """A camera that was fitted to some views, and its residuals in each."""
 
     fit: Adjusted  #: to those views
     estimate: Estimate  #: With the poses of all views
@@ -51,7 +50,7 @@ class Consensus:
 def find_consensus(
     points: Points, names: Sequence[str], settings: CalibrationSettings, radius_m: float
 ) -> Consensus:
-    """The camera that most views agree on, with all coefficients free that may be.
+    """The camera that most views agree on, with all allowed coefficients free.
 
     Takes the views' names, and the radius of circles (m), 0 for points.
 
@@ -95,7 +94,7 @@ def find_consensus(
 
 
 def _demand_most(agree: BoolArray, names: Sequence[str]) -> None:
-    """Refuse what at most half of the views agree on."""
+    """Raise an error if at most half of the views agree."""
     if 2 * agree.sum() <= len(agree):
         raise CalibrationError(
             f"no camera explains most of the pictures: {listed(names, ~agree)} contradict "
@@ -116,7 +115,7 @@ def _fitted(
     lens: FreeLens,
     radius_m: float,
 ) -> Consensus:
-    """Fit to the views that are used; of the others the poses alone."""
+    """Fit to the views that are used; for the others, fit only the poses."""
     views, others = np.flatnonzero(used), np.flatnonzero(~used)
     fit, _ = fit_points(estimate.of(views), points.of(views), settings, lens, radius_m)
     found = replace(estimate, intrinsics=fit.estimate.intrinsics).with_poses(views, fit.estimate)
@@ -149,7 +148,7 @@ def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> Float
 
 
 def demand_different_views(fit: Adjusted) -> None:
-    """Refuse views that do not separate focal length and distance."""
+    """Raise an error for views that do not separate focal length and distance."""
     spread_deg = normals_spread_deg(fit.estimate.rotations)
     variance = float(fit.covariance[0, 0])
     # In a singular problem rounding can make the variance zero or negative.

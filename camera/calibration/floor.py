@@ -1,7 +1,7 @@
-"""``camera floor``: where a calibrated camera is, from known places on the floor.
+"""``camera floor``: the pose of a calibrated camera from known points on the floor.
 
-The robot's axes are given by where the board lies: its middle at (X, Y) of the robot frame (X left,
-Y backward, Z up), its x axis turned from the robot's X axis.
+The board's placement defines the robot's axes: its middle is at (X, Y) of the robot frame (X left,
+Y backward, Z up), its x axis rotated from the robot's X axis.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import read_text
 from redetect.storage.messages import excerpt
 
-#: Columns of a file of floor points: pixel, and place in the robot frame (m).
+#: Columns of a file of floor points: pixel, and position in the robot frame (m).
 FLOOR_COLUMNS = ("u", "v", "x", "y")
 
 _FEWEST_POINTS = 4
@@ -60,7 +60,7 @@ def perform(options: Floor) -> int:
     placed = place_on_floor(camera, seen.pixels, seen.xy, lens, seen.radius_m)
     print(describe_pose(placed))
     if lens is None:
-        print("the lens's covariance is not in the .cam file: neither will the pose's be")
+        print("the .cam file has no covariance of the lens: that of the pose is not written")
     camera = placed_camera(camera, placed, lens)
     write_floor_pictures(options, camera)
     write_camera(camera, options.output, overwrite=options.force)
@@ -88,7 +88,7 @@ class FloorPose:
 
 
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
-    """(N, 3) places in the robot frame of a board's (N, 3) points.
+    """(N, 3) positions in the robot frame of a board's (N, 3) points.
 
     The board's middle lies at `origin_xy`; `yaw` is the angle from the robot's X axis to the
     board's x axis, counterclockwise seen from above (rad).
@@ -151,8 +151,8 @@ def place_on_floor(
         away = np.linalg.norm(fit.residuals, axis=1)
         u, v = pixels[np.argmax(away)].tolist()
         warnings.append(
-            f"an RMS residual of {fit.rms_px:.2f} px says that the points are not explained (the "
-            f"farthest, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all places right, "
+            f"an RMS residual of {fit.rms_px:.2f} px means that the points do not fit (the "
+            f"worst, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all points right, "
             "is the floor flat, and is it this camera's calibration?"
         )
     return FloorPose(
@@ -168,7 +168,7 @@ def place_on_floor(
 def placed_camera(
     camera: Camera, pose: FloorPose, intrinsics_covariance: FloatArray | None
 ) -> Camera:
-    """The camera at a pose, with the covariance of both where that of its lens is known."""
+    """The camera at a pose, with the covariance of both if that of its lens is known."""
     camera = with_pose(camera, pose.robot_from_camera)
     if intrinsics_covariance is None:
         return replace(camera, covariance=None)

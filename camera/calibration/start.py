@@ -1,4 +1,4 @@
-"""Where a calibration begins: poses of planes without a start, over a range of focal lengths."""
+"""Initial values of a calibration: poses of planes without a start, for many focal lengths."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
         if found is None:
             continue
         fit, seen = found
-        # Of all points, so that a focal length gains nothing by views that it doesn't see.
+        # Over all points, so that a focal length gains nothing from views it cannot explain.
         errors = np.full(few.pixels.size, np.inf)
         errors[: fit.residuals.size] = np.abs(fit.residuals).ravel()
         error = float(np.median(errors)), -len(seen)
@@ -52,9 +52,9 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
 
 
 def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estimate]:
-    """Both poses that each view of a plane leaves open, the likelier first, without a start.
+    """Both possible poses of each view of a plane, the more likely one first, without a start.
 
-    From afar a board and its mirror image in depth look almost alike (T. Collins, A. Bartoli,
+    From afar, a board and its mirror image in depth look almost alike (T. Collins, A. Bartoli,
     Infinitesimal plane-based pose estimation, IJCV 109, 2014; OpenCV's solver).
     """
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]

@@ -29,8 +29,8 @@ from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded, demand_place, write_bytes
 
-#: The models that each format has, the simplest first, and how many of their coefficients: some
-#: formats lack k3.
+#: The models of each format, the simplest first, and their number of coefficients: some formats
+#: lack k3.
 MODELS: dict[str, dict[Model, int]] = {
     "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
     "ros": {"radtan": 5, "rational": 8, "fisheye": 4},
@@ -60,7 +60,7 @@ def perform(options: Convert) -> int:
     )
     if not converted.deviation_px <= options.limit_px:
         raise ConversionError(
-            f"{options.target}: not written, for {converted.deviation_px:.3g} px is above "
+            f"{options.target}: not written, since {converted.deviation_px:.3g} px is above "
             f"--limit-px {options.limit_px:g}: choose another --model or format, or raise the limit"
         )
     if isinstance(camera, Camera) and not isinstance(source, Camera) and options.pose_from is None:
@@ -68,7 +68,7 @@ def perform(options: Convert) -> int:
             "no pose: sensor2World is the identity; give --pose-from, or let `camera floor` find it"
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
-        print("the pose stays behind: the format has none (--pose-from brings it back)")
+        print("the pose is dropped: the format has none (--pose-from restores it)")
     written = format_of(camera, to_format)
     write_bytes(options.target, written.encode(), overwrite=options.force)
     print(f"written: {options.target}")
@@ -164,9 +164,9 @@ def format_of(camera: AnyCamera, to_format: Format) -> str:
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
-    """Convert to a model of a format that holds the camera as it is, if there is one.
+    """Convert to a model of a format that represents the camera exactly, if there is one.
 
-    Else to the first one that is within the limit, or the nearest one.
+    Otherwise to the first one within the limit, or the closest one.
     """
     if to_format == "cam":
         pose = read_camera(options.pose_from) if options.pose_from is not None else None

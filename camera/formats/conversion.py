@@ -24,7 +24,7 @@ EXACT_PX = 1e-6
 _LAWSON_ROUNDS = 25
 _STEPS = 60
 _LAWSON_STEPS = 5
-# What parameters count as that cannot be or do not see all rays: no step leads there.
+# Cost of parameters that are impossible or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
 
 
@@ -37,7 +37,7 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID = (41, 31)
 _CHECK_GRID = (129, 97)
-# A largest deviation after least squares from which on a fuller model is tried.
+# Largest deviation after least squares above which a fuller model is tried.
 _NEAR_PX = 0.02
 
 
@@ -46,14 +46,14 @@ class Converted:
     """A converted camera."""
 
     camera: AnyCamera
-    # Largest distance, over the image, between where a pixel's ray is seen by the source and by the
-    # target (target's pixels).
+    # Largest distance, over the image, between the pixels of a ray in the source and in the target
+    # (target's pixels).
     deviation_px: float
     at: tuple[float, float]  # the target's pixel where it is largest
 
 
 class CameraFit(NamedTuple):
-    """A camera that is to see rays as near as possible to pixels, by its (P,) parameters."""
+    """A fit of a camera's (P,) parameters so that rays project close to given pixels."""
 
     pixels: FloatArray  # (N, 2)
     #: The (N, 2) pixels at which it sees the rays, and their (N, 2, P) derivatives.
@@ -199,7 +199,7 @@ def convert_to_foreign(
         camera = ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
         return _measured(camera, check)
 
-    # From few coefficients to all: so a fit does not start in a wrong valley.
+    # From few coefficients to all, so that a fit does not start near a wrong minimum.
     counts = sorted({min(count, number) for count in (1, 2, 4, 5, 6, 7, 8)})
     spans = [np.eye(len(start))[:, : 4 + count] for count in counts]
     return _nearest(CameraFit(pixels, project, possible, measured), start, spans)
@@ -210,8 +210,8 @@ def convert_to_camera(
 ) -> Converted:
     """Convert to the project's model, exactly or by a fit.
 
-    A polynomial and tangential terms without a denominator are copied. Else the rational part is
-    fitted beside the source's tangential terms and, where it comes not near, all of them and a
+    A polynomial and tangential terms without a denominator are copied. Otherwise the rational part
+    is fitted with the source's tangential terms and, if that is not close enough, all terms and a
     polynomial together.
 
     Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
@@ -256,7 +256,7 @@ def convert_to_camera(
     decentred = any(tangential)
     spans = [FreeLens(count).span(None) for count in range(6)]
     if decentred:
-        # Finally, the copied terms may compensate for what the radial part cannot follow.
+        # Finally, the copied terms may compensate for errors of the radial part.
         spans.append(FreeLens(5, tangential=True).span(None))
     fit = CameraFit(pixels, project, possible, measured)
     best = _nearest(fit, start, spans)

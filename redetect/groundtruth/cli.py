@@ -1,7 +1,6 @@
 """The command ``groundtruth``.
 
-Exit codes: 0 all went well; 1 the command could not be carried out, or gave no pose; 2 the command
-line was wrong; 130 it was interrupted.
+Exit codes: 0 success; 1 the command failed, or gave no pose; 2 wrong command line; 130 interrupted.
 """
 
 from __future__ import annotations

@@ -13,4 +13,4 @@ class GroundTruthError(OneLineError, ValueError):
 
 
 class GeometryError(OneLineError, ValueError):
-    """Observations from which no pose follows; it costs its frame only."""
+    """Observations that do not determine a pose; only their frame is affected."""

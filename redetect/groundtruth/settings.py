@@ -1,6 +1,6 @@
 """Settings of all estimations, for the command line and library callers.
 
-Nothing heavy is imported here: `--help` is quick.
+Imports nothing heavy, so that `--help` is quick.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ class PoseSettings(_Bounded):
     """Settings of the poses."""
 
     solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
-    # A marker in an image is left out, and listed, if its normalised error is larger than this
+    # A marker in an image is an outlier, and listed, if its normalised error is larger than this
     # and its residual larger than --outlier-px.
     outlier_sigma: Positive = 5.0
-    outlier_px: NotNegative = 1.0  # Root mean square residual of what may be left out (px).
+    outlier_px: NotNegative = 1.0  # Least root mean square residual of an outlier (px).
     # Standard deviation added to each corner's own covariance, for errors that a fit to the image
-    # does not include: the lens' calibration, the print (px).
+    # does not include: the lens calibration, the print (px).
     corner_floor_px: NotNegative = 0.01
-    # A second solution is ruled out only if the first is this many times likelier.
+    # A second solution is ruled out only if the first is this many times more likely.
     ambiguity_odds: Annotated[float, _ODDS] = 1000.0
     # Images whose times differ by at most this are used together (s).
     time_tolerance_s: NotNegative = 0.005
-    # Speed that the robot reaches, when neighbouring frames decide between solutions (m/s).
+    # Largest speed of the robot, if neighbouring frames decide between solutions (m/s).
     speed_m_s: Positive = 1.0
-    turn_deg_s: Positive = 90.0  # The same for its turning (deg/s).
-    # By how much the robot's height may differ between neighbouring frames (m).
+    turn_deg_s: Positive = 90.0  # The same for its turn rate (deg/s).
+    # Largest difference of the robot's height between neighbouring frames (m).
     heave_m: Positive = 0.03
     wobble_deg: Positive = 2.0  # The same for roll and pitch (deg).
 
@@ -73,12 +73,12 @@ class PoseSettings(_Bounded):
 class RigSettings(_Bounded):
     """Settings of the rig's estimation."""
 
-    # A marker belongs to the rig only if this many times, or images, show it with another and agree
+    # Least number of times, or images, that show a marker of the rig with another one and agree
     least_support: Annotated[int, whole(1)] = 3
     # A marker in an image is left out, and counted, if its normalised error is larger than this
     # and its residual larger than --outlier-px.
     outlier_sigma: NotNegative = 5.0
-    outlier_px: NotNegative = 1.0  # Root mean square residual of what may be left out (px).
+    outlier_px: NotNegative = 1.0  # Least root mean square residual of an outlier (px).
     # Standard deviation added to each corner's own covariance (px).
     corner_floor_px: NotNegative = 0.01
     # Images of different cameras whose times differ by at most this are used together (s).
@@ -95,55 +95,55 @@ class NetworkSettings(_Bounded):
     # A board in an image is left out, and counted, if its normalised error is larger than this and
     # its residual larger than --outlier-px.
     outlier_sigma: Positive = 10.0
-    outlier_px: Positive = 1.0  # Root mean square residual of what may be left out (px).
+    outlier_px: Positive = 1.0  # Least root mean square residual of an outlier (px).
 
 
 @dataclass(frozen=True)
 class AlignmentSettings(_Bounded):
     """Settings of the scanners' alignment."""
 
-    # Farthest that a reading may lie from what it is matched with at first (m).
+    # Initial gate for matching readings (m).
     gate_m: Positive = 0.5
-    keep: ShareAbove0 = 0.95  # Share of the matches that counts: the best.
+    keep: ShareAbove0 = 0.95  # Share of the matches that are used: the best.
 
 
 @dataclass(frozen=True)
 class LaserSettings(_Bounded):
     """Settings of laser tracking."""
 
-    gate_m: Positive = 0.2  # Farthest that a reading may lie from the robot's outline (m).
-    keep: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP counts: the best.
+    gate_m: Positive = 0.2  # Largest distance of a reading from the robot's outline (m).
+    keep: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP uses: the best.
 
-    # The ICP ends when its root mean square error changes by less, or after as many steps.
+    # The ICP ends when its root mean square error changes by less, or after this number of steps.
     threshold_m: ClassVar[float] = 1e-5
     most_steps: ClassVar[int] = 60
-    # Standard deviation of a reading's distance from the outline that does not depend on the
-    # scanner's noise: the outline is drawn to millimetres.
+    # Standard deviation of a reading's distance from the outline in addition to the scanner's
+    # noise: the outline is drawn to millimetres.
     floor_m: ClassVar[float] = 0.001
-    # Readings along a face, whose beam and normal have a smaller cosine, count as if it were this:
-    # their distances from the face are small whatever the pose.
+    # Lower bound of the cosine between beam and normal: readings along a face are close to it
+    # whatever the pose.
     least_slope: ClassVar[float] = 0.35
     # The final pose uses readings up to this many standard deviations off.
     gate_sigma: ClassVar[float] = 3.5
-    # A direction is undetermined if the pose's standard deviation along it is larger (a turn counts
-    # by what it does to the farthest corner).
+    # A direction is undetermined if the pose's standard deviation along it is larger (a turn is
+    # measured at the farthest corner).
     weak_sigma_m: ClassVar[float] = 0.03
-    # Readings that a pose needs, and that a robot needs which is found again.
+    # Least number of readings for a pose, and for finding the robot again.
     least_readings: ClassVar[int] = 8
     acquire_readings: ClassVar[int] = 16
-    # The robot is lost after so long without a pose; then it is searched this often.
+    # The robot is lost after this time without a pose, and then searched for at this interval.
     coast_s: ClassVar[float] = 0.25
     acquire_s: ClassVar[float] = 0.05
-    # Headings that the search begins from.
+    # Number of headings from which the search begins.
     headings: ClassVar[int] = 24
-    # New readings nearer to each other than this may be of one object.
+    # New readings closer together than this may belong to one object.
     link_m: ClassVar[float] = 0.3
-    # Share of the beams that should see the robot, or see something beside it, that must agree.
+    # Least share of agreeing beams among those that should see the robot, or see something beside.
     least_agreement: ClassVar[float] = 0.75
-    # The outline counts as symmetric if it is nowhere farther from itself when rotated.
+    # Tolerance of the outline's symmetry under rotation.
     symmetry_m: ClassVar[float] = 0.12
-    # The readings identify the front if the residuals differ by this many standard errors; else it
-    # is known after the robot has driven this much farther forward than backward.
+    # The readings identify the front if the residuals differ by this many standard errors;
+    # otherwise it is known after the robot has driven this much farther forward than backward.
     front_sigma: ClassVar[float] = 5.0
     forward_m: ClassVar[float] = 0.3
 
@@ -153,7 +153,7 @@ class SyncSettings(_Bounded):
     """Settings of the synchronisation of clocks."""
 
     largest_offset_s: Positive = 1.0  # Bound of the time offset, either way (s).
-    # Bound of the drift: the clocks' rates differ by at most this share.
+    # Bound of the drift, the relative difference of the clocks' rates.
     largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
     segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).
 
@@ -165,24 +165,23 @@ class SyncSettings(_Bounded):
 
 @dataclass(frozen=True)
 class FuseSettings(_Bounded):
-    """How odometry errs, and how far a measurement may be off."""
+    """Errors of odometry, and the gate of measurements."""
 
     # Standard deviation of odometry's distance per square root of a metre driven (m).
     distance_sigma: NotNegative = 0.02
-    # How far the robot slips sideways per square root of a metre driven (m). The lateral error by a
-    # wrong heading is not part of it.
+    # Standard deviation of lateral slip per square root of a metre driven (m), without the lateral
+    # error due to a wrong heading.
     lateral_sigma: NotNegative = 0.01
     # Standard deviation of odometry's heading per square root of a radian turned (rad).
     turn_sigma: NotNegative = 0.02
     turn_per_metre_sigma: NotNegative = 0.01  # The same per square root of a metre driven (rad).
-    # Scale these deviations (distance's, the sideways one, and both of the heading together) to
-    # maximise the likelihood of the measurements; they only begin the search then.
+    # Scale these deviations (distance, lateral slip, and both of the heading together) to maximise
+    # the likelihood of the measurements; they are only the start of the search then.
     learn_noise: bool = True
-    # Standard deviation, before anything was measured, of the share by which odometry's turns are
-    # too long or too short. Of this and the next two, terms that make no better predictions are
-    # left out.
+    # Prior standard deviation of the scale error of odometry's turns. Of this and the next two,
+    # terms that do not improve predictions are dropped.
     turn_scale_sigma: NotNegative = 0.03
-    turn_bias_per_metre_sigma: NotNegative = 0.01  # The same of its turn per metre driven (rad).
-    distance_scale_sigma: NotNegative = 0.03  # The same of the share of its ways.
-    # Share of right poses that pass the gate.
+    turn_bias_per_metre_sigma: NotNegative = 0.01  # The same for its turn per metre driven (rad).
+    distance_scale_sigma: NotNegative = 0.03  # The same for the scale error of its distances.
+    # Share of correct poses that pass the gate.
     gate_probability: Annotated[float, PROBABILITY] = 0.9999

@@ -1,7 +1,6 @@
 """The command ``slam``.
 
-Exit codes: 0 all went well; 1 the command could not be carried out; 2 the command line was wrong;
-130 it was interrupted, and wrote nothing.
+Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupted, without output.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Motion and measurement of a robot on the floor, with Jacobians, and the noise of its odometry.
+"""Motion and measurement models of a robot on the floor, with Jacobians, and odometry noise.
 
-A pose is (x, y, theta): the robot's origin in the map (m), and the turn of its axes against the
+A pose is (x, y, theta): the robot's origin in the map (m), and the rotation of its axes against the
 map's (rad, counter-clockwise). An odometry step (dx, dy, dphi) is the pose after a movement in the
 robot frame before it. Robot frame: X left, Y backward, so a bearing is atan2(x, -y): 0 forward,
-positive to the left. Everything is vectorised over leading axes. f and J1 to J6 are the report's.
+positive to the left. Everything is vectorised over leading axes. f and J1 to J6: see the report.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """Standard deviations of the steps of odometry that state none."""
+    """Standard deviations of odometry steps without a covariance."""
 
-    per_metre: NotNegative = 0.05  # of the way, as a share of it
-    per_radian: NotNegative = 0.05  # of the turn, as a share of it
-    turn_per_metre: NotNegative = 0.03  # of the turn by the way, radians per metre
-    least_m: Positive = 0.005  # of every step's way, metres
-    least_rad: Positive = 0.002  # of every step's turn, radians
+    per_metre: NotNegative = 0.05  # of the distance, relative to it
+    per_radian: NotNegative = 0.05  # of the turn, relative to it
+    turn_per_metre: NotNegative = 0.03  # of the turn due to the distance, radians per metre
+    least_m: Positive = 0.005  # lower bound for the distance, metres
+    least_rad: Positive = 0.002  # lower bound for the turn, radians
 
     def __post_init__(self) -> None:
         demand_fields(self, SlamError)
@@ -43,7 +43,7 @@ class OdometryNoise:
     def sentence(self) -> str:
         """Description of the assumed noise."""
         return (
-            f"{100.0 * self.per_metre:g} % of the way, {100.0 * self.per_radian:g} % of the turn "
+            f"{100.0 * self.per_metre:g} % of distance, {100.0 * self.per_radian:g} % of the turn "
             f"and {self.turn_per_metre:g} rad per metre, at least {self.least_m:g} m and "
             f"{self.least_rad:g} rad"
         )
@@ -61,7 +61,7 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
 
 
 def _with_heading(matrices: FloatArray) -> FloatArray:
-    """(..., 3, 3) of (..., 2, 2) by a pose's place, 1 by its heading."""
+    """(..., 3, 3) from (..., 2, 2) for a pose's position, with 1 for its heading."""
     whole = np.zeros((*matrices.shape[:-2], 3, 3))
     whole[..., :2, :2] = matrices
     whole[..., 2, 2] = 1.0
@@ -119,12 +119,12 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
     return np.concatenate([-by_disc, turned[..., None]], axis=-1), by_disc
 
 
-#: Of the camera above the floor (m).
+#: Typical height of the camera above the floor (m).
 CAMERA_HEIGHT_M = 1.5
 
 
 def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
-    """How a small tilt of the robot moves the places on the floor that a camera seems to see.
+    """Derivative of apparent floor positions by a small tilt of the robot.
 
     Takes `disc_xy` (n, 2); returns (n, 2, 2).
     """
@@ -147,7 +147,7 @@ def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLik
 def bearing_jacobians(
     pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `bearing_of_vertical` by the pose and by the line's place (chain rule).
+    """Jacobians of `bearing_of_vertical` by the pose and by the line's position (chain rule).
 
     Returns `by_pose` (..., 3), `by_line` (..., 2).
     """

@@ -1,4 +1,4 @@
-"""White Gaussian noise on a run's rows, which say so in their covariances: ``slam noise``."""
+"""``slam noise``: adds white Gaussian noise to a run's rows and their covariances."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
     """Rows of a landmark file with noise added.
 
     Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
-    comment at the head says what was added. Without noise the rows come out as they are.
+    comment at the head states what was added. Without noise the rows are unchanged.
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])
@@ -56,7 +56,7 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
 
 
 def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Record:
-    """A row with noise, as it is where its kind gets none."""
+    """A row with noise; unchanged if its kind gets none."""
     if isinstance(record, Step) and (noise.step_sigma or noise.turn_sigma):
         x, y, turn = rng.standard_normal(3).tolist()
         return replace(
@@ -85,10 +85,9 @@ def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Recor
 
 
 def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recording:
-    """A run whose landmark rows are noisier by a factor on their own standard deviations.
+    """A run with noise on its landmark rows, a factor times their own standard deviations.
 
-    Covariances become 1 + factor^2 times what they were; odometry stays. Everything random follows
-    from the seed.
+    Covariances are multiplied by 1 + factor^2; odometry stays. Noise is determined by the seed.
     """
     rng = np.random.default_rng([seed, 2])
     circles, lines = recording.circles, recording.lines

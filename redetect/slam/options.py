@@ -22,10 +22,10 @@ class RunFlags:
     lines: bool = False  # Use the vertical lines.
     # Name of the landmark files in the folder; by default map, else detected.
     stem: MaybeStr = None
-    # Calibration, if it is not the one in the run folder (lines and --calibrate need one).
+    # Calibration, if not the one in the run folder (lines and --calibrate need one).
     camera: MaybePath = None
     force: bool = False  # Replace existing files.
-    # Of the steps that state no covariance.
+    # Noise of steps without a covariance.
     odometry_noise: OdometryNoise = field(default_factory=OdometryNoise)
 
     @property
@@ -49,32 +49,32 @@ class RunsFlags(RunFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Map(RunsFlags):
-    """Least-squares map: all poses and landmarks of a run at once, or of several runs.
+    """Least-squares map: all poses and landmarks of a run, or of several runs, at once.
 
-    Of several, identifiers have to agree, and the map is in the frame of the first one's start.
+    Identifiers of several runs have to agree, and the map is in the frame of the first one's start.
 
     Example: slam map images/e --circles --lines -o /tmp/e-map
     """
 
-    # Estimate the camera's mounting (rotation, place, height) as well, by discs alone.
+    # Also estimate the camera's mounting (rotation, position, height), with discs only.
     calibrate: bool = False
-    # With --calibrate, whether its place over the floor is unknown, or only rotation and height.
+    # With --calibrate, whether its horizontal position is unknown, or only rotation and height.
     place: bool = True
-    # With --calibrate, where rows are compared with discs: `recorded`, as they were written, where
-    # their covariances belong; `corrected`, on the floor as the camera as mounted sees it, which
-    # finds the camera too low.
+    # With --calibrate, how rows are compared with discs: `recorded`, as they were written, which
+    # their covariances refer to; `corrected`, on the floor as the camera as mounted sees it, which
+    # biases the camera's height downwards.
     row_errors: Literal["corrected", "recorded"] = "recorded"
-    # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt takes the last steps
-    # (extra [slam]), of discs and plain least squares alone.
+    # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt does the last steps
+    # (extra [slam]), for discs and plain least squares only.
     solver: Literal["separable", "gtsam"] = "separable"
-    # `huber`, `cauchy` or `geman-mcclure` lets far-off rows pull less.
+    # Robust loss: `huber`, `cauchy` or `geman-mcclure` reduces the weight of outliers.
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
-    loss_scale: float = 3.0  # Standard deviations from which on they do.
+    loss_scale: float = 3.0  # Scale of the robust loss, standard deviations.
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     # Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
     # pictures; by default `slam` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False  # Show the pictures in windows as well.
+    interactive: bool = False  # Also show the pictures in windows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +84,11 @@ class Audit(RunFlags):
     Example: slam audit images/e -o /tmp/audited.circles
     """
 
-    calibrate: bool = False  # Estimate the camera's mounting as well.
-    # Squared error of a row, in units of its covariance, from which on it contradicts.
+    calibrate: bool = False  # Also estimate the camera's mounting.
+    # Squared error of a row, in units of its covariance, from which it contradicts the rest.
     gate: float = 100.0
-    # `mend`: rows get the identifier of the landmark that they show, -1 where none explains
-    # them; `drop`: their lines are left out.
+    # `mend`: rows get the identifier of the landmark that they show, -1 if none explains them;
+    # `drop`: their lines are removed.
     apply: Literal["mend", "drop"] = "mend"
     pictures: MaybePath = None  # Folder for pictures of what the rows show.
     images: MaybePath = None  # Folder of the run's images; by default that of the rows.
@@ -101,15 +101,15 @@ class Audit(RunFlags):
 class FilterFlags(RunFlags):
     """Options of both filters."""
 
-    # `known`: rows say by their IDs which landmark they show; `nearest` or `joint`: it is found
-    # out, by Mahalanobis distance of one row at a time or of a frame's rows together.
+    # `known`: rows are associated by their IDs; `nearest` or `joint`: by Mahalanobis distance, of
+    # one row at a time or of a frame's rows together.
     association: Literal["known", "nearest", "joint"] = "known"
-    # Share of right rows that pass the gate; with known association nothing is gated.
+    # Share of correct rows that pass the gate; not used with known association.
     gate_probability: float = 0.999
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     reference: MaybePath = None  # A path.csv to measure the distance from.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    interactive: bool = False  # Show the pictures in windows as well.
+    interactive: bool = False  # Also show the pictures in windows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +122,8 @@ class Localize(FilterFlags):
     map: Path  # The map (written by `slam map`).
     # Standard deviations of the pose at the start.
     start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # Nothing is known of the pose at the start: it is found by the discs of the first frames,
-    # whatever their identifiers. Without these, with `--association joint`.
+    # The pose at the start is unknown: it is estimated from the discs of the first frames, whatever
+    # their identifiers (global localisation). Needs `--association joint` without identifiers.
     lost: bool = False
     # Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
@@ -143,19 +143,19 @@ class Ekf(FilterFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Associate(RunsFlags):
-    """Find out which rows of a run, or of several, show the same landmark, and write those IDs.
+    """Find the rows of a run, or of several, that show the same landmark, and write their IDs.
 
-    Where the file has IDs of its own they are not used, but the result is scored against them.
+    IDs in the file are not used, but the result is scored against them.
 
     Example: slam associate images/e --method joint --map-level
     """
 
-    # Score again with noise added to the measurements (factors on their standard deviation).
+    # Repeat with noise added to the measurements (factors on their standard deviation).
     noise: tuple[float, ...] = ()
-    seed: int = 1  # Of that noise.
-    # The landmark file to write; by default associated.circles (or .lines) in the run folder. With
-    # both kinds two files, which differ in the suffix; of several runs found_1.circles,
-    # found_2.circles, ... for found.circles. The scores go into a .json beside.
+    seed: int = 1  # Seed of that noise.
+    # The landmark file to write; by default associated.circles (or .lines) in the run folder. Both
+    # kinds give two files, which differ in the suffix; several runs give found_1.circles,
+    # found_2.circles, ... for found.circles. The scores are written to a .json beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     # How a run is associated.
     settings: OmitArgPrefixes[AssociateSettings] = field(default_factory=AssociateSettings)
@@ -163,13 +163,13 @@ class Associate(RunsFlags):
 
 @dataclass(frozen=True)
 class Noise:
-    """Add white Gaussian noise to a run; its covariances are raised to match.
+    """Add white Gaussian noise to a run, and increase its covariances to match.
 
     Example: slam noise images/e --sigma 0.05 -o /tmp/noisy.circles
     """
 
     run: Positional[Path]  # Run folder, or a .circles, .lines or .txt file.
-    lines: bool = False  # Of a run folder take the .lines file instead of the .circles.
+    lines: bool = False  # In a run folder, use the .lines file instead of the .circles.
     # Name of the landmark file in the folder; by default map, else detected.
     stem: MaybeStr = None
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None  # The file to write.
@@ -184,14 +184,14 @@ class Export(RunFlags):
     Example: slam export images/e --to g2o -o /tmp/e.g2o
     """
 
-    # Run folder, or a .circles or .lines file; for --to tum a path.csv as well.
+    # Run folder, or a .circles or .lines file; for --to tum also a path.csv.
     run: Positional[Path]
     output: Annotated[Path, arg(aliases=["-o"])]  # The file to write; for csv a folder.
     # `g2o`: graph of poses, discs and their measurements; `tum`: a path as trajectory; `csv`:
     # odometry and measurements as tables for GTSAM or MRPT.
     to: Literal["g2o", "tum", "csv"] = "g2o"
-    # For --to tum, times of the frames, rows `prefix seconds`; by default a .times file beside the
-    # run that has them all; where there is none, t counts the steps.
+    # For --to tum, times of the frames, rows `prefix seconds`; by default a complete .times file
+    # beside the run; without one, t counts the steps.
     times: MaybePath = None
 
 
@@ -205,9 +205,9 @@ class Import:
     # A .g2o graph, a TUM trajectory, RobotN_Odometry.dat or Landmark_Groundtruth.dat of the UTIAS
     # data set (MRCLAM), or aa3_dr.mat of Victoria Park.
     file: Positional[Path]
-    # Of a graph the .circles file to write, or, with the suffix .csv, the path of its estimates; of
-    # a trajectory the path.csv; of a robot the .circles, or the .csv of its true path; of true
-    # landmarks the map.csv.
+    # The file to write: for a graph a .circles file, or, with the suffix .csv, the path of its
+    # estimates; for a trajectory a path.csv; for a robot a .circles file, or the .csv of its true
+    # path; for true landmarks a map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
     range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
     bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).

@@ -1,7 +1,7 @@
 """Pictures of maps and of errors along a path, as PNG files or in windows.
 
-Maps are drawn in the axes that they are in, X to the right and Y up, equally scaled. The same input
-gives the same bytes; a user's own matplotlib settings do not matter.
+Maps are drawn in their own axes, X to the right and Y up, with equal scales. The same input gives
+the same bytes; a user's own matplotlib settings have no effect.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
 _SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _ELLIPSE_POINTS = 40
-# Crops in a row, and their half width.
+# Number of crops in a row, and their half width.
 _CROPS_ABREAST, _CROP_PX = 8, 48.0
 # Largest number of discs that are labelled with their numbers.
 _MOST_NUMBERED = 40
 # Largest number of landmarks whose ellipses are drawn.
 _MOST_ELLIPSES = 700
-# How far beyond path and discs verticals are drawn.
+# Margin around path and discs within which verticals are drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 
 
@@ -99,7 +99,7 @@ def draw_map(
     path : Path2D
         The robot's path.
     before : (LandmarkMap, Path2D), optional
-        The same before loops were closed: drawn in a panel of its own, to the same scale.
+        The same before loops were closed: drawn in a separate panel, to the same scale.
     reference : Path2D, optional
         The true path, or another to compare with; dashed.
     title : str
@@ -214,7 +214,7 @@ def _extent(
     margin = max(0.05 * span, 0.3)
     if any(len(some.lines) for some, _ in drawn):
         margin = min(_MARGIN_M, _MARGIN_SHARE * span + 1.0)
-    # A straight drive has next to no width, but shall have a picture.
+    # A straight drive has hardly any width, but needs a picture, too.
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + margin
     half = np.maximum(half, 0.2 * float(half.max()))
     return middle - half, middle + half
@@ -275,7 +275,7 @@ def _draw_landmarks(
     shown = _inside(some.xy, low, high)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
-    # Where there are hundreds of landmarks, small dots alone show walls.
+    # With hundreds of landmarks, only small dots show walls.
     size = 4.0 if len(some) <= 100 else 2.0
     axes.plot(
         some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
@@ -295,7 +295,7 @@ def _draw_landmarks(
 
 
 class Crop(NamedTuple):
-    """A part of an image: its file, the pixel (u, v) in the middle, and what it is called."""
+    """A part of an image: its file, the pixel (u, v) in the middle, and its caption."""
 
     file: Path
     pixel: tuple[float, float]
@@ -303,7 +303,7 @@ class Crop(NamedTuple):
 
 
 def picture_of_frame(folder: Path, prefix: str) -> Path | None:
-    """The image of a frame in a folder or its subfolder ``images``; None where there is none."""
+    """The image of a frame in a folder or its subfolder ``images``; None if there is none."""
     for place in (folder, folder / "images"):
         for name in (prefix, *(f"{prefix}{suffix}" for suffix in sorted(PICTURES))):
             if Path(name).suffix.lower() in PICTURES and (place / name).is_file():

@@ -25,18 +25,18 @@ from redetect.slam.models import OdometryNoise
 
 UNKNOWN_ID = -1
 
-#: The noise of odometry that states none.
+#: The noise of odometry without covariances.
 ASSUMED = OdometryNoise()
 
-#: Beyond these standard deviations a step gives no information about the robot's motion.
+#: Steps with larger standard deviations give no information on the robot's motion: they are lost.
 MOST_STEP_SIGMA_M = 100.0
 MOST_STEP_SIGMA_RAD = float(np.pi)
-#: Those of the step from one run to another.
+#: Standard deviations of the step from one run to another.
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
-# Where in a STEP row the numbers of its covariance are.
+# Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
 
@@ -47,7 +47,7 @@ class CircleRows:
     frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
     xy: FloatArray  # (n, 2): centres in the robot frame (m)
     covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
-    # (n,): -1 where unknown, as are all below 0; of a row with several the first that is known.
+    # (n,): -1 if unknown, as are all below 0; the first known one of a row with several.
     ids: IntArray
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class CircleRows:
 
     @property
     def identified(self) -> BoolArray:
-        """(n,) which rows say what disc they show."""
+        """(n,) mask of rows with an identifier."""
         return np.asarray(self.ids != UNKNOWN_ID)
 
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
@@ -83,7 +83,7 @@ class LineRows:
     frame: IntArray  # (n,): of each row, ascending from 0
     bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
     sigma_rad: FloatArray  # (n,): its standard deviation, above 0
-    # All lines that each row shows (joined rows have several); empty where unknown.
+    # All lines of each row (joined rows have several); empty if unknown.
     ids: tuple[tuple[int, ...], ...]
 
     def __len__(self) -> int:
@@ -91,7 +91,7 @@ class LineRows:
 
     @property
     def identified(self) -> BoolArray:
-        """(n,) which rows say what lines they show."""
+        """(n,) mask of rows with identifiers."""
         return np.array([len(ids) > 0 for ids in self.ids], dtype=np.bool_)
 
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> LineRows:
@@ -124,14 +124,14 @@ class Recording:
     step_covariance: FloatArray  # (N, 3, 3): positive definite
     circles: CircleRows
     lines: LineRows  # none if they were not requested
-    unstated_steps: int = 0  # steps whose covariance their source does not state: it is assumed
+    unstated_steps: int = 0  # number of steps with an assumed covariance
 
     def __len__(self) -> int:
         return len(self.steps)
 
     @property
     def lost(self) -> IntArray:
-        """Steps whose odometry says nothing of the robot's motion."""
+        """Steps whose odometry gives no information on the robot's motion."""
         way = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
         turn = self.step_covariance[:, 2, 2]
         return np.flatnonzero((way > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
@@ -151,7 +151,7 @@ class Recording:
 
 
 def first_poses(runs: Sequence[Recording]) -> IntArray:
-    """(k + 1,) where in the path of `joined` runs each one's begins, and the number of poses."""
+    """(k + 1,) index in the path of `joined` runs at which each begins, and the number of poses."""
     return np.cumsum([0, *(len(run) + 1 for run in runs)])
 
 
@@ -165,7 +165,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
     starts = first_poses(runs)
     lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
     circles, lines = [run.circles for run in runs], [run.lines for run in runs]
-    # The first run's start is no step.
+    # The first run's start is not a step.
     return Recording(
         tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
@@ -189,9 +189,9 @@ def joined(runs: Sequence[Recording]) -> Recording:
 def landmark_files(
     run: Path, *, circles: bool = True, lines: bool = False, stem: str | None = None
 ) -> list[Path]:
-    """The landmark files of a run folder, of the kinds that are wanted; of a file, itself.
+    """The landmark files of a run folder, of the requested kinds; for a file, itself.
 
-    They are called `stem`, by default map, or else detected.
+    Their name is `stem`, by default map, or else detected.
     """
     if not run.is_dir():
         _demand_landmarks(run)
@@ -207,14 +207,14 @@ def landmark_files(
             expected = " or ".join(path.name for path in candidates)
             raise SlamError(
                 f"{run}: no landmarks: expected {expected} in it: `detect {kind}` writes "
-                f"detected.{kind}, --stem says how another file is called"
+                f"detected.{kind}, --stem names another file"
             )
         files.append(found)
     return files
 
 
 def _demand_landmarks(path: Path) -> None:
-    """Refuse what is named as a run, and can't be one."""
+    """Raise `SlamError` for a path that cannot be a run."""
     expected = "expected a run folder, or a .circles or .lines file"
     if not path.exists():
         raise SlamError(f"{path}: no such landmark file or folder: {expected}")
@@ -242,11 +242,11 @@ def read_recording(
     run : path
         A run folder, or a single ``.circles`` or ``.lines`` file.
     circles, lines : bool
-        Which landmarks to read from a folder. A file's own rows are all read.
+        Which landmarks to read from a folder. All rows of a single file are read.
     stem : str, optional
         Name of the files in the folder without suffix; see `landmark_files`.
     noise : OdometryNoise
-        Of the steps that state no covariance.
+        Noise of steps without a covariance.
 
     Raises
     ------
@@ -275,7 +275,7 @@ def recording_of_frames(
     if not np.any(numbers):
         raise SlamError(
             f"{name}: no odometry: all {len(steps)} steps and their covariances are 0; expected "
-            "the robot's movements: `detect` takes them along, --odometry says where from"
+            "the robot's movements: `detect` includes them, from the source given by --odometry"
         )
     unstated = ~np.any(covariance, axis=(1, 2))
     covariance[unstated] = noise.covariance(numbers[unstated, :3])
@@ -295,7 +295,7 @@ def recording_of_frames(
 
 
 def frames_of_discs(recording: Recording) -> list[Frame]:
-    """Steps and rows of discs as frames, of which `recording_of_frames` gathers them again.
+    """Steps and rows of discs as frames, the inverse of `recording_of_frames`.
 
     The rows' quality is 1.
     """

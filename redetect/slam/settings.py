@@ -26,19 +26,19 @@ class AssociateSettings:
     # `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
     # frame's rows (JCBB).
     method: Method = "joint"
-    # Then search loops by fitting local maps of landmarks to each other.
+    # Then close loops by matching local maps of landmarks.
     map_level: bool = True
-    gate_probability: Annotated[float, PROBABILITY] = 0.999  # Share of right rows that pass.
+    gate_probability: Annotated[float, PROBABILITY] = 0.999  # Share of correct rows that pass.
     # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
-    # by more than the file says.
+    # by more than the file states.
     sigma_scale: Positive = 1.4
     # Standard deviation of the robot's sway about both axes of the floor, which moves all discs of
     # a frame together (degrees). Bearings are compensated for tilt.
     tilt_sigma_deg: Annotated[float, from_to(0.0, 45.0)] = 0.2
-    # Share of a disc's right rows that keep its ID at the map level, by their covariances as the
-    # file states them; rows farther from its place in the map get -1.
+    # Share of a disc's correct rows that keep its ID at the map level, given the covariances in the
+    # file; rows farther from its position in the map get -1.
     kept_probability: Annotated[float, PROBABILITY] = 0.99
-    # Discs of fewer such rows are taken for clutter: their rows get -1.
+    # Discs with fewer such rows count as clutter: their rows get -1.
     fewest_rows: Annotated[int, whole(1)] = 3
 
     def __post_init__(self) -> None:
@@ -59,8 +59,7 @@ class AddedNoise:
     bearing_sigma: NotNegative = 0.0
     step_sigma: NotNegative = 0.0  # Added to dx and dy of each step (m).
     turn_sigma: NotNegative = 0.0  # Added to dphi of each step (rad).
-    # Everything random follows from it. The files of discs and of lines of one run get the same
-    # odometry.
+    # Seed of all random numbers. The files of discs and of lines of a run get the same odometry.
     seed: Annotated[int, whole(0)] = 1
 
     def __post_init__(self) -> None:

@@ -43,7 +43,7 @@ def test_pictures_that_do_not_tell_it_get_square_pixels() -> None:
     found = calibrated(1.0, 4, 6, noise_px=0.9)
 
     assert aspect_of(found).value == pytest.approx(1.0, abs=1e-9)
-    assert any("scaleY / scaleX open" in warning for warning in found.warnings)
+    assert any("scaleY / scaleX uncertain" in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(10, 7), (8, 5), (6, 9)])

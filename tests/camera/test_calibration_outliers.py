@@ -92,7 +92,7 @@ def test_a_picture_stays_for_all_but_a_point_that_is_wrong() -> None:
         view.pixels[view.indices[9]] += (5.0, -4.0)
     found = calibrate(views, BOARD, (640, 480), SETTINGS)
     assert found.outliers == ()
-    assert found.warnings[0].startswith("6 points left out")
+    assert found.warnings[0].startswith("6 points excluded")
     assert_true(found)
 
 
@@ -103,7 +103,7 @@ def test_a_picture_without_a_residual_is_reported() -> None:
         found = calibrate(views, BOARD, (640, 480), settings)
         assert found.outliers == (("04.png", np.inf),)
         assert_true(found)
-    assert "left out: 04.png, where no pose" in describe(found, camera_of(found))
+    assert "excluded: 04.png, where no pose" in describe(found, camera_of(found))
 
 
 def test_pictures_that_contradict_each_other_are_named() -> None:
@@ -145,8 +145,8 @@ def test_another_board_among_the_photographs_is_named(
     command += ["--coefficients", "2", "--tangential", "off", "--polynomial", "off"]
     assert main([*command, "-o", str(output)]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("left out: ") == 1
-    assert "left out: other.png, residuals of" in printed
+    assert printed.count("excluded: ") == 1
+    assert "excluded: other.png, residuals of" in printed
     found = read_camera(output)
     covariance = covariance_of(found)
     assert covariance is not None

@@ -60,7 +60,7 @@ def test_without_discs_the_height_stays() -> None:
 
     assert found is not None
     assert math.isnan(found.raised_m)
-    assert "left as calibrated" in found.sentences()[1]
+    assert "height is unchanged" in found.sentences()[1]
 
 
 def test_without_verticals_there_is_no_mounting() -> None:

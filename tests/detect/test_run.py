@@ -269,4 +269,4 @@ def test_truncated_image(
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     message = refusal(path, published_camera)
-    assert "cut off" in message or "cannot be decoded" in message
+    assert "truncated" in message or "cannot be decoded" in message

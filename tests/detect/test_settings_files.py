@@ -65,7 +65,7 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("nonsense", "no JSON"),
+        ("nonsense", "not JSON"),
         ("[]", 'no "settings"'),
         ('{"settings": 3}', 'no "settings"'),
         ('{"settings": {"circles": 3}}', "names and values"),

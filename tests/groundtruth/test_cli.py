@@ -182,7 +182,7 @@ def test_nothing_to_work_on_is_refused(tmp_path: Path, capsys: Captured) -> None
     network = json.loads((session / "network.json").read_text())
     del network["cameras"]["b"], network["covariance"]
     (session / "network.json").write_text(json.dumps(network))
-    refused(["poses", str(session)], "b: is no camera of the network", capsys)
+    refused(["poses", str(session)], "b: is not a camera of the network", capsys)
 
 
 def test_a_rig_that_nobody_saw_gives_no_poses(tmp_path: Path, capsys: Captured) -> None:

@@ -112,7 +112,7 @@ def test_from_the_files_to_the_map(
     assert detect(["all", *arguments, "-o", str(run)]) == 0
     assert slam(["associate", str(run), "-o", found]) == 0
     unstated = 1 if recorded is bag else FRAMES  # before the first image there is no movement
-    assert f"{unstated} of {FRAMES} steps state no covariance: taken for 5 % of the way" in (
+    assert f"{unstated} of {FRAMES} steps have no covariance: assumed 5 % of distance" in (
         capsys.readouterr().err
     )
     assert slam(["map", found, *start, "-o", str(tmp_path / "map")]) == 0
@@ -126,7 +126,7 @@ def test_from_the_files_to_the_map(
 
     for form, name in (("g2o", "drive.g2o"), ("csv", "tables")):
         assert slam(["export", found, "--to", form, "-o", str(tmp_path / name)]) == 0
-    assert capsys.readouterr().err.count("steps state no covariance") == 5
+    assert capsys.readouterr().err.count("steps have no covariance") == 5
     times = ["--times", str(run / "detected.times"), "-o", str(tmp_path / "map.tum")]
     assert slam(["export", str(tmp_path / "map" / "path.csv"), "--to", "tum", *times]) == 0
     exported = np.loadtxt(tmp_path / "map.tum")

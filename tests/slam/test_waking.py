@@ -100,7 +100,7 @@ def test_a_run_is_localised_from_an_unknown_start(
     part.write_text(head + "".join(f"STEP {step}\n" for step in rest))
     where = ["--map", str(tmp_path / "map" / "map.csv"), "--association", "joint"]
     assert main(["localize", str(part), *where, "--lost", "-o", str(tmp_path / "out")]) == 0
-    assert "woke up at" in capsys.readouterr().out
+    assert "located at" in capsys.readouterr().out
     found = read_path(tmp_path / "out" / "path.csv").poses[1:]
     true = read_path(tmp_path / "map" / "path.csv").poses[26:]
     off = np.hypot(*(found[:, :2] - true[:, :2]).T)

@@ -72,7 +72,7 @@ def perform(options: Fuse) -> int:
     )
     if fusion.localisation is not None:
         print(
-            f"{options.odometry} is taken for a localisation: its errors are stationary, of "
+            f"{options.odometry} is treated as a localisation: its errors are stationary, of "
             f"{1e3 * fusion.localisation.position_sigma:.0f} mm in x and y and "
             f"{np.degrees(fusion.localisation.heading_sigma):.2f} degrees"
         )
@@ -88,8 +88,8 @@ def perform(options: Fuse) -> int:
         begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
         print(
             f"warning: {options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
-            f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: which way the robot went "
-            "is not known there, and covariances are raised",
+            f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: the robot's path there is "
+            "unknown, and covariances are increased",
             file=sys.stderr,
         )
     return 0

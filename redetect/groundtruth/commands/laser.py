@@ -1,4 +1,4 @@
-"""The command ``groundtruth laser``: a session's scans in, poses and an account of each set out."""
+"""The command ``groundtruth laser``: a session's scans in, poses and a report on each set out."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_bytes
 
-#: A set is disturbed by this many readings that hide the robot or are of objects beside it.
+#: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
 _DISTURBED = 3
 
 
@@ -69,7 +69,7 @@ def perform(options: Laser) -> int:
                 f"warning: scanner {scanner['name']} does not fit the others: its readings suggest "
                 f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
                 f"{np.degrees(shift[2]):.2f} deg; "
-                + ("it was left out" if scanner["left_out"] else "it was used all the same"),
+                + ("it was excluded" if scanner["left_out"] else "it was used nevertheless"),
                 file=sys.stderr,
             )
     return 0 if len(poses) else 1
@@ -100,7 +100,7 @@ def account_lines(track: LaserTrack) -> list[str]:
 def describe(
     track: LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
 ) -> dict[str, Any]:
-    """Sets by status, visits and how their front was found, and what residuals say of scanners."""
+    """Sets by status, visits and how their front was found, and the residuals of scanners."""
     segments = []
     for segment, front in sorted(track.fronts.items()):
         times = track.times_s[track.segment == segment]

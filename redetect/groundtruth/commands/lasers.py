@@ -83,21 +83,21 @@ def perform(options: Lasers) -> int:
         )
     for name in far_off:
         print(
-            f"warning: scanner {name}: was measured wrong, or the map shows another place like it",
+            f"warning: scanner {name}: was measured wrong, or another place of the map is similar",
             file=sys.stderr,
         )
     for name in alignment.undetermined:
-        print(f"warning: scanner {name}: the map leaves a direction open", file=sys.stderr)
+        print(f"warning: scanner {name}: a direction is not determined", file=sys.stderr)
     for name in alignment.inconsistent:
         print(
-            f"warning: scanner {name}: its place on the map is not that among the other scanners",
+            f"warning: scanner {name}: its pose on the map disagrees with the other scanners",
             file=sys.stderr,
         )
     return 0
 
 
 def _sigmas(before: Scanner, after: Scanner) -> float:
-    """How far a scanner is from where it was measured, in the measurement's standard deviations."""
+    """Distance of a scanner from its measured pose, in the measurement's standard deviations."""
     shift = pose_differences(after.pose, before.pose)
     covariance = before.covariance + after.covariance
     if not np.any(before.covariance):

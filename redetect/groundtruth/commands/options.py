@@ -22,14 +22,14 @@ from redetect.storage.bounds import MaybeInt, MaybePath
 
 @dataclass(frozen=True)
 class Rig:
-    """Estimate where the markers sit on the robot, from images that show several of them.
+    """Estimate the poses of the markers on the robot, from images that show several of them.
 
     Example: groundtruth rig calibration/rig/* --width-m 0.2 --robot known.json -o rig.json
     """
 
     runs: Positional[tuple[Path, ...]]  # Run folders with detected.markers and a calibration.
     width_m: float  # Width of the markers' black squares (m).
-    # Calibration of the cameras to each other: then images of one time are used together.
+    # Network file with the cameras' relative poses: images taken at one time are used together.
     network: MaybePath = None
     # The marker whose frame is the robot's; by default the one seen best.
     reference: MaybeInt = None
@@ -42,13 +42,13 @@ class Rig:
 
 @dataclass(frozen=True)
 class Network:
-    """Estimate where the cameras are in the world, from images of checkerboards.
+    """Estimate the poses of the cameras in the world, from images of checkerboards.
 
     Example: groundtruth network calibration/network -o network.json
     """
 
     boards: Positional[Path]  # A boards.json, or its folder.
-    # The network file to write. It names the calibrations relative to its own folder.
+    # The network file to write; its paths of calibrations are relative to its folder.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("network.json")
     force: bool = False  # Replace an existing file.
     settings: OmitArgPrefixes[NetworkSettings] = field(default_factory=NetworkSettings)
@@ -56,48 +56,48 @@ class Network:
 
 @dataclass(frozen=True)
 class Poses:
-    """Work out the robot's poses from the markers found in the images of one or several cameras.
+    """Compute the robot's poses from the markers found in the images of one or several cameras.
 
     Example: groundtruth poses SESSION -o poses.csv --report report.jsonl
     """
 
-    # A folder with a run folder per camera, by the names of the network's cameras.
+    # A folder with a run folder per camera, named as the cameras in the network.
     session: Positional[Path]
-    rig: MaybePath = None  # Where the markers are on the robot; by default rig.json in the session.
-    # Where the cameras are in the world; by default network.json in the session.
+    rig: MaybePath = None  # Markers' poses on the robot; by default rig.json in the session.
+    # Cameras' poses in the world; by default network.json in the session.
     network: MaybePath = None
     # The file of poses to write (t, x, y, theta and 9 of covariance); by default poses.csv in the
-    # session. Settings and version go into a .json beside it.
+    # session. Settings and version are written to a .json beside it.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
-    tum: MaybePath = None  # Write the poses in space as a TUM trajectory as well.
-    report: MaybePath = None  # Write an account of every time as lines of JSON.
+    tum: MaybePath = None  # Also write the poses in space as a TUM trajectory.
+    report: MaybePath = None  # Write a report on every time as lines of JSON.
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[PoseSettings] = field(default_factory=PoseSettings)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Hold poses against the truth: errors, and whether the covariances are right.
+    """Compare poses with the truth: errors, and consistency of the covariances.
 
-    Errors are absolute (ATE) and, with --relations or --rpe-step, relative as well (RPE).
+    Errors are absolute (ATE) and, with --relations or --rpe-step, also relative (RPE).
 
     Example: groundtruth score poses.csv truth.csv
     """
 
     poses: Positional[Path]  # Poses (t, x, y, theta, and perhaps 9 of covariance).
-    truth: Positional[Path]  # The same of the truth.
+    truth: Positional[Path]  # The same for the truth.
     # Which of the two is interpolated at the other's times.
     interpolate: Literal["truth", "poses"] = "truth"
     largest_gap_s: float = 0.5  # Nothing is interpolated across longer gaps (s).
-    # Move the poses rigidly onto the truth first, for solutions with a world of their own.
+    # Align the poses rigidly with the truth first, for solutions with a world of their own.
     align: bool = False
-    # Relations between two times (t_i, t_j, x, y, z, roll, pitch, yaw): the poses are held against
-    # these too.
+    # Relations between two times (t_i, t_j, x, y, z, roll, pitch, yaw): the poses are also compared
+    # with these.
     relations: MaybePath = None
-    rpe_step: MaybeInt = None  # Relative errors are between poses this many compared poses apart.
-    # Such steps that take longer, as across a gap, do not count (s).
+    rpe_step: MaybeInt = None  # Number of compared poses between the poses of a relative error.
+    # Steps that take longer than this, as across a gap, are ignored (s).
     rpe_longest_s: float = float("inf")
-    json: MaybePath = None  # Write the figures as JSON; -: to standard output, alone.
+    json: MaybePath = None  # Write the figures as JSON; -: to standard output only.
     force: bool = False  # Replace an existing file.
 
 
@@ -128,9 +128,9 @@ class Laser:
     session: Positional[Path]  # Folder with robot.json, the scans, and the scans of the empty area.
     # Poses of the fixed scanners; by default aligned.json in the session, else scanners.json.
     scanners: MaybePath = None
-    average: int = 6  # Sets of scans that each written pose rests on; no set is used twice.
-    # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. An
-    # account of every set of scans goes into a .jsonl, settings and version into a .json beside it.
+    average: int = 6  # Number of sets of scans per written pose; no set is used twice.
+    # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. A
+    # report on every set of scans is written to a .jsonl, settings and version to a .json beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[LaserSettings] = field(default_factory=LaserSettings)
@@ -162,15 +162,15 @@ class Fuse:
     odometry: Positional[Path]  # The robot's own poses (t, x, y, theta).
     laser: MaybePath = None  # Ground truth from the laser (t, x, y, theta, 9 of covariance).
     camera: MaybePath = None  # Ground truth from the markers, in the same columns.
-    # Output of `groundtruth sync`; without it all clocks are assumed to be one.
+    # Output of `groundtruth sync`; without it, all clocks are assumed to be the same.
     clock: MaybePath = None
-    # Leave each segment of the ground truth between two others out as well, predict it, and print
-    # how far off the prediction is (pauses of more than 5 s begin another segment).
+    # Also cross-validate: leave out each segment of the ground truth between two others, predict
+    # it, and print the errors (pauses of more than 5 s begin another segment).
     leave_out: bool = False
-    # Write the poses of the filter alone, each from what was measured until then, to this file.
+    # Also write the poses of the forward filter alone, from measurements until then, to this file.
     filtered: MaybePath = None
-    # The file to write (t, x, y, theta and 9 of covariance). What was rejected, settings and
-    # version go into a .json beside it.
+    # The file to write (t, x, y, theta and 9 of covariance). Rejected measurements, settings and
+    # version are written to a .json beside it.
     output: Annotated[Path, arg(aliases=["-o"])] = Path("fused.csv")
     force: bool = False  # Replace existing files.
     settings: OmitArgPrefixes[FuseSettings] = field(default_factory=FuseSettings)
@@ -178,13 +178,13 @@ class Fuse:
 
 @dataclass(frozen=True)
 class Validate:
-    """Hold a ground truth against reference poses surveyed by distances and on-board scans.
+    """Compare a ground truth with reference poses surveyed by distances and on-board scans.
 
     Example: groundtruth validate SESSION fused.csv -o validation
     """
 
-    # Folder with fiducials.json, distances.csv, robot.json and the building; with on-board scans,
-    # they refine the reference poses.
+    # Folder with fiducials.json, distances.csv, robot.json and the building; on-board scans in it
+    # refine the reference poses.
     session: Positional[Path]
     poses: Positional[Path]  # The ground truth (t, x, y, theta, and perhaps 9 of covariance).
     clock: MaybePath = None  # Output of `groundtruth sync`, for the on-board scans.
@@ -198,15 +198,15 @@ class Validate:
 
 @dataclass(frozen=True)
 class Report:
-    """One page with map, path, covariance ellipses and errors over time, as one HTML file.
+    """Write an HTML page with map, path, covariance ellipses and errors over time.
 
     Example: groundtruth report SESSION --truth truth.csv -o report.html
     """
 
-    # Folder with the building and the results: laser.csv, camera.csv, fused.csv, clock.json and
-    # validation, as far as they are there.
+    # Folder with the building and those of the results laser.csv, camera.csv, fused.csv, clock.json
+    # and validation that exist.
     session: Positional[Path]
-    # True or reference poses (t, x, y, theta); by default truth.csv in the session, if there.
+    # True or reference poses (t, x, y, theta); by default truth.csv in the session, if it exists.
     truth: MaybePath = None
     # The page to write; by default report.html in the session.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

@@ -47,10 +47,10 @@ def perform(command: Poses) -> int:
         + ", ".join(f"{number} {status}" for status, number in track.counts.items() if number)
     )
     if track.unknown_markers:
-        print(f"{track.unknown_markers} markers found are not on the rig: left out")
+        print(f"{track.unknown_markers} markers found are not on the rig: ignored")
     left_out = sum(int((~t.estimate.views).sum()) for t in track.times if t.pose and t.estimate)
     if left_out:
-        print(f"{left_out} markers do not fit the others of their time: left out")
+        print(f"{left_out} markers disagree with the others at their time: ignored")
     if command.report is not None:
         lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
         write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
@@ -79,13 +79,13 @@ def perform(command: Poses) -> int:
 
 
 def read_all_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
-    """The markers found in all runs, whose folders' names are the cameras'."""
+    """The markers found in all runs, whose folders have the names of cameras."""
     frames = []
     for run in runs:
         name = run.resolve().name
         if name not in network.names:
             raise GroundTruthError(
-                f"{run}: is no camera of the network: expected one of {', '.join(network.names)}"
+                f"{run}: is not a camera of the network: expected one of {', '.join(network.names)}"
             )
         frames += read_marker_frames(run, network.names.index(name))
     return frames

@@ -1,4 +1,4 @@
-"""``groundtruth sync``: files and the printed account round the synchronisation of clocks."""
+"""``groundtruth sync``: files and printed results of the synchronisation of clocks."""
 
 from __future__ import annotations
 
@@ -54,10 +54,9 @@ def compare_with_ptpd(
     """Compare the clocks estimated from headings with ptpd's reports, which are on the robot's
     clock.
 
-    Reports, how many of them lie in a segment that is determined, the root mean square of the
-    difference between their offsets and the model's there (s), the mean drift of both, and by how
-    much ptpd's offsets leave the best straight line through them (s). None where nothing can be
-    said.
+    Returns the number of reports, and of those in determined segments, the root mean square
+    difference between their offsets and the model's (s), the mean drift of both, and the residual
+    of ptpd's offsets about the best straight line (s). None if undefined.
     """
     timed = np.isfinite(log.times_s)
     times, offsets = log.times_s[timed], log.offset_s[timed]

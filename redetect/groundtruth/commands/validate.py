@@ -222,13 +222,13 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
         try:
             found = find_scans(session, scanner.name)
         except GroundTruthError as error:
-            print(f"warning: {error}: its scans do not refine", file=sys.stderr)
+            print(f"warning: {error}: its scans are not used", file=sys.stderr)
             continue
-        # A clock that was set makes times step back; the poses' own times are looked up.
+        # If a clock was set, times step back; the poses' own times are looked up.
         boards.append(Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
         files.append(found)
     if not boards:
-        print("warning: no scans of a scanner on board: distances alone count", file=sys.stderr)
+        print("warning: no scans of a scanner on board: using distances only", file=sys.stderr)
     return boards, files
 
 

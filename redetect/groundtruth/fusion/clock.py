@@ -4,9 +4,9 @@ Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``,
 ground truth's; between segments the offset is interpolated, before the first and after the last
 their lines are extrapolated.
 
-Logs of ptpd say what the clocks' own synchronisation knows of offset and drift. Two layouts are
-read, as ptpd writes them: comma-separated statistics under a head that names the columns, and debug
-messages, of which ``offset from master`` and ``observed drift`` count.
+Logs of ptpd contain offset and drift from the clocks' own synchronisation. Two layouts are read:
+comma-separated statistics under a head with the names of the columns, and debug messages, of which
+``offset from master`` and ``observed drift`` are used.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ Status = Literal["ok", "no turns", "jump", "at a bound"]
 class ClockSegment:
     """The two clocks over one segment of the ground truth."""
 
-    from_s: float  # When the segment begins and ends, on the ground truth's clock
+    from_s: float  # Start and end of the segment, on the ground truth's clock
     to_s: float
-    reference_s: float  # Where in it the offset holds, on the ground truth's clock
+    reference_s: float  # Time for which the offset holds, on the ground truth's clock
     offset_s: float = 0.0  # Robot time minus ground truth time there
     rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
     angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
-    # Standard deviations; infinite where the segment does not determine the value
+    # Standard deviations; infinite if the segment does not determine the value
     sigma_offset_s: float = math.inf
     sigma_rate: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
     # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
-    # `jump`: its two halves disagree, as where a clock was set; `at a bound`: the optimum is at the
+    # `jump`: its two halves disagree, since a clock was set; `at a bound`: the optimum is at a
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
-    # By the segment alone, where one line through all segments replaced offset and deviation
+    # From the segment alone, if one line through all segments replaced offset and deviation
     own_offset_s: float | None = None
     own_sigma_s: float | None = None
 
@@ -69,14 +69,14 @@ class ClockModel:
             raise GroundTruthError("a clock without segments: expected at least one")
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
-        """Robot times of times on the ground truth's clock."""
+        """Convert times on the ground truth's clock to robot times."""
         knots, offsets = knots_of(self.segments)
         times = np.asarray(times_s, dtype=np.float64)
         drifts = (self.segments[0].rate - 1.0, self.segments[-1].rate - 1.0)
         return times + _extended(times, knots, offsets, drifts)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
-        """Times on the ground truth's clock of robot times: the inverse of `robot_times`."""
+        """Convert robot times to the ground truth's clock, the inverse of `robot_times`."""
         knots, offsets = knots_of(self.segments)
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
@@ -157,10 +157,10 @@ _AGREEMENT = 0.999
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     """Put segments on the straight line through all of them, if that agrees with each.
 
-    A clock that is neither disciplined nor set runs evenly over minutes. Segments that are minutes
-    apart then determine its rate much better than each alone, and its offset somewhat better. They
-    stay as they are where fewer than two are determined, a clock was set, or one line does not
-    explain them: its squared error is larger than one session in a thousand has by chance.
+    A clock that is neither disciplined nor set has a constant rate over minutes. Segments that are
+    minutes apart then determine its rate much better than each alone, and its offset somewhat
+    better. They are unchanged if fewer than two are determined, a clock was set, or one line does
+    not explain them: its squared error has a probability below one in a thousand.
     """
     determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}
@@ -254,7 +254,7 @@ def _rows(path: Path) -> list[list[float]]:
             offset = float(message[1]) + 1e-9 * int(message[2] or 0)
             rows.append([float(time[1]) if time else math.nan, offset, math.nan])
         elif drift := _DRIFT_MESSAGE.search(lowered):
-            # It follows the offset of the same report.
+            # The drift follows the offset of the same report.
             if rows and math.isnan(rows[-1][2]):
                 rows[-1][2] = float(drift[1])
         elif _OFFSET in lowered and "," in lowered:

@@ -1,10 +1,10 @@
 """Fusion of odometry with ground truths: Kalman filter forward, smoothing backward (RAWSEEDS D2.1).
 
-Odometry is the control, poses from laser and markers are the measurements. What odometry is off by
-systematically (a share of turns and ways, a bend) is estimated along, since it is what decides how
-far a gap can be bridged; how much it errs at random is what makes the measurements likeliest. The
-nodes are the odometry's times and the measurements' own, between which odometry goes on along
-arcs; so no measurement is interpolated, which would count the same noise twice.
+Odometry is the control, poses from laser and markers are the measurements. Systematic errors of
+odometry (scale of turns and distances, a bend) are part of the state, since they determine how well
+a gap can be bridged; its random errors are estimated by maximum likelihood. The nodes are the times
+of odometry and of the measurements, between which odometry moves along arcs; so no measurement is
+interpolated, which would count the same noise twice.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 
-# The factors on odometry's deviations that are tried, and over how many nodes.
+# Factors on odometry's deviations that are tried, and the number of nodes used.
 _NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LONGEST_GAP_TO_LEARN_FROM_S = 20.0
 _LEARNING_ROUNDS = 2
-# As far apart are measurements that odometry is to lead from one to the next, in how many rounds a
-# factor is found, and how seldom right variances may look too small.
+# Spacing of the measurements between which odometry predicts, number of rounds for the factor, and
+# significance level for too small variances.
 _SPACING_S = 2.0
 _LOOSENING_ROUNDS = 3
 _DOUBT = 0.001
-# Akaike's: an estimate fits its own measurements that much better by chance.
+# Akaike's criterion: by chance, an estimate fits its own measurements better by this.
 _COST_OF_TERM = 2.0
-# Share of its deviation before anything was measured below which an estimate counts as measured.
+# Share of its prior deviation below which an estimate counts as measured.
 _MEASURED = 0.5
 
 
 def likeliest_noise(problem: MovementProblem) -> FloatArray:
-    """Odometry's random errors that make the measurements likeliest, near those given.
+    """Maximum likelihood estimate of odometry's random errors, near those given.
 
-    Long gaps are left out: by their ends a filter that is linearised may be lost, and then no noise
-    is likelier than another for what odometry did.
+    Long gaps are excluded: a linearised filter may be lost at their ends, and then the likelihood
+    does not depend on the noise.
     """
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
@@ -81,11 +81,11 @@ def likeliest_noise(problem: MovementProblem) -> FloatArray:
 
 
 def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
-    """By what factor odometry's variances over seconds are greater than samples by themselves say.
+    """Factor of odometry's variances over seconds to those expected from single samples.
 
-    A localisation, or odometry that was filtered, errs smoothly: hardly from sample to sample, and
-    yet over a gap. So most measurements are left out, and what odometry makes of the ways between
-    those that are left is compared with them. 1 unless errors are beyond what chance explains.
+    A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
+    over a gap. So most measurements are dropped, and odometry's predictions between the remaining
+    ones are compared with them. The factor is 1 unless the errors are significantly larger.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -100,7 +100,7 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
         return 1.0
     looser = 1.0
     for _ in range(_LOOSENING_ROUNDS):
-        # The first one of each part says nothing of odometry.
+        # The first one of each part gives no information on odometry.
         squared = sum(
             float(np.sum(np.minimum(account.squared[1:], problem.gate())))
             for account in (part.account(math.sqrt(looser) * noise) for part in some)
@@ -114,12 +114,11 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
 def terms_that_pay(
     problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
 ) -> BoolArray:
-    """(3,) which of odometry's systematic errors, as estimated, make better predictions over
-    seconds.
+    """(3,) mask of odometry's systematic errors whose estimates improve predictions over seconds.
 
-    They are estimated from sample to sample. Where odometry's own jitter is a part of these
-    samples, measured poses deny it, and a share of turns comes out that is none (regression
-    dilution). Over seconds, and over gaps, such an estimate predicts worse than none.
+    They are estimated from sample to sample. If these include odometry's own jitter, which measured
+    poses do not confirm, a spurious scale of turns results (regression dilution). Over seconds, and
+    over gaps, such an estimate makes predictions worse.
     """
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0
@@ -129,7 +128,7 @@ def terms_that_pay(
         return account.surprise + _COST_OF_TERM * np.count_nonzero(terms)
 
     best = surprise(kept)
-    # What was hardly measured stays as uncertain as it is.
+    # Terms that were hardly measured keep their uncertainty.
     measured = deviations < _MEASURED * systematic_sigmas(problem.settings)
     while np.any(kept & measured):
         fewer = [kept & (np.arange(3) != term) for term in np.flatnonzero(kept & measured)]
@@ -142,7 +141,7 @@ def terms_that_pay(
 
 @dataclass(frozen=True)
 class Rejected:
-    """A measurement that the gate kept out."""
+    """A measurement that the gate rejected."""
 
     stream: str  # Its stream
     time_s: float
@@ -153,9 +152,9 @@ class Rejected:
 class OdometryErrors:
     """Odometry's errors estimated from the measurements."""
 
-    turn_scale: float  # By what share turns are longer than odometry says
-    turn_bias_per_metre: float  # The turn that it misses per metre (rad)
-    distance_scale: float  # By what share ways are longer
+    turn_scale: float  # Relative excess of true turns over odometry's
+    turn_bias_per_metre: float  # Turn that odometry misses per metre (rad)
+    distance_scale: float  # Relative excess of true distances over odometry's
     turn_scale_sigma: float  # Standard deviations of these three
     turn_bias_per_metre_sigma: float
     distance_scale_sigma: float
@@ -163,8 +162,8 @@ class OdometryErrors:
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
-    # By what factor their variances were raised where nothing was measured for more than a second,
-    # since odometry erred more over seconds than from sample to sample; 1 if it did not.
+    # Factor on their variances if nothing was measured for more than a second, since errors over
+    # seconds were larger than expected from single samples; 1 if they were not.
     looser_in_gaps: float
 
 
@@ -175,20 +174,20 @@ class Fusion:
     # At the odometry's times from the first measurement to the last, with covariances; headings
     # within +-pi.
     poses: PlanarPoses
-    # The same by the filter alone: each from what was measured until then
+    # The same from the filter alone: each from measurements until then
     filtered: PlanarPoses
     rejected: tuple[Rejected, ...]  # In order of time
-    # When the filter was restarted because no measurement fitted any more
+    # Times at which the filter was restarted because measurements did not fit any more
     restarts_s: tuple[float, ...]
-    used: dict[str, int]  # Measurements that went in, by stream
+    used: dict[str, int]  # Number of measurements used, by stream
     odometry: OdometryErrors  # The estimated errors of odometry
-    # Errors of odometry that is a localisation, along which the path was estimated then
+    # Errors of odometry treated as a localisation, if the path was estimated that way
     localisation: LocalisationErrors | None
-    # Covariances that were not positive definite as written, by stream; they were raised by their
-    # file's rounding.
+    # Number of covariances that were not positive definite as written, by stream; they were
+    # increased by their file's rounding.
     repaired: dict[str, int]
-    # Between which times odometry was not written, within the poses' time. What may have been
-    # driven there besides, at the rates at which the robot usually goes, makes it less certain.
+    # Pauses of odometry within the poses' time. Motion that it may have missed there, at the
+    # robot's usual rates, increases the covariances.
     pauses_s: tuple[tuple[float, float], ...]
 
 
@@ -295,13 +294,13 @@ _LARGEST_GAP_S = 2.0
 class LeftOut:
     """A segment of the ground truth, predicted without it."""
 
-    from_s: float  # When the segment begins
+    from_s: float  # Start of the segment
     to_s: float
-    poses: int  # Of the ground truth in it that have a prediction
+    poses: int  # Number of its ground truth poses with a prediction
     position_rms_m: float  # Root of the mean squared error of the fused path
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
-    # The same of odometry after the rigid motion that fits it to the other segments best
+    # The same for odometry, rigidly aligned with the other segments
     aligned_position_rms_m: float
     aligned_heading_rms_rad: float
 
@@ -311,10 +310,10 @@ def leave_out(
     streams: Mapping[str, PlanarPoses],
     settings: FuseSettings | None = None,
 ) -> tuple[LeftOut, ...]:
-    """Leave each segment of the ground truth between two others out, and predict it.
+    """Leave out each segment of the ground truth between two others, and predict it.
 
-    Takes what `fuse` takes. Segments are those of the first stream; the others are left out at the
-    same times. The first segment and the last are not among the results, since a fused path goes
+    Parameters as for `fuse`. Segments are those of the first stream; the other streams are left out
+    at the same times. The first and the last segment are not predicted, since a fused path extends
     from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
     three segments within the odometry's time.
     """
@@ -367,7 +366,7 @@ def _left_out(
 
 
 def _rms(difference: FloatArray) -> tuple[float, float]:
-    """Of the position (m) and of the heading (rad)."""
+    """Root mean square of position (m) and heading (rad)."""
     if len(difference) == 0:
         return np.nan, np.nan
     squared = np.mean(np.square(difference), axis=0)

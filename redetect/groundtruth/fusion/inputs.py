@@ -19,7 +19,7 @@ from redetect.plane import between, log_motion
 
 
 def systematic_sigmas(settings: FuseSettings) -> FloatArray:
-    """(3,) deviations of the turns' share, the turn per metre (rad) and the ways' share."""
+    """(3,) prior deviations of turn scale, turn per metre (rad) and distance scale."""
     return np.array(
         [
             settings.turn_scale_sigma,
@@ -41,20 +41,19 @@ def noise_of(settings: FuseSettings) -> FloatArray:
     )
 
 
-#: A robot at rest may still move a little; without this noise, rest would give singular
-#: covariances.
+#: Noise of a robot at rest, without which covariances would be singular.
 CREEP_M2_PER_S = (1e-4) ** 2
 CREEP_RAD2_PER_S = (1e-4) ** 2
-# The share of turns is one of distinct turns: by more than this (rad) from a second before to a
-# second after, some four standard deviations of wheels at 1 m/s. Less may be odometry's random
-# errors, which measured headings contradict, so that the share would be biased towards -1
+# The turn scale applies to distinct turns only: more than this (rad) from a second before to a
+# second after, some four standard deviations of wheels at 1 m/s. Smaller ones may be random errors
+# of odometry, which measured headings contradict, so that the scale would be biased towards -1
 # (regression dilution).
 _DISTINCT_OVER_S = 1.0
 _DISTINCT_RAD = 0.06
-# Odometry pauses where samples are farther apart than both, in seconds and in usual intervals.
+# Odometry pauses if samples are farther apart than both, in seconds and in usual intervals.
 _PAUSE_S = 1.0
 _PAUSE_INTERVALS = 10.0
-# Motion that is possible in a pause: at this quantile of the rates over a second.
+# Possible motion in a pause: at this quantile of the rates over a second.
 _USUAL_RATES_OVER_S = 1.0
 _USUAL_RATES_QUANTILE = 0.9
 
@@ -62,7 +61,7 @@ _USUAL_RATES_QUANTILE = 0.9
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
     """Pauses of odometry, as the times of the samples before and after each.
 
-    Only the resulting movement is known of them, not the path. No two samples may have one time.
+    Only their total movement is known, not the path. No two samples may have the same time.
     """
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
@@ -78,9 +77,9 @@ def _paused(times_s: FloatArray) -> BoolArray:
 def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Movements between nodes, each a share of an arc between two samples of odometry.
 
-    `odometry` has two samples or more, no two of one time; (N,) node times ascend within its time.
+    `odometry` has two or more samples at distinct times; (N,) node times ascend within its time.
     Returns the controls (N, 4) of a `MovementProblem`, and the additional distance (m) and turn
-    (rad) (N, 2) that the robot may have made where odometry pauses, at its usual rates.
+    (rad) (N, 2) that are possible in pauses of odometry, at the robot's usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
@@ -95,7 +94,7 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
 
 
 def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[FloatArray, ...]:
-    """Sums of steps from a margin before each to a margin after it, and over how long."""
+    """Sums of steps from a margin before each to a margin after it, and their durations."""
     from_s = np.maximum(times_s[:-1] - margin_s, times_s[0])
     to_s = np.minimum(times_s[1:] + margin_s, times_s[-1])
     total = np.concatenate([[0.0], np.cumsum(steps)])
@@ -104,7 +103,7 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
 
 
 def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:
-    """(N - 1, 2) way and turn that pauses may hide, beyond the arcs over them."""
+    """(N - 1, 2) distance and turn that pauses may hide, beyond the arcs over them."""
     paused = _paused(times_s)
     hidden = np.zeros((len(way), 2))
     if not np.any(paused) or np.all(paused):
@@ -116,7 +115,7 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
     passed = np.diff(times_s)[paused]
     for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
         hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
-    # Some odometry is written on change only: with all digits equal, the robot was at rest.
+    # Some odometry is written on change only: if all digits are equal, the robot was at rest.
     hidden[(way == 0.0) & (turn == 0.0)] = 0.0
     return hidden
 
@@ -124,11 +123,11 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
 def gather(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
 ) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
-    """All measurements within the odometry's time, in order, with covariances that can be used.
+    """All measurements within the odometry's time, in order, with usable covariances.
 
-    Of several poses of one time in a stream, the last counts. Returns each measurement's stream,
-    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream how many covariances had to be
-    raised.
+    Of several poses at one time in a stream, the last counts. Returns each measurement's stream,
+    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream the number of covariances that
+    had to be increased.
     """
     found = []
     repaired = {}
@@ -151,7 +150,7 @@ def gather(
 
 
 def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:
-    """Covariances of rows made symmetric, and raised where rounding made them singular."""
+    """Covariances of rows made symmetric, and increased if rounding made them singular."""
     symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
     smallest = np.linalg.eigvalsh(symmetric)[:, 0]
     worst = float(smallest.min(initial=0.0))

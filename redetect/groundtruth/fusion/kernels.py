@@ -1,11 +1,11 @@
-"""One movement by odometry, compiled: where it leads, derivatives, what its errors sum up to.
+"""Compiled motion model of odometry: prediction, derivatives, accumulated noise.
 
-Between two nodes the robot is taken to go forward, sideways and round at constant rates, which is
-an arc. All along it, white noise is added to the three rates: along the way, across it, and to the
-turn. Its effect at the arc's end is integrated in closed form: a heading that errs early
-leads aside for the rest of the way. So an arc that is cut in two, and its halves one after the
-other, come to the same. In complex numbers, with the arc's length s, its turn w and the directions
-of its chord and across it as axes, a wrong heading at the share t - 1/2 of the way moves the end by
+Between two nodes the robot is assumed to move forward and sideways and to turn at constant rates,
+which gives an arc. Along it, white noise is added to the three rates. Its effect at the arc's end
+is integrated in closed form: an early heading error causes a lateral error over the remaining arc.
+So cutting an arc in two does not change the result. In complex numbers, with the arc's length s,
+its turn w and the directions of its chord and across it as axes, a heading error at the share
+t - 1/2 of the arc moves the end by
 
     s (cos h - cos wt + i (sin h - sin wt)) / w,        h = w / 2,
 
@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
-#: Length of the state, and of the pose at its beginning.
+#: Size of the state, and of the pose at its beginning.
 STATE = 6
 POSE = 3
-#: Restart of the filter at a node: none, after many rejections, where it was lost.
+#: Restart of the filter at a node: none, after many rejections, because it was lost.
 NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
-# Below this half turn (rad) differences cancel, and series are right to ten digits.
+# Below this half turn (rad) differences cancel, and series are accurate to ten digits.
 _SERIES_BELOW = 0.1
 
 
@@ -40,8 +40,8 @@ def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
     `half_turn`: half the angle between its tangents at both ends (rad). Returns `chord`: length of
     the chord, sin(h) / h. `mean_along`: mean of (cos h - cos 2ht) / 2h over t from -1/2 to 1/2. The
     mean of (sin h - sin 2ht) / 2h is half the chord. `variance_along`, `variance_across`: variances
-    of the two over t. `mean_cosine`: mean of cos(4ht), sin(2h) / 2h: how much of the difference
-    between errors along the way and across it is left in the directions of the chord.
+    of the two over t. `mean_cosine`: mean of cos(4ht), sin(2h) / 2h: the share of the difference
+    between errors along the arc and across it that remains in the directions of the chord.
     """
     h = half_turn
     q = h * h
@@ -70,14 +70,14 @@ def move(
     variances: FloatArray,
     point: FloatArray,
 ) -> None:
-    """Move a state and its covariance on by a movement of odometry, in place.
+    """Propagate a state and its covariance by a movement of odometry, in place.
 
     `x`, `p` (6,), (6, 6): state (see `redetect.groundtruth.fusion.kernels`) and covariance;
     replaced. `f` (6, 6): identity on the first call; becomes the derivative of the new state by the
-    old one. `control` (4,): way forward, way to the left (m) and turn (rad), summed up over the
-    movement in the robot's own, turning frame; and the part of the turn that a share of turns is a
-    share of. `variances` (3,): what noise along the way, across it (m^2) and of the turn (rad^2)
-    sum up to. `point` (6,): the state at which the movement is linearised.
+    old one. `control` (4,): distance forward, distance to the left (m) and turn (rad), accumulated
+    over the movement in the robot's own, turning frame; and the part of the turn to which the turn
+    scale applies. `variances` (3,): accumulated noise along the path, across it (m^2) and of the
+    turn (rad^2). `point` (6,): the state at which the movement is linearised.
     """
     way = math.sqrt(control[0] * control[0] + control[1] * control[1])
     turn, distinct = control[2], control[3]
@@ -176,9 +176,9 @@ def take_in(
     s_inverse: FloatArray,
     gain: FloatArray,
 ) -> None:
-    """Take a measured pose into a state and its covariance, in place.
+    """Update a state and its covariance with a measured pose, in place.
 
-    `x`, `p` (d,), (d, d). `common` (d, 3): covariance of the state and what is measured of it.
+    `x`, `p` (d,), (d, d). `common` (d, 3): cross-covariance of the state and its measured part.
     `s_inverse` (3, 3): of the innovation's covariance. `gain` (d, 3): work space.
     """
     for i in range(len(x)):
@@ -199,8 +199,8 @@ def take_in(
 class Odometry(NamedTuple):
     """Movements to N nodes, each from the node before; the first is not used."""
 
-    controls: FloatArray  # (N, 4): as `move` takes them
-    variances: FloatArray  # (N, 3): accumulated noise along the way, across it and of the turn
+    controls: FloatArray  # (N, 4): as for `move`
+    variances: FloatArray  # (N, 3): accumulated noise along the path, across it and of the turn
 
 
 class MeasuredPoses(NamedTuple):
@@ -212,14 +212,14 @@ class MeasuredPoses(NamedTuple):
 
 
 class Gating(NamedTuple):
-    """When a measurement is rejected, and when the filter restarts from one."""
+    """Conditions for rejecting a measurement, and for restarting the filter from one."""
 
     largest_squared: float  # Largest squared normalised innovation
-    # After this number of rejections in a row the pose becomes the measured one, with
+    # After this number of consecutive rejections the pose is set to the measured one, with
     # `restart_variances`, however far off the filter was
     restart_after: int
     restart_variances: FloatArray  # (3,)
-    lost_variance: float  # The same at once where the heading's variance (rad^2) is greater
+    lost_variance: float  # The same immediately if the heading's variance (rad^2) is larger
     cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
 
 
@@ -239,22 +239,22 @@ class MeasurementAccount(NamedTuple):
 
     squared: FloatArray  # (M,): squared normalised innovations
     accepted: BoolArray  # (M,)
-    restarted: NDArray[np.int8]  # (N,): whether the filter began anew at a node, and why
-    surprise: float  # Minus twice the logarithm of the likelihood of the accepted innovations
+    restarted: NDArray[np.int8]  # (N,): whether the filter restarted at a node, and why
+    surprise: float  # Minus twice the log-likelihood of the accepted innovations
 
 
 def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
-    """A history to be filled; of no nodes where none is wanted."""
+    """A history to be filled; with zero nodes if none is needed."""
     states, spreads = (nodes, state), (nodes, state, state)
     return FilterHistory(
         np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
     )
 
 
-# Element by element: Numba compiles an assignment of arrays with its error's text, for seconds.
+# Element by element, since an assignment of arrays takes seconds to compile.
 @kernel()
 def keep(states: FloatArray, covariances: FloatArray, k: int, x: FloatArray, p: FloatArray) -> None:
-    """Write a state and its covariance down as those of a node."""
+    """Store a state and its covariance as those of a node."""
     for i in range(len(x)):
         states[k, i] = x[i]
         for j in range(len(x)):
@@ -274,9 +274,9 @@ def filter_forward(
     """Filter N nodes forward.
 
     `start`, `start_covariance` (6,), (6, 6): before the measurements at the first node. `points`
-    (N, 6): states at which each movement away from a node is linearised, with headings that go on
-    without jumps; measured headings are assumed to be within half a turn of them. Of length 1: at
-    the filter's own. `history`: filled, unless it is of no nodes.
+    (N, 6): states at which each movement away from a node is linearised, with continuous headings;
+    measured headings are assumed to be within half a turn of them. With length 1, the filter's own
+    states are used. `history`: filled, unless it has zero nodes.
     """
     controls, nodes = odometry.controls, measured.nodes
     kept = len(history.predicted) > 0
@@ -355,15 +355,14 @@ def filter_forward(
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """Smooth what a filter left, from the last node to the first (Rauch, Tung, Striebel).
+    """Smooth a filter's history, from the last node to the first (Rauch, Tung, Striebel).
 
-    Where the filter began anew, poses before learn from what came after only what it says of
-    odometry's systematic errors.
+    Across a restart of the filter, only odometry's systematic errors are propagated backward.
 
     Returns `states`, `covariances` (N, d), (N, d, d).
     """
     expected = history.predicted_covariance[1:].copy()
-    # States without any variance stay as they are.
+    # States without variance do not change.
     variances = np.einsum("kii->ki", expected)
     variances[variances == 0.0] = 1.0
     reached = history.transitions[1:] @ history.filtered_covariance[:-1]
@@ -384,7 +383,7 @@ def _take_back(
     predicted: FloatArray,
     predicted_covariance: FloatArray,
 ) -> None:
-    """Make filtered states and covariances smoothed ones, in place; `gains` (N - 1, d, d)."""
+    """Replace filtered states and covariances by smoothed ones, in place; `gains` (N - 1, d, d)."""
     count, size = states.shape
     change = np.empty((size, size))
     for k in range(count - 2, -1, -1):

@@ -1,12 +1,12 @@
-"""Odometry that is a localisation: its poses err about a rigid motion, however long it goes on.
+"""Odometry from a localisation: a rigid motion plus stationary errors, without drift.
 
-A localisation in a map, or a path that was closed into loops, doesn't drift as wheels do. Its
-poses are those of the ground truth after one rigid motion, and their errors besides are stationary:
-an Ornstein-Uhlenbeck process for x, y and the heading, of a deviation and a correlation time each
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, appendix B). The process is
-Markov: in a gap between measurements the errors depend only on those at its two ends, in closed
-form. Odometry is taken for a localisation if, as such, it predicts the measurements better than by
-the movements between its poses.
+A localisation in a map, or a path with closed loops, does not drift as wheels do. Its poses are
+those of the ground truth after a rigid motion, plus stationary errors: an Ornstein-Uhlenbeck
+process for x, y and the heading, each with a deviation and a correlation time (Rasmussen and
+Williams, Gaussian Processes for Machine Learning, 2006, appendix B). The process is Markov: in a
+gap between measurements the errors depend only on those at its two ends, in closed form. Odometry
+is treated as a localisation if that model predicts the measurements better than the movements
+between its poses.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.landmarks import wrap_angle
 
-# Both ways to see odometry are compared by measurements this far apart, if there are enough, and
-# only where a longer gap is to be bridged.
+# Both models of odometry are compared on measurements this far apart, if there are enough, and only
+# if a longer gap has to be bridged.
 _SPACING_S = 2.0
 _FEWEST = 10
 _LEAST_GAP_S = 20.0
 _MOST_TO_LEARN_FROM = 500
-# A few visits hardly determine a correlation time: a mean and a deviation of its logarithm are
-# assumed.
+# Prior mean and deviation of the logarithm of the correlation time, which a few visits hardly
+# determine.
 _USUAL_CORRELATION_S = 10.0
 _LOG_CORRELATION_SIGMA = 0.7
-_LEVEL_SIGMA = 10.0  # Of what is unknown (m, rad)
-# Differences this many times as large as half of them are gross errors, of which there is one in
-# 10000, anywhere within 10 m by 10 m.
+_LEVEL_SIGMA = 10.0  # Prior deviation of unknowns (m, rad)
+# Differences this many times the median are gross errors, of which there is one in 10000, anywhere
+# within 10 m by 10 m.
 _USUAL = 6.0
 _TRIMMINGS = 5
 _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
@@ -51,13 +51,13 @@ _OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 
 @dataclass(frozen=True)
 class LocalisationErrors:
-    """How odometry errs that is a localisation."""
+    """Errors of odometry that is a localisation."""
 
     position_sigma: float  # Standard deviation of x and y, each (m)
     heading_sigma: float  # Of the heading (rad)
-    position_correlation_s: float  # After which time errors are alike by 1/e only
+    position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
-    # Heading of the ground truth beyond that of the aligned localisation (rad)
+    # Heading of the ground truth minus that of the aligned localisation (rad)
     heading_offset: float
 
 
@@ -66,9 +66,9 @@ def as_localisation(
 ) -> tuple[PlanarPoses, LocalisationErrors] | None:
     """The path from odometry that is a localisation, if it is one.
 
-    `problem` has the same odometry, no two samples of which are of one time; `noise` (4,): its
-    random errors over seconds. `path` is the one by movements, with covariances: it stays where
-    poses were measured, and the gaps between them are bridged anew.
+    `problem` has the same odometry, with distinct times; `noise` (4,): its random errors over
+    seconds. `path` is the one from movements, with covariances: it is kept where poses were
+    measured, and the gaps in between are bridged again.
     """
     thin = problem.thinned(_SPACING_S)
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
@@ -121,24 +121,23 @@ def _by_motion(from_centre: FloatArray) -> FloatArray:
 
 
 class _Stationary(NamedTuple):
-    """A process of one deviation and correlation time about a mean of k unknowns."""
+    """A process with a deviation and a correlation time about a mean with k unknowns."""
 
     sigma: float
     lasting_s: float
     mean: FloatArray  # (k,)
     mean_covariance: FloatArray  # (k, k)
-    surprise: float  # Minus twice the logarithm of the likelihood
+    surprise: float  # Minus twice the log-likelihood
 
 
 def _stationary(
     times_s: FloatArray, values: FloatArray, variances: FloatArray, design: FloatArray
 ) -> _Stationary:
-    """The process that makes (M, n) values of it likeliest, whatever its mean is.
+    """Maximum likelihood estimate of the process for (M, n) values, with unknown mean.
 
-    `design` (M, n, k): the values' derivatives by the unknowns of the mean. Each value is as
-    uncertain as its time's variance (M,) says. A mean that is estimated follows the errors, of few
-    visits most of all: their likelihood is the one that is left (restricted maximum likelihood;
-    Rasmussen and Williams, section 2.7).
+    `design` (M, n, k): the values' derivatives by the unknowns of the mean. Values have the
+    variances (M,) of their times. Since an estimated mean follows the errors, in particular with
+    few visits, the restricted likelihood is used (Rasmussen and Williams, section 2.7).
     """
     stride = 1 + len(times_s) // _MOST_TO_LEARN_FROM
     apart = np.abs(times_s[::stride, None] - times_s[::stride])
@@ -172,7 +171,7 @@ def _stationary(
 def _bridged(
     path: PlanarPoses, aligned: PlanarPoses, measured_s: FloatArray, errors: LocalisationErrors
 ) -> PlanarPoses:
-    """A path whose gaps are those of an aligned localisation plus its errors given at both ends.
+    """A path with gaps filled by an aligned localisation plus its errors given at both ends.
 
     The localisation's covariances are those of its alignment.
     """

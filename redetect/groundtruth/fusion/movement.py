@@ -1,9 +1,9 @@
-"""Odometry as control and measured poses: their likelihood together, and the smoothed path.
+"""Odometry as control and measured poses: their joint likelihood, and the smoothed path.
 
 Over a long path without measurements odometry's heading drifts so far that derivatives along the
-filter's own path do not hold for the true one. So filter and smoother are repeated, linearised
-along the smoothed path, until it settles (Gauss-Newton steps). Headings are known up to whole
-turns: where odometry could have drifted by so much, or does not explain the other end of a gap, the
+filter's own path are invalid for the true one. So filter and smoother are repeated, linearised
+along the smoothed path, until it converges (Gauss-Newton steps). Headings are known up to full
+turns: if odometry could have drifted by that much, or does not explain the other end of a gap, the
 two sides are not connected. Such a gap is cut in the middle, and each half follows odometry from
 its own end.
 """
@@ -47,7 +47,7 @@ from redetect.groundtruth.trajectories.streams import (
     pose_differences,
 )
 
-#: Least time without measurements that is a gap: rejections after it are attributed to it.
+#: Least duration of a gap without measurements; rejections after a gap are attributed to it.
 UNMEASURED_S = 1.0
 _TURN_PER_METRE = 4
 
@@ -61,7 +61,7 @@ def back_from(
     """
     controls, variances = odometry
     count = len(controls)
-    # Driven backward, all rates change their signs; the turn per metre does so by itself.
+    # Backward in time, all rates change their signs; the turn per metre does so by itself.
     mirror = np.ones(STATE)
     mirror[_TURN_PER_METRE] = -1.0
     reverse = np.concatenate([np.zeros((1, 4)), -controls[:0:-1]])
@@ -81,7 +81,7 @@ def back_from(
 
 _RESTART_AFTER = 40
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
-# Of the heading (rad^2): beyond it, another number of whole turns is possible.
+# Variance of the heading (rad^2) beyond which another number of full turns is possible.
 _LOST_VARIANCE = 1.0
 _MOST_STEPS = 5
 _SETTLED_RAD = 1e-3
@@ -89,18 +89,18 @@ _SETTLED_RAD = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MovementProblem:
-    """Odometry and measured poses on common nodes, whatever odometry errs at random."""
+    """Odometry and measured poses on common nodes, independent of odometry's random errors."""
 
     times_s: FloatArray  # (N,): the nodes
-    # (N, 4): odometry's movement to each node: way forward, way to the left (m) and turn (rad),
-    # each summed up in the robot's turning frame; and the turn again where it is a distinct one,
-    # else 0.
+    # (N, 4): odometry's movement to each node: distance forward, distance to the left (m) and turn
+    # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
+    # one, else 0.
     controls: FloatArray
-    # (N, 2): way (m) and turn (rad) that it may have made besides, where odometry pauses
+    # (N, 2): additional distance (m) and turn (rad) that are possible in pauses of odometry
     unseen: FloatArray
     measured: MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
-    repaired: dict[str, int]  # Covariances that had to be raised, by stream
+    repaired: dict[str, int]  # Number of covariances that had to be increased, by stream
     settings: FuseSettings
 
     @property
@@ -109,7 +109,7 @@ class MovementProblem:
         return self.times_s[self.measured.nodes]
 
     def shortened(self, count: int) -> MovementProblem:
-        """The contiguous nodes, at most `count`, that have the most measurements."""
+        """The contiguous nodes, at most `count`, with the most measurements."""
         if len(self.times_s) <= count:
             return self
         nodes = self.measured.nodes
@@ -132,7 +132,7 @@ class MovementProblem:
         )
 
     def split(self, longest_s: float) -> list[MovementProblem]:
-        """The parts between which nothing was measured for longer than this, without the gaps."""
+        """The parts between gaps in the measurements longer than this, without the gaps."""
         cuts = np.flatnonzero(np.diff(self.measured_s) > longest_s) + 1
         return [
             self._part(int(own[0]), int(own[-1]) + 1) for own in np.split(self.measured.nodes, cuts)
@@ -141,15 +141,15 @@ class MovementProblem:
     def account(
         self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
     ) -> MeasurementAccount:
-        """How a forward-only filter uses the measurements.
+        """The use of the measurements by a forward-only filter.
 
         It begins with the given means and deviations of odometry's systematic errors, by default
-        with those of the settings.
+        those of the settings.
         """
         return self._forward(self._variances(noise), systematic=systematic)
 
     def thinned(self, spacing_s: float) -> MovementProblem:
-        """With no measurement sooner than this after the one before."""
+        """The problem with measurements at least this far apart."""
         kept = np.zeros(len(self.streams), dtype=np.bool_)
         last = -np.inf
         for i, time in enumerate(self.measured_s):
@@ -159,13 +159,13 @@ class MovementProblem:
         return self.with_only(kept)
 
     def with_only(self, kept: BoolArray) -> MovementProblem:
-        """With some of its measurements."""
+        """The problem with some of its measurements."""
         nodes, poses, covariances = self.measured
         measured = MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
         return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) by the filter alone: from what was before."""
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone."""
         history = empty_history(len(self.times_s))
         self._forward(self._variances(noise), history=history)
         return history.filtered, history.filtered_covariance
@@ -173,11 +173,11 @@ class MovementProblem:
     def smooth(
         self, noise: FloatArray, looser_in_gaps: float = 1.0
     ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
-        """Smoothed states, their covariances, and what became of the measurements.
+        """Smoothed states, their covariances, and the use of the measurements.
 
         `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.inputs.noise_of`.
-        `looser_in_gaps`: factor on the variances they make where nothing is measured. Returns
-        `states`, `covariances` (N, 6), (N, 6, 6).
+        `looser_in_gaps`: factor on their variances where nothing is measured. Returns `states`,
+        `covariances` (N, 6), (N, 6, 6).
         """
         variances = self._variances(noise)
         nodes = self.measured.nodes
@@ -194,7 +194,7 @@ class MovementProblem:
             cuts[unfit] = True
         states, covariances = smooth_backward(history)
         good = nodes[account.accepted]
-        # The nodes of the last measurement before, and the first one after, gaps that were cut.
+        # The nodes of the last measurement before and the first one after each gap that was cut.
         gaps = [
             (int(good[np.searchsorted(good, end) - 1]), int(end))
             for end in np.flatnonzero(account.restarted == WHERE_LOST)
@@ -212,7 +212,7 @@ class MovementProblem:
         return states, covariances, account
 
     def _ends_that_did_not_fit(self, account: MeasurementAccount) -> list[int]:
-        """Nodes after gaps where those rejections began that made the filter restart."""
+        """Nodes after gaps at which the rejections began that made the filter restart."""
         nodes, times_s = self.measured.nodes, self.measured_s
         found = []
         for node in np.flatnonzero(account.restarted == AFTER_REJECTIONS):
@@ -235,8 +235,8 @@ class MovementProblem:
     ) -> None:
         """Determine the second half of a gap that was cut from the measurements after it.
 
-        A robot that was `carried` in the gap may have been so anywhere along its way: covariances
-        then have the other end's path as a possibility.
+        A robot that was `carried` in the gap may have been anywhere along its path then, so
+        covariances include the other end's path as a possibility.
         """
         gap = slice(begin, end + 1)
         back, spreads = back_from(
@@ -258,7 +258,7 @@ class MovementProblem:
         return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
 
     def _variances(self, noise: FloatArray) -> FloatArray:
-        """(N, 3) noise of movements to nodes: along the way, across it (m^2), of the turn (rad^2).
+        """(N, 3) noise of movements to nodes: along the path, across it (m^2), of the turn (rad^2).
 
         `noise` (4,): see `redetect.groundtruth.fusion.inputs.noise_of`. All of it is proportional
         to way, turn and time, so that it adds up over parts of a movement; but for what pauses
@@ -305,9 +305,9 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Bring odometry and measured poses with covariances to common nodes.
+    """Combine odometry and measured poses with covariances on common nodes.
 
-    From the first measurement within the odometry's time to the last, on the measurements' clock.
+    The nodes are from the first measurement within the odometry's time to the last.
     """
     names, times, measured, covariances, repaired = gather(odometry, streams)
     odometry = last_of_each_time(odometry)

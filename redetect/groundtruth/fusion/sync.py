@@ -2,13 +2,13 @@
 
 The headings of odometry and ground truth are those of one robot; the offset and the rate between
 their clocks minimise the squared difference, with the angle between their axes eliminated in closed
-form (RAWSEEDS D2.1 part 2). That search is global and derivative-free and depends on no initial
-value. But odometry's heading drifts, which a sum of squares would in part explain by a time offset.
+form (RAWSEEDS D2.1 part 2). That search is global and derivative-free and needs no initial value.
+But odometry's heading drifts, which a sum of squares would partly explain by a time offset. So the
 
-So from there the clock is moved to where the measured poses are likeliest, given odometry's
-movements and their errors: once for the headings of the ground truth alone, and once for its whole
-poses, if they have covariances; then curves of the path and changes of speed contribute as well.
-The more certain of the two counts.
+clock is then refined by maximising the likelihood of the measured poses, given odometry's movements
+and their errors: once for the headings of the ground truth alone, and once for its full poses, if
+they have covariances, so that curves of the path and changes of speed contribute, too. The more
+certain result is used.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ _ROUNDS = 2
 # Steps of the search (s, at the middle and at the ends) and of derivatives (standard deviations).
 _STEP_S = 0.005
 _DERIVATIVE_STEP = 0.7
-# Ratio of the errors in simulated sessions to the deviations by the likelihood's curvature: errors
-# of wheels do not follow the model exactly.
+# Ratio of the errors in simulated sessions to the deviations from the likelihood's curvature, since
+# errors of wheels do not follow the model exactly.
 _SIGMA_FACTOR = 2.0
 # Share of the bounds beyond which the search has not found a minimum within them.
 _AT_A_BOUND = 0.999
 # A segment determines the offset if its deviation is below this share of the search bound.
 _LEAST_DETERMINED = 0.1
-# The same of the drift, which is taken to be 0 where it is not determined.
+# The same for the drift, which is assumed to be 0 if it is not determined.
 _DETERMINED_DRIFT = 0.025
 _NEAR_S = 0.1
 _MOST_JUMPS = 3
 _JUMP_OFFSETS = np.arange(-40, 41)
 _JUMP_SPACING_S = 0.005
-# By how much a jump must lower the squared normalised errors.
+# Least decrease of the squared normalised errors by a jump.
 _JUMP_GAIN = 60.0
 _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
@@ -125,12 +125,12 @@ _NO_ODOMETRY = "no odometry"
 def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, jumps_left: int
 ) -> list[ClockSegment]:
-    """One segment's clock; several parts where the clock was set within it."""
+    """One segment's clock; several parts if the clock was set within it."""
     headings = np.unwrap(segment.poses[:, 2])
-    # Without their noise, coarsely: means of ten.
+    # Means of ten, with less noise.
     means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
     turned = float(np.sum(np.abs(np.diff(means))))
-    # What odometry covers, wherever within the bounds its clock is.
+    # The part covered by odometry, for all offsets within the bounds.
     reach = bounds.largest_offset_s + bounds.largest_drift * float(np.ptp(segment.times_s))
     measured = segment.only(
         segment.during(odometry.times_s[0] + reach, odometry.times_s[-1] - reach)
@@ -183,7 +183,7 @@ def _segment(
 
 @dataclass(frozen=True, eq=False)
 class HeadingPair:
-    """The headings of two streams: those of one, and the other one, which is interpolated."""
+    """The headings of two streams, the second of which is interpolated."""
 
     times_s: FloatArray  # (N,)
     headings: FloatArray  # (N,)
@@ -194,9 +194,9 @@ class HeadingPair:
 
     @classmethod
     def of(cls, odometry: PlanarPoses, groundtruth: PlanarPoses, reach_s: float) -> HeadingPair:
-        """Interpolate the smoother, faster stream; of the other one, some samples are enough.
+        """Interpolate the smoother, faster stream, at some samples of the other one.
 
-        Within `reach_s` of its ends the ground truth may not have been measured by the other clock.
+        Within `reach_s` of its ends, the ground truth may be outside the other stream's time.
         """
         inside = odometry.during(
             groundtruth.times_s[0] + reach_s, groundtruth.times_s[-1] - reach_s
@@ -230,9 +230,9 @@ class HeadingPair:
 
 
 def roughness(values: FloatArray) -> float:
-    """Standard deviation of values (N,) beside their neighbours, in their unit.
+    """Standard deviation of the noise of values (N,), in their unit.
 
-    Third differences cancel whatever changes smoothly; their median does not mind single jumps.
+    Third differences cancel smooth changes; their median is robust against single jumps.
     """
     third = np.diff(values, 3)
     # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
@@ -244,7 +244,7 @@ def _mean_angle(differences: FloatArray) -> float:
 
 
 def _search(pair: HeadingPair, bounds: SyncSettings) -> FloatArray:
-    """(2,) offset (s) and drift of the least squared differences, the angle eliminated."""
+    """(2,) offset (s) and drift with the least squared differences, the angle eliminated."""
     largest = np.array(bounds.largest)
 
     def squared(x: FloatArray) -> float:
@@ -256,7 +256,7 @@ def _search(pair: HeadingPair, bounds: SyncSettings) -> FloatArray:
 
 
 class ClockFit(NamedTuple):
-    """The clock that makes measured poses likeliest, given odometry's movements."""
+    """The maximum likelihood estimate of the clock, given odometry's movements."""
 
     clock: FloatArray  # (2,): offset at the reference time (s), drift
     sigmas: FloatArray  # (2,)
@@ -264,12 +264,12 @@ class ClockFit(NamedTuple):
     noise: FloatArray  # (4,): odometry's random errors
 
     def squared(self, clock: FloatArray) -> FloatArray:
-        """(M,) squared normalised errors of the measured poses by another clock, gated."""
+        """(M,) squared normalised errors of the measured poses with another clock, gated."""
         problem = self.problem_at(clock)
         return np.minimum(problem.account(self.noise).squared, problem.gate())
 
     def uncertainty(self, measured: PlanarPoses) -> float:
-        """Variance of the offset at the ends of what was measured (s^2)."""
+        """Variance of the offset at the ends of the measurements (s^2)."""
         half = 0.5 * float(np.ptp(measured.times_s))
         return float(np.sum(np.square(self.sigmas * [1.0, half])))
 
@@ -281,7 +281,7 @@ def _likeliest(
     start: FloatArray,
     bounds: SyncSettings,
 ) -> ClockFit | None:
-    """The likeliest clock near a start and within the bounds; None where nothing is likeliest."""
+    """The most likely clock near a start and within the bounds; None without a maximum."""
     largest = np.array(bounds.largest)
     half = 0.5 * float(np.ptp(measured.times_s))
 
@@ -292,7 +292,7 @@ def _likeliest(
         return movement_problem(own, {"pose": measured}, FuseSettings())
 
     def surprise(clock: FloatArray) -> float:
-        # Even between the bounds, before anything was measured.
+        # The prior is uniform between the bounds.
         prior = 3.0 * float(np.sum(np.square(clock / largest)))
         return problem_at(clock).account(noise).surprise + prior
 
@@ -336,7 +336,7 @@ def _likeliest(
 def _deviations(
     surprise: Callable[[FloatArray], float], at: FloatArray, step: FloatArray
 ) -> FloatArray | None:
-    """(2,) of two unknowns, from the curvature of minus twice the logarithm of the likelihood."""
+    """(2,) deviations of two unknowns, from the curvature of minus twice the log-likelihood."""
     e, f = np.diag(step)
     here = surprise(at)
     curvature = np.diag([surprise(at + d) + surprise(at - d) - 2.0 * here for d in (e, f)])
@@ -345,16 +345,16 @@ def _deviations(
     cross = 0.25 * (
         surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
     )
-    # Where a gate opens or shuts, a step may pass for curvature.
+    # If a gate opens or closes, a step may look like curvature.
     if cross**2 < np.prod(np.diag(curvature)):
         curvature[0, 1] = curvature[1, 0] = cross
     return np.asarray(step * np.sqrt(2.0 * np.diag(np.linalg.inv(curvature))))
 
 
 def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
-    """Measured poses as uncertain as odometry's own jitter makes the comparison.
+    """Measured poses with odometry's own jitter added to their covariances.
 
-    A localisation jitters from sample to sample, which is no error that adds up.
+    A localisation jitters from sample to sample, and this error does not accumulate.
     """
     covariances = np.zeros((len(measured), 3, 3))
     if measured.covariances is None:
@@ -368,13 +368,13 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
 
 
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
-    """Means of up to five samples: single ones are rough, and between two of them less so.
+    """Means of up to five samples, since single ones are noisier than interpolated ones.
 
-    Where samples meet the measured poses at the same phase throughout, that difference would pass
-    for a better or worse fit of the clock.
+    If samples have a constant phase relative to the measured poses, that difference would look like
+    a better or worse fit of the clock.
     """
     x, y, theta = odometry.poses.T
-    # From the first one on: sums of times since 1970 lose digits.
+    # Relative to the first one, since sums of times since 1970 lose digits.
     begin_s = odometry.times_s[0]
     columns = np.column_stack([odometry.times_s - begin_s, x, y, np.unwrap(theta)])
     interval_s = float(np.median(np.diff(odometry.times_s)))
@@ -384,7 +384,7 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
 
 
 def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
-    """Poses of which nothing is known but the heading."""
+    """Poses with known headings only."""
     assert measured.covariances is not None
     covariances = np.tile(np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]), (len(measured), 1, 1))
     covariances[:, 2, 2] = measured.covariances[:, 2, 2]
@@ -392,10 +392,10 @@ def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
 
 
 def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
-    """When the clock was set, on the ground truth's clock; None if it was not.
+    """Time at which the clock was set, on the ground truth's clock; None if it was not.
 
-    Each part before and after a place has the offset, of many and without a drift, that suits it
-    best; a jump is where both together are much better than the best clock without one.
+    The parts before and after a time have the best of many offsets, without drift; a jump is found
+    if both together fit much better than the best clock without one.
     """
     spacing = max(float(fit.sigmas[0]), _JUMP_SPACING_S)
     offsets = fit.clock[0] + spacing * _JUMP_OFFSETS
@@ -420,7 +420,7 @@ def _differ(parts: list[ClockSegment]) -> bool:
         for part in (before, after):
             away = place - part.reference_s
             offsets.append(part.offset_s + (part.rate - 1.0) * away)
-            # Where the drift is not determined, it still is that of a quartz.
+            # If the drift is not determined, it still is that of a quartz.
             rate_sigma = min(part.sigma_rate, _LARGEST_DRIFT_OF_A_QUARTZ)
             variances.append(part.sigma_offset_s**2 + (rate_sigma * away) ** 2)
         jump = abs(offsets[1] - offsets[0])

@@ -35,7 +35,7 @@ from redetect.plane import apply, compose
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
 
-#: Gains of the filter that only says where the next set starts.
+#: Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 
 _VELOCITY_WINDOW_S = 0.3
@@ -48,10 +48,10 @@ class LaserTrack:
     """Result for every set of scans."""
 
     times_s: FloatArray  # (N,)
-    # (N,): index into `STATUS`. Poses are good where it is OK or REACQUIRED, and but for one
-    # direction where it is UNDETERMINED.
+    # (N,): index into `STATUS`. Poses are valid if it is OK or REACQUIRED, and except for one
+    # direction if it is UNDETERMINED.
     status: IntArray
-    # (N,): number of the acquisition that the set belongs to; -1 where the robot is lost.
+    # (N,): number of the acquisition that the set belongs to; -1 if the robot is lost.
     segment: IntArray
     poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
     # (N, 3, 3): of (x, y, theta), from the readings' noise and the scanners' poses
@@ -59,7 +59,7 @@ class LaserTrack:
     noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
     # (N, 3): velocity (m/s) and turn (rad/s) in the world, from the poses before and after
     motion: FloatArray
-    readings: IntArray  # (N,): readings that the pose rests on
+    readings: IntArray  # (N,): number of readings used for the pose
     rms_m: FloatArray  # (N,): their root mean square distance from the outline
     chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
     beams: FloatArray  # (N, 6): as in `BeamCounts`
@@ -115,7 +115,7 @@ class Tracker:
         self.gradient = np.zeros((len(fixed.origins), 3))
 
     def run(self) -> LaserTrack:
-        """Track, resolve the front, and work the poses out again with their motion known."""
+        """Track, resolve the front, and compute the poses again with their motion known."""
         times = self.sets.times_s
         pose, motion = np.zeros(3), np.zeros(3)
         last = before = sure = looked = -math.inf
@@ -151,7 +151,7 @@ class Tracker:
                 self.track.status[i], pose = COASTING, predicted
                 continue
             error = pose_differences(fitted, predicted)
-            # At first no motion is known: it follows the poses more quickly.
+            # At first the motion is unknown, and follows the poses more quickly.
             young = max(0.0, 1.0 - (i - begun) / 12.0)
             pose = predicted + (_POSE_GAIN + (1.0 - _POSE_GAIN) * young) * error
             if step > 0.0:
@@ -195,7 +195,7 @@ class Tracker:
         return pose
 
     def _aligned(self, seen: Seen, start: FloatArray) -> tuple[FloatArray, int]:
-        """Pose by the trimmed ICP from a start, and how many readings it rests on."""
+        """Pose by the trimmed ICP from a start, and the number of readings used."""
         s = self.settings
         pose, _, count = fit_outline(
             seen.points, self.body.faces, start, s.gate_m, s.keep, s.threshold_m, s.most_steps
@@ -251,7 +251,7 @@ class Tracker:
             self.track.status[i], self.track.poses[i] = COASTING, np.nan
             return
         self._store(i, found, explain_set(self.sets[i], self.fixed, self.body, found.pose))
-        # Keeps what the whole visit, or its first set, has determined.
+        # Keeps the result of the whole visit, or of its first set.
         if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
             self.track.status[i] = status
         self.information += found.information
@@ -302,13 +302,13 @@ class Tracker:
     def _ahead(
         self, rows: IntArray, velocity: FloatArray, choices: list[FloatArray]
     ) -> list[float]:
-        """How far the robot drove forward, by every choice of its front (m)."""
+        """Distance that the robot drove forward, for every choice of its front (m)."""
         times, poses = self.sets.times_s[rows], self.track.poses[rows]
         step = np.diff(times, append=times[-1])
         ahead = []
         for choice in choices:
             heading = poses[:, 2] + choice[2]
-            # The same motion at the place that would be the robot's origin.
+            # The same motion at the point that would be the robot's origin.
             arm = compose(poses, np.broadcast_to(choice, poses.shape))[:, :2] - poses[:, :2]
             vx = velocity[:, 0] - velocity[:, 2] * arm[:, 1]
             vy = velocity[:, 1] + velocity[:, 2] * arm[:, 0]
@@ -316,16 +316,16 @@ class Tracker:
         return ahead
 
     def _scales(self, good: IntArray) -> FloatArray:
-        """Factors on the covariances where residuals are larger than the scanners' noise.
+        """Factors on the covariances if residuals are larger than the scanners' noise.
 
-        The residuals of half a second; one set's alone would say too little.
+        From the residuals of half a second, since one set's are too few.
         """
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
         total, squared = (
             convolve1d(values, np.ones(37), mode="constant")
             for values in (freedom, self.track.chi2[good] * freedom)
         )
-        # Within its own scatter a ratio above 1 is none.
+        # A ratio above 1 within its own scatter is not significant.
         ratio = squared / total
         return np.where(ratio > 1.0 + 4.0 * np.sqrt(2.0 / total), ratio, 1.0)
 
@@ -340,7 +340,7 @@ class Tracker:
 
 
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
-    """(n, 3) slopes of lines through the poses of the window round each time."""
+    """(n, 3) slopes of lines through the poses of the window around each time."""
     values = poses.copy()
     values[:, 2] = np.unwrap(poses[:, 2])
     out = np.zeros_like(values)
@@ -377,11 +377,11 @@ def track_without_suspects(
     scanners: tuple[Scanner, ...],
     settings: LaserSettings | None = None,
 ) -> tuple[LaserTrack, dict[str, FloatArray]]:
-    """Follow the robot, leaving out scanners whose readings do not fit the others'.
+    """Follow the robot, excluding scanners whose readings disagree with the others'.
 
-    One at a time, the worst first, and only while three scanners or more are left to say so.
-    Returns the track and, of those left out, the shift that their readings suggest and its standard
-    deviations (2, 3).
+    They are excluded one at a time, the worst first, and only while at least three scanners remain.
+    Returns the track and, for the excluded ones, the shift that their readings suggest and its
+    standard deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
     track = track_robot(sets, fixed, robot, settings)
@@ -401,7 +401,7 @@ def track_without_suspects(
 
 
 def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:
-    """(scanners,) how far beyond what is allowed their shifts are; above 1 is suspect."""
+    """(scanners,) ratio of their shifts to the allowed ones; above 1 is suspect."""
     least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
     excess = np.zeros(len(scanners))
     for k, scanner in enumerate(scanners):
@@ -417,16 +417,15 @@ LARGEST_GAP_S = 0.05
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
-    """Poses of a track, each from `sets_per_pose` consecutive sets; 1: every set by itself.
+    """Poses of a track, each from `sets_per_pose` consecutive sets; 1: every set separately.
 
-    The sets' poses are moved to their mean time with the robot's motion and averaged. Every set is
-    in one pose only, so that the readings' errors in different poses are independent; those of the
-    scanners' poses are common to all and are not averaged away. A block is shorter at the end of a
-    visit, and where sets have no determined pose.
+    The sets' poses are propagated to their mean time with the robot's motion and averaged. Every
+    set is in one pose only, so that the readings' errors in different poses are independent; those
+    of the scanners' poses are common to all and are not averaged out. A block is shorter at the end
+    of a visit, and if sets have no determined pose.
 
-    Sets with an undetermined direction come as poses of their own, with the covariance that says
-    so; those whose front is unknown do not come at all. Raises `GroundTruthError` if
-    `sets_per_pose` is not positive.
+    Sets with an undetermined direction become poses of their own, with a matching covariance; those
+    with an unknown front are dropped. Raises `GroundTruthError` if `sets_per_pose` is not positive.
     """
     if sets_per_pose < 1:
         raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
@@ -435,7 +434,7 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     if not len(rows):
         return PlanarPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     times = track.times_s[rows]
-    # A new block where the visit changes, after a gap, and round an undetermined set.
+    # A new block begins with a visit, after a gap, and before and after an undetermined set.
     parted = np.ones(len(rows), dtype=np.bool_)
     parted[1:] = (
         (track.segment[rows[1:]] != track.segment[rows[:-1]])
@@ -458,8 +457,8 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     lead = track.poses[rows[begins]]
     moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
     apart = pose_differences(moved, lead[block])
-    # All weigh the same: information computed at a wrong pose would favour the wrong poses, and
-    # with equal weights at the mean time an error of the motion drops out.
+    # Equal weights: information computed at a wrong pose would favour wrong poses, and with equal
+    # weights at the mean time an error of the motion cancels.
     mean, noise = mean_of(apart), mean_of(track.noise[rows]) / size[:, None, None]
     shared = mean_of((track.covariances - track.noise)[rows])
     poses = lead + mean

@@ -40,12 +40,12 @@ class FixedScanners(NamedTuple):
 
 
 class Body(NamedTuple):
-    """The robot as the scanners see it."""
+    """The robot's outline in the scanners' plane."""
 
     faces: FloatArray  # (k, 4): counter-clockwise
     middle: FloatArray  # (2,): of its bounding box, in its frame
-    radius_m: float  # Of its farthest corner from there
-    symmetries: FloatArray  # (s, 3): motions that its outline does not show, or not clearly
+    radius_m: float  # Distance of its farthest corner from there
+    symmetries: FloatArray  # (s, 3): motions that change its outline not at all, or not clearly
 
 
 class Seen(NamedTuple):
@@ -67,10 +67,10 @@ class OutlinePose(NamedTuple):
     """The most likely pose of an outline near a start."""
 
     pose: FloatArray
-    # (3, 3): from the readings alone, but for open directions, which have the prior's
+    # (3, 3): from the readings alone, except for undetermined directions, which have the prior's
     covariance: FloatArray
     by_scanner: FloatArray  # (3, 3 scanners): derivatives of the pose by the scanners' poses
-    used: int  # Readings that it rests on
+    used: int  # Number of readings used
     chi2: float  # Their squared normalised residuals
     open_directions: int
     rms_m: float  # Of their distances from the outline
@@ -82,38 +82,38 @@ class OutlinePose(NamedTuple):
 
 
 class BeamCounts(NamedTuple):
-    """How a pose explains the beams of a set."""
+    """Numbers of a set's beams, compared with a pose."""
 
-    expected: int  # Beams that should see the robot before the background; of these
-    agree: int  # as far as they should,
-    through: int  # farther,
-    hidden: int  # nearer,
+    expected: int  # Beams that should see the robot in front of the background; of these:
+    agree: int  # readings as expected
+    through: int  # readings that are farther
+    hidden: int  # readings that are nearer
     none: int  # without a reading
-    beside: int  # New readings in the outline's circle where the robot is not
+    beside: int  # New readings in the outline's circle, but outside the robot
 
 
 class OutlineFit(NamedTuple):
-    """How an outline is fitted."""
+    """Settings of the fit of an outline."""
 
-    floor_m: float  # Standard deviation of what the outline and the scanner are not
-    least_slope: float  # Beams that graze a face count as if they met it at this sine
-    gate_sigma: float  # Readings farther off do not count
-    gate_m: float  # Instead of this in the first step
-    prior_sigma_m: float  # With it, open directions hold on to the start
-    weak_sigma_m: float  # Directions along which the standard deviation would be larger are open
-    scale_m: float  # A radian counts as this
-    steps: int  # At most
+    floor_m: float  # Standard deviation of the outline's and the scanner's model errors
+    least_slope: float  # Lower bound of the sine of incidence, for beams along a face
+    gate_sigma: float  # Gate of readings, standard deviations
+    gate_m: float  # Gate in the first step
+    prior_sigma_m: float  # Prior deviation from the start, for undetermined directions
+    weak_sigma_m: float  # Standard deviation above which a direction is undetermined
+    scale_m: float  # Length that corresponds to a radian
+    steps: int  # Largest number
 
 
 @kernel()
 def new_points(
     scans: ScanSet, fixed: FixedScanners, centre: FloatArray, reach_m: float, motion: FloatArray
 ) -> Seen:
-    """Points of a set that are nearer than the background and within reach of a place.
+    """Points of a set that are nearer than the background and within reach of a position.
 
-    `centre` (2,): points farther than `reach_m` from here are left out. `motion` (5,): of the
-    robot: velocity (m/s), turn (rad/s), and the point it turns about at the set's time. By it the
-    points are moved on from their scan's time to the set's.
+    `centre` (2,): points farther than `reach_m` from here are ignored. `motion` (5,) of the robot:
+    velocity (m/s), turn rate (rad/s), and the point it turns about at the set's time. It is used to
+    propagate the points from their scan's time to the set's.
     """
     ranges_mm, rows, ages_s = scans
     most = rows.size * ranges_mm.shape[1]
@@ -194,7 +194,7 @@ def _face_of(
 def _hold_open(
     h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
 ) -> tuple[int, FloatArray]:
-    """Add the start as a prior of the directions that the readings leave open, in place.
+    """Add the start as a prior of the directions that the readings do not determine, in place.
 
     `h` (3, 3) and `g` (3,) are the normal equations; directions are evaluated about the `middle`
     (2,) of the points, theta in metres. Returns how many are open, and the least determined one.
@@ -230,10 +230,10 @@ def refine_outline(
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
-    sigma |n . beam|, and a floor for what the outline and the scanner are not. A reading belongs to
-    the face that its beam meets first, whatever its noise; at first, while the pose may be off, to
-    the nearest one turned to the scanner. Readings beyond the gate do not count, and open
-    directions hold on to the start (see `OutlineFit`).
+    sigma |n . beam|, and a floor for model errors of the outline and the scanner. A reading belongs
+    to the face that its beam meets first, whatever its noise; at first, while the pose may be off,
+    to the nearest one facing the scanner. Readings beyond the gate are ignored, and undetermined
+    directions stay at the start (see `OutlineFit`).
     """
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -323,7 +323,7 @@ def refine_outline(
 
 @kernel()
 def explain_set(scans: ScanSet, fixed: FixedScanners, body: Body, pose: FloatArray) -> BeamCounts:
-    """How a pose explains the beams of a set, by casting each of them at the outline."""
+    """Compare a set's beams with a pose, by casting each of them at the outline."""
     ranges_mm, rows, _ = scans
     faces, middle, radius_m = body.faces, body.middle, body.radius_m
     expected = agree = through = hidden = none = beside = 0

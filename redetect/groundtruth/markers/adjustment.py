@@ -1,15 +1,15 @@
-"""All poses of a chain at once: bundle adjustment of cameras, bodies and parts.
+"""Bundle adjustment of all poses of a chain of cameras, bodies and parts.
 
     point in the part's frame --body_from_part--> body --world_from_body--> world
           --inverse of world_from_camera--> camera --projection--> pixel
 
-Every estimation here is of this form. A robot's pose: the body is the robot, its parts are the
-markers. A rig: the same with the parts unknown. A network of cameras: bodies are the boards held
-before the cameras, their parts the two faces.
+All estimations here have this form. A robot's pose: the body is the robot, its parts are the
+markers. A rig: the same with unknown parts. A network of cameras: bodies are the boards held in
+front of the cameras, their parts the two faces.
 
-The unknowns are poses, not points: a marker's four corners and a board's are rigid and of known
-size, which gives the result its scale. Bundle adjusters for reconstruction (as pycolmap's) move
-each point independently and cannot keep a square rigid.
+The unknowns are poses, not points: the corners of a marker or board are rigid and of known size,
+which gives the result its scale. Bundle adjusters for reconstruction (such as pycolmap's) move each
+point independently and cannot keep a square rigid.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ UNDETERMINED = "the points do not determine all poses"
 class ChainPoints:
     """Points seen in images."""
 
-    camera: IntArray  # (N,): which camera, body and part each point belongs to
+    camera: IntArray  # (N,): indices of each point's camera, body and part
     body: IntArray
     part: IntArray
     points: FloatArray  # (N, 3): in the part's frame (m)
@@ -68,16 +68,16 @@ class ChainPoints:
 
 
 class Chain(NamedTuple):
-    """Cameras, bodies and their parts, as the points of a `ChainPoints` name them."""
+    """Cameras, bodies and their parts, with the indices used in `ChainPoints`."""
 
-    cameras: Sequence[Camera]  # Their lenses; the mounting that a `Camera` holds is not used
+    cameras: Sequence[Camera]  # Their lenses; the mounting of a `Camera` is not used
     world_from_camera: FloatArray  # (C, 4, 4)
     world_from_body: FloatArray  # (B, 4, 4)
     body_from_part: FloatArray  # (P, 4, 4)
 
 
 class ChainProjection(NamedTuple):
-    """Pixels of points and how they move with right perturbations of the three poses."""
+    """Pixels of points and their derivatives by right perturbations of the three poses."""
 
     # (N, 2): NaN where a point is not in front of its camera or past the distortion's fold
     pixels: FloatArray
@@ -125,7 +125,7 @@ def _by_tangent(by_point: FloatArray, points: FloatArray) -> FloatArray:
     return np.concatenate([by_point, -(by_point @ cross_matrices(points))], axis=-1)
 
 
-# Of the first pass, which only has to come near: points farther off than this pull less.
+# Scale of the robust loss of the first, coarse pass.
 _PLAIN, _ROBUST, _NEAR = Loss(), Loss("huber", 3.0), 1e-6
 _TOLERANCE = 1e-15
 
@@ -207,8 +207,8 @@ class AdjustedBundle:
     """A bundle at its minimum."""
 
     bundle: Bundle  # With the adjusted poses
-    used: BoolArray  # (N,): points whose views were not found to be wrong
-    residuals: FloatArray  # (N, 2): pixels seen minus pixels expected, of all points
+    used: BoolArray  # (N,): points whose views are not outliers
+    residuals: FloatArray  # (N, 2): measured minus predicted pixels, of all points
     cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
     # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, the bodies marginalised;
@@ -252,7 +252,7 @@ def adjust_bundle(
         if np.array_equal(kept, used) and used is not everything:
             break
         used = kept
-        # A body of which nothing is left to be used stays where it is.
+        # A body without used points is not moved.
         free = bundle.free.copy()
         free[bundle.shared :] &= np.isin(
             np.arange(len(bundle.world_from_body)), bundle.seen.body[used]

@@ -1,9 +1,9 @@
 """The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
 
 The chosen solver (of OpenCV or pycolmap) gives initial poses, which are refined by least squares
-over all corners. If all markers agree, it remains to check whether the mirror image of the markers
-explains the corners as well. If not, each marker's own two solutions are hypotheses, and the one
-that most others agree with decides which markers are wrong.
+over all corners. If all markers agree, the mirror image of the markers is tested, too, since it may
+explain the corners as well. If not, each marker's own two solutions are hypotheses, and the one
+with which most others agree determines the wrong markers.
 """
 
 from __future__ import annotations
@@ -209,10 +209,10 @@ def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
 _SAME_ANGLE_RAD = 0.01
 _SAME_PLACE_M = 0.005
-# A mirror image that explains all views is near what one view alone says of it.
+# A mirror image that explains all views is close to the estimate from one view alone.
 _FARTHEST_START_PX = 40.0
 _OWN_STARTS = 4
-# A robot that left the hall is no solution: least squares ran off.
+# A robot outside the hall is not a solution: least squares diverged.
 _FARTHEST_M = 1e4
 
 
@@ -314,7 +314,7 @@ def _same(a: FloatArray, b: FloatArray) -> bool:
 
 
 def _inflation(best: RefinedPose) -> float:
-    """How much larger the residuals are than their covariances say; never less than 1."""
+    """Factor of the squared residuals to their covariances; at least 1."""
     return max(1.0, best.cost / max(1, best.degrees_of_freedom))
 
 
@@ -330,7 +330,7 @@ def _likely(minima: list[RefinedPose], settings: PoseSettings) -> list[RefinedPo
 
 
 def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
-    """Whether a second minimum is a dimple that the best one's covariance covers anyway."""
+    """Whether a second minimum is within the covariance of the best one."""
     apart = log_se3(inverse(best.world_from_robot) @ pose.world_from_robot)
     return bool(apart @ np.linalg.solve(best.covariance, apart) < 4.0)
 
@@ -359,7 +359,7 @@ def _consensus(problem: PoseProblem) -> tuple[BoolArray, RefinedPose]:
     largest = max(int(views.sum()) for views, _ in found.values())
     best = [entry for entry in found.values() if int(entry[0].sum()) == largest]
     best.sort(key=lambda entry: entry[1].cost)
-    # Sets that share most of their views are the same story with another doubtful view.
+    # Sets that share most of their views differ only in a doubtful view.
     if any(2 * int((views & best[0][0]).sum()) <= largest for views, _ in best):
         raise GeometryError(f"groups of {largest} markers exclude each other")
     return best[0]

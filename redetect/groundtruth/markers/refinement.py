@@ -1,14 +1,13 @@
 """A robot's pose by weighted least squares over all corners of all markers in all cameras.
 
-The corners' covariances describe the image's noise only. Where markers and cameras are not exactly
-known, their uncertainty moves all corners of a marker, or of a camera, together. So the weight is
-the inverse of
+The corners' covariances describe the image's noise only. Uncertain poses of markers and cameras
+move all corners of a marker, or of a camera, together. So the weight is the inverse of
 
     S = R + G C G^T
 
 with R the corners' covariances, C that of the calibration and G the corners' derivatives by it.
-This is the estimate of pose *and* calibration with C as the calibration's prior, the calibration
-marginalised: its uncertainty reaches the pose's covariance, and counts in the weights.
+This is the estimate of pose *and* calibration with C as the calibration's prior, marginalised over
+the calibration: its uncertainty is included in the pose's covariance and in the weights.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from redetect.landmarks import squared_mahalanobis
 _ROWS = 8
 # Normalised error of a view at which its weight begins to fall.
 _HUBER = 2.0
-# Steps (m, rad) that are as good as none, and the share of the cost that rounding may hide.
+# Negligible steps (m, rad), and the share of the cost that is rounding.
 _SMALLEST_STEP, _COST_TOLERANCE, _MOST_STEPS = 1e-10, 1e-15, 200
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 
@@ -113,7 +112,7 @@ class _Corners(NamedTuple):
 
 
 def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
-    """Go down from a start to the nearest minimum.
+    """Descend from a start to the nearest minimum.
 
     A marker's four corners are weighted together, by Huber's loss. `start` (4, 4) is a pose
     `world_from_robot`. Raises `GeometryError` if a corner is behind its camera there, or the
@@ -134,7 +133,7 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
         cost = _cost(problem, ahead, now.covariance)
         gain = float(step @ (added * step - now.gradient))
         settled = np.abs(step).max() < _SMALLEST_STEP or gain <= _COST_TOLERANCE * now.cost
-        # Near the minimum rounding decides which cost is less; such steps are right all the same.
+        # Near the minimum rounding decides which cost is lower; such steps are still correct.
         if cost <= now.cost * (1.0 + _COST_TOLERANCE) + 1e-20:
             pose = ahead
             if settled:

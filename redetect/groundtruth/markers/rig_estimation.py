@@ -1,8 +1,8 @@
-"""Where the markers sit on a robot, from images that show several of them.
+"""Estimates the poses of markers on a robot, from images that show several of them.
 
-Pairs of markers seen together, a consensus for each pair, a tree over the best supported pairs
-(markers never seen together are bridged by a third), and one bundle adjustment of all markers and
-all times.
+The steps: pairs of markers seen together, a consensus for each pair, a tree over the best supported
+pairs (markers never seen together are connected by a third), and one bundle adjustment of all
+markers and all times.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View
 from redetect.groundtruth.settings import PoseSettings, RigSettings
 from redetect.groundtruth.trajectories.transforms import inverse, mean_pose
 
-# Exactly known poses are held to a micrometre and a microradian.
+# Standard deviations of exactly known poses: a micrometre and a microradian.
 _EXACT = 1e-12
-# Where a time's pose is chosen among its markers' solutions, a wrong one counts no more than this.
+# Bound of a wrong solution's cost, when a time's pose is chosen among its markers' solutions.
 _WRONG_PX = 20.0
 
 
@@ -52,7 +52,7 @@ class RigEstimate:
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
     adjusted: AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
-    times: int  # How many times (images, without a network) were used
+    times: int  # Number of times (images, without a network) used
     left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
 
 
@@ -72,8 +72,8 @@ def estimate_rig(
     groups : sequence of sequences of MarkerFrame
         Images taken at one time; single ones where the cameras are not calibrated to each other.
     network : Network
-        The cameras; their places mean nothing where they are not calibrated to each other. If it
-        has a covariance, that is a prior of the cameras' adjustment.
+        The cameras; their poses are ignored if they are not calibrated to each other. If it has a
+        covariance, that is a prior of the cameras' adjustment.
     width_m : float
         Width of the markers.
     reference : int, optional

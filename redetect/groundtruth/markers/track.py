@@ -1,4 +1,4 @@
-"""A robot's poses over a session: every time's pose, decided by its neighbours, and an account."""
+"""A robot's poses over a session, with ambiguities decided by neighbouring times, and a report."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class TrackedTime:
     images: tuple[MarkerFrame, ...]
     views: tuple[View, ...]  # The rig's markers in them
     # `clear`, or `resolved` by the neighbours: there is a pose. `unresolved`: several poses are
-    # possible; `rejected`: what was seen does not fit the times before and after; `failed`: no pose
+    # possible; `rejected`: the candidates do not fit the times before and after; `failed`: no pose
     # explains the corners; `unseen`: no marker of the rig in any image.
     status: Status
     estimate: PoseEstimate | None = None
@@ -61,7 +61,7 @@ class Track:
 
     @property
     def counts(self) -> dict[Status, int]:
-        """How many times ended how."""
+        """Number of times by status."""
         return {status: sum(t.status == status for t in self.times) for status in STATUSES}
 
     @property
@@ -90,7 +90,7 @@ def track_robot(
     network: Network,
     settings: PoseSettings,
 ) -> Track:
-    """Work out the robot's poses from the markers found in a session's images.
+    """Compute the robot's poses from the markers found in a session's images.
 
     `groups` are the images of each time (`redetect.groundtruth.markers.session.group_by_time`),
     their cameras' indices those of `network`.
@@ -188,7 +188,7 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
     return replace(tracked, status=choice.status, choice=choice, reason=reason, pose=pose)
 
 
-# In units of negative log-likelihood: leaving a frame out is cheaper than two jumps round it, and a
+# Costs as negative log-likelihoods: skipping a frame is cheaper than two jumps around it, and a
 # robot that was carried elsewhere costs one jump.
 _JUMP_COST = 20.0
 _REJECT_COST = 15.0
@@ -198,11 +198,11 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Choice:
-    """Which candidate of a frame is the robot's pose."""
+    """The candidate of a frame that is the robot's pose."""
 
-    candidate: int | None  # None where the frame fits its neighbours with no candidate
-    # `clear` (there was only one), `resolved` by the neighbours, `unresolved` (the named candidate
-    # is the likeliest but not likely enough), or `rejected`
+    candidate: int | None  # None if no candidate of the frame fits its neighbours
+    # `clear` (there was only one), `resolved` by the neighbours, `unresolved` (the given candidate
+    # is the most likely one, but not likely enough), or `rejected`
     status: Status
     margin: float  # Natural logarithm of the odds against the next candidate; infinite without one.
 
@@ -219,7 +219,7 @@ def choose_candidates(
     choices = []
     for number, estimate in enumerate(estimates):
         costs = through[frame == number]
-        # The cheapest sequence leaves the frame out.
+        # The cheapest sequence skips the frame.
         if cheapest < costs.min() - _ROUNDING:
             choices.append(Choice(None, "rejected", float(costs.min() - cheapest)))
             continue

@@ -1,7 +1,7 @@
-"""Which rows of a run show the same landmark.
+"""Data association: which rows of a run show the same landmark.
 
-`run` is the way through: `frame_to_frame` against a map that travels with the robot, places met
-again by constellations of landmarks (`loops`), and the path that they say (`loop_closing`);
-verticals along it (`line_points`). `placing` lays a run on a map. `compatibility` gates single rows
-or tests them jointly; `score` compares with identifiers that are known.
+`run` calls the stages: `frame_to_frame` against a local map that moves with the robot, detection of
+revisited places by constellations of landmarks (`loops`), the resulting path (`loop_closing`), and
+verticals along it (`line_points`). `placing` registers a run in a map. `compatibility` gates single
+rows or tests them jointly; `score` compares with known identifiers.
 """

@@ -1,12 +1,12 @@
-"""Which rows show which known landmarks: individual gate, or joint compatibility (JCBB).
+"""Associates rows with known landmarks: individual gate, or joint compatibility (JCBB).
 
-A frame's innovations are not independent: all of them carry the error of the one pose. Joint
+A frame's innovations are not independent: all of them share the error of the pose. Joint
 compatibility tests whether a set of pairs is likely *together*; branch and bound finds the largest
 such set (J. Neira, J. D. Tardos, "Data association in stochastic mapping using the joint
 compatibility test", IEEE Transactions on Robotics and Automation 17(6), 2001).
 
-Everything here is in terms of innovations and covariances, whatever the landmarks are: of n rows
-and m landmarks that may be in view, each measured by d numbers (2 for a disc, 1 for a bearing).
+All functions take innovations and covariances, whatever the landmarks are: n rows and m landmarks
+that may be visible, each measured by d numbers (2 for a disc, 1 for a bearing).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def compatible(
     *,
     most_nodes: int = MOST_NODES,
 ) -> IntArray:
-    """Which rows show which landmarks.
+    """Associate rows with landmarks.
 
     Parameters
     ----------
@@ -44,18 +44,18 @@ def compatible(
         `nearest`: nearest neighbour with Mahalanobis gate, closest pairs first, each row and
         landmark once. `joint`: the largest set of pairs that are compatible jointly, among equals
         the most likely one. Every pair must pass the individual gate, and all k pairs together the
-        gate of d k degrees of freedom. Unlike in the published search, a branch is only given up
-        where no set below it can pass, so that the result does not depend on the order of the rows.
+        gate of d k degrees of freedom. Unlike the published search, a branch is pruned only if no
+        set below it can pass, so that the result does not depend on the order of the rows.
     innovations, predicted_covariance, noise : (n, m, d), (m d, m d), (n, d, d) float64
     gate_probability : float
-        Share of right pairs, or sets of pairs, that pass.
+        Share of correct pairs, or sets of pairs, that pass.
     most_nodes : int
         Bound of the joint search.
 
     Returns
     -------
     (n,) int64
-        Index of each row's landmark, -1 where it shows none of them; none is there twice.
+        Index of each row's landmark, -1 if it shows none of them; each occurs at most once.
     """
     arrays = map(np.ascontiguousarray, (innovations, predicted_covariance, noise))
     innovations, predicted_covariance, noise = arrays
@@ -66,7 +66,7 @@ def compatible(
         return pair_nearest_first(squared, gates[1] if n else 0.0)
     candidates = np.argsort(squared, axis=1, kind="stable")
     counts = np.sum(squared <= gates[1], axis=1) if n else np.zeros(0, np.int64)
-    # Rows with few candidates first: they decide most.
+    # Rows with few candidates first, since they constrain the search most.
     rows = np.argsort(counts, kind="stable")
     rows = rows[counts[rows] > 0]
     return search_jointly(
@@ -76,9 +76,9 @@ def compatible(
 
 @cache
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
-    """Largest squared distances of 0, 1, 2, ... pairs that stay below with a probability.
+    """Chi-squared quantiles for the squared distances of 0, 1, 2, ... pairs.
 
-    Returns (most_pairs + 1,), not to be changed.
+    Returns (most_pairs + 1,), not to be modified.
     """
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
@@ -97,8 +97,8 @@ def _append(
 ) -> float:
     """Extend a Cholesky factor and the whitened innovation by one pair's block, in place.
 
-    Returns what the pair adds to the squared distance; negative if the covariance is not positive
-    definite with it.
+    Returns the pair's contribution to the squared distance; negative if the extended covariance is
+    not positive definite.
     """
     width = len(innovation)
     added = 0.0
@@ -127,7 +127,7 @@ def individual_distances(
 ) -> FloatArray:
     """Squared Mahalanobis distance of each row from each landmark (n, m).
 
-    Infinite where a covariance is not positive definite or an innovation is not finite.
+    Infinite if a covariance is not positive definite or an innovation is not finite.
     """
     n, m, width = innovations.shape
     every = np.arange(m)
@@ -161,11 +161,11 @@ def search_jointly(
     gates: FloatArray,
     most_nodes: int,
 ) -> IntArray:
-    """Depth-first branch and bound over all ways to give rows landmarks.
+    """Depth-first branch and bound over all assignments of landmarks to rows.
 
-    Parameters are those of `compatible`, and the rows in the order in which they get
-    landmarks, the first `counts` (n,) of `candidates` (n, m) of each, the joint gate of k pairs
-    `gates[k]` (n + 1), and how many pairs may be tried.
+    Parameters are those of `compatible`, and the order in which rows are assigned, the candidates
+    of each row, the first `counts` (n,) of `candidates` (n, m), the joint gate of k pairs
+    `gates[k]` (n + 1), and the largest number of pairs to try.
 
     Returns (n,): the landmark of each row, -1 without.
     """

@@ -1,9 +1,9 @@
-"""Association from frame to frame, against the landmarks seen of late.
+"""Association from frame to frame, against recently seen landmarks.
 
-These are the state of an EKF-SLAM (`redetect.slam.filters.ekf_slam`) that forgets what is out of
-sight. Its innovations carry the correlation that joint compatibility needs. How uncertain the pose
-has become by drift has no part in them: landmarks share that error, and what the heading turns is
-evaluated at first estimates, so that it cancels.
+These are the state of an EKF-SLAM (`redetect.slam.filters.ekf_slam`) that forgets landmarks out of
+sight. Its innovations include the correlation that joint compatibility needs. Accumulated drift
+does not affect them: landmarks share that error, and Jacobians by the heading are evaluated at
+first estimates, so that it cancels.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from redetect.slam.filters.frames import FrameRows, frames_of
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 
-# A landmark that is unseen for longer is forgotten (frames); so is a disc whose position relative
-# to the robot has become less certain than this (m), beyond some distance in proportion to it.
+# A landmark unseen for longer is forgotten (frames); so is a disc whose position relative to the
+# robot is more uncertain than this (m), a limit that grows in proportion beyond some distance.
 _FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
 # At most this many landmarks of each kind are kept, those seen last.
 _MOST_LANDMARKS = 40
@@ -46,7 +46,7 @@ def associate_locally(
     none = FrameRows(CircleRows.of(), LineRows.of())
     disc_labels: list[int] = []
     line_labels: list[int] = []
-    discs_seen: dict[int, int] = {}  # when landmarks were seen last
+    discs_seen: dict[int, int] = {}  # frame of each landmark's last sight
     lines_seen: dict[int, int] = {}
     lost = {0, *recording.lost.tolist()}
     for frame, rows in enumerate(frames_of(replace(recording, circles=scaled))):
@@ -54,7 +54,7 @@ def associate_locally(
             ekf = EkfSlam(camera_xy=camera_xy, tilt_sigma_rad=setting.tilt_sigma_rad)
         ekf.predict(recording.steps[frame], recording.step_covariance[frame])
         _forget(ekf, frame, discs_seen, lines_seen)
-        # Discs first: after them the pose is known better.
+        # Discs first, since they improve the pose.
         if len(rows.circles):
             found = _labels(ekf, rows.circles, len(discs_seen), setting)
             disc_labels += found
@@ -86,7 +86,7 @@ def _labels(
 def _forget(
     ekf: EkfSlam, frame: int, discs_seen: dict[int, int], lines_seen: dict[int, int]
 ) -> None:
-    """Take landmarks out that were not seen for long, or have become too uncertain."""
+    """Remove landmarks that were not seen for long, or have become too uncertain."""
     names = list(ekf.disc_slots)
     place, jacobian, index, _ = ekf.predicted(list(ekf.disc_slots.values()), [])
     spread = np.einsum("ij,jk,ik->i", jacobian, ekf.block(index), jacobian)

@@ -3,11 +3,11 @@
 A row of a vertical is a ray in the map. From frame to frame it is ambiguous: neighbouring edges are
 closer together than the uncertainty of a bearing, and a new edge may be at any distance. Over many
 frames the rays of one vertical intersect in one point, which becomes less likely by chance with
-each frame. So at each intersection of rays of frames a few steps apart, the likelihood of the
-surrounding frames with a vertical there is compared with that without. The best point is assigned
-its rows, at most one per frame; then the next best point among the remaining rows. This is a greedy
-solution of what multiple hypothesis tracking solves with trees (D. B. Reid, "An algorithm for
-tracking multiple targets", IEEE Transactions on Automatic Control 24(6), 1979).
+each frame. So for each intersection of rays of frames a few steps apart, the likelihood of the
+surrounding frames with a vertical there is compared to that without. The best point is assigned its
+rows, at most one per frame; then the next best point among the remaining rows. This is a greedy
+solution of the problem that multiple hypothesis tracking solves with trees (D. B. Reid, "An
+algorithm for tracking multiple targets", IEEE Transactions on Automatic Control 24(6), 1979).
 
 The path comes from the discs; it gives the heading of a single frame less precisely than a bearing
 is measured. So the verticals associated from frame to frame are added to the least-squares problem
@@ -37,28 +37,28 @@ from redetect.slam.recording import Recording
 class Rays(NamedTuple):
     """Rows of verticals in the map, by frame and bearing."""
 
-    row: IntArray  # (n,): which row of the run each ray is
-    centre: FloatArray  # (n, 2): the camera's place (m)
+    row: IntArray  # (n,): index of each ray's row in the run
+    centre: FloatArray  # (n, 2): the camera's position (m)
     # (n,): its direction in the map, and in the robot frame (rad).
     angle: FloatArray
     bearing: FloatArray
     sigma: FloatArray  # (n,): of it (rad)
     frame: IntArray  # (n,): ascending from 0
     start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f
-    heading: FloatArray  # (F, 2): cosine and sine of the robot's
+    heading: FloatArray  # (F, 2): cosine and sine of the robot's heading
     widest_rad: float  # half the field of view, below a right angle
 
 
-# Probability that a vertical in view gives a row, and standard deviations within which a ray may be
+# Probability that a visible vertical gives a row, and standard deviations within which a ray may be
 # that row.
 _DETECTED, _GATE = 0.7, 3.0
-# Frames before and after a crossing that are considered.
+# Number of frames before and after a crossing that are considered.
 _WINDOW = 40
 # Of a point: log likelihood ratio of the rows with it to without.
 _LEAST_SCORE = 4.0
 # Numbers of steps between frames whose rays are intersected.
 _GAPS = np.array([2, 4, 7, 11])
-# Least angle between two rays that are intersected, in standard deviations, and how far away.
+# Least angle between two intersected rays, in standard deviations, and largest distance.
 _LEAST_PARALLAX_SIGMAS, _FARTHEST_M = 4.0, 14.0
 _NEAREST_M = 0.3
 _FEWEST_ROWS = 3
@@ -110,12 +110,12 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
 def _best_run(
     point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, reach: float
 ) -> tuple[float, IntArray]:
-    """The unbroken stretch of frames with the most evidence for a vertical at a point.
+    """The contiguous stretch of frames with the most evidence for a vertical at a point.
 
-    A frame in which a ray passes within the gate adds the logarithm of how much likelier the ray is
-    from there than from anywhere (its `worth`, at the best); one without such a ray, though the
-    point is in the field of view, adds that of the probability to miss a vertical. Returns the sum
-    over the stretch, and its rays.
+    A frame with a ray within the gate adds the log likelihood ratio of a ray from that point to one
+    from anywhere (at most its `worth`); a frame without such a ray, if the point is in the field of
+    view, adds the log probability of missing a vertical. Returns the sum over the stretch, and its
+    rays.
     """
     start, bearing, sigma = rays.start, rays.bearing, rays.sigma
     first, last = max(0, frame - _WINDOW), min(len(start) - 1, frame + _WINDOW)
@@ -137,7 +137,7 @@ def _best_run(
         seen = math.atan2(left, ahead)
         gained = missed
         i, end = start[f], start[f + 1]
-        while i < end:  # the first ray that is near enough
+        while i < end:  # the first ray within the gate
             middle = (i + end) // 2
             if bearing[middle] < seen - reach:
                 i = middle + 1
@@ -186,19 +186,19 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
 def take_points(
     points: FloatArray, frames: IntArray, rays: Rays, reach: float
 ) -> tuple[IntArray, FloatArray]:
-    """The best of all points with the rays that it takes, then the best by the other rays, ...
+    """Select points greedily: the best one with its rays, then the best of the other rays, etc.
 
-    Takes `points` (k, 2), `frames` (k,), and how far off the widest gate lets a bearing be (rad);
-    returns `labels` (n,), `found` (m, 2).
+    Takes `points` (k, 2), `frames` (k,), and the widest gate of a bearing (rad); returns `labels`
+    (n,), `found` (m, 2).
     """
-    # How much likelier a ray is from a vertical than from anywhere, as a logarithm.
+    # Log likelihood ratio of a ray from a vertical to one from anywhere.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)
     worth = np.log(_DETECTED / (rays.sigma * _ROOT_TWO_PI * clutter))
     free = np.ones(len(rays.angle), dtype=np.bool_)
     labels = np.full(len(free), -1, dtype=np.int64)
     found = np.empty((len(free), 2))
     count = 0
-    # Scores only fall as rows are assigned: a point still first when rescored is the best.
+    # Scores only decrease as rows are assigned: a point still first when rescored is the best.
     waiting = [(0.0, 0) for _ in range(0)]
     for k in range(len(points)):
         score, _ = _best_run(points[k], frames[k], rays, free, worth, reach)
@@ -228,7 +228,7 @@ def take_points(
     return labels, found[:count].copy()
 
 
-# How far beyond the field of view a bearing may be.
+# Tolerance of bearings beyond the field of view.
 _WIDER_RAD = 0.005
 # Number of times that the frame-to-frame association corrects the path.
 _FIRST_ROUNDS = 2
@@ -237,7 +237,7 @@ _HEADING_SIGMA_DEG = (0.2, 0.15, 0.1, 0.1)
 # Factor on the rows' standard deviations, which do not include the detector's errors at edges that
 # are close together; the same for rows that correct the path.
 _SIGMA_SCALE, _PATH_SIGMA_SCALE = 1.5, 2.0
-# Points of fewer rows do not correct the path.
+# Points with fewer rows do not correct the path.
 _PATH_ROWS = 6
 
 
@@ -250,7 +250,7 @@ def lines_by_points(
     camera_xy: ArrayLike = (0.0, 0.0),
     disc_sigma_scale: float = 1.0,
 ) -> tuple[IntArray, FloatArray]:
-    """Labels of the rows of verticals, by the points in which they meet.
+    """Labels of the rows of verticals, by the points in which their rays intersect.
 
     Takes `path` (N + 1, 3), `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,); returns
     `labels` (m,), `path` (N + 1, 3).
@@ -259,7 +259,7 @@ def lines_by_points(
     scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))
 
     def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
-        """Least squares over poses, discs and points, again without the rows that are far off."""
+        """Least squares over poses, discs and points, repeated without outliers."""
         count = len(points)
         used = (labels >= 0) & (
             np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= _PATH_ROWS
@@ -330,7 +330,7 @@ def rays_of(
 
 
 def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
-    """The points in which rays meet, the best first.
+    """The points in which rays intersect, the best first.
 
     Returns `labels` (n,), `points` (k, 2).
     """

@@ -1,7 +1,7 @@
-"""Closing the loops that were found: labels merged, and the path and landmarks that they say.
+"""Closes loops: merges labels, and solves for the resulting path and landmarks.
 
 The least-squares problem is that of `slam map` with the labels as identifiers, under Huber's loss,
-so that rows count less which contradict all others.
+so that rows that contradict all others count less.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
 from redetect.slam.recording import Recording
 
-# Lines whose places are less certain have none.
+# Lines with a less certain position have none.
 _LEAST_SIGMA_M = 0.5
 
 
@@ -44,7 +44,7 @@ class LabelledMap(NamedTuple):
 
     path: FloatArray  # (N + 1, 3): start and pose after each step; theta is not wrapped
     circle_xy: FloatArray  # (M, 2), by label (m)
-    line_xy: FloatArray  # (L, 2), by label (m); NaN where nothing is known
+    line_xy: FloatArray  # (L, 2), by label (m); NaN if unknown
 
 
 def intersect_bearings(
@@ -54,7 +54,7 @@ def intersect_bearings(
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
 ) -> FloatArray:
-    """Places of lines from the bearings of all rows that saw them, the path being known.
+    """Positions of lines from the bearings of all their rows, given the path.
 
     Takes `path` (N + 1, 3), `labels` (n,), `camera_xy` (2,); returns (L, 2).
     """
@@ -80,9 +80,9 @@ def solve_path(
 ) -> LabelledMap:
     """Least squares over all poses and landmarks, from a path (by default odometry) on.
 
-    Labels count from 0 without gaps. Lines keep near their initial positions `line_xy` (L, 2); rows
-    of lines with NaN are ignored, without `line_xy` all. `sigma_scale` is a factor on the discs'
-    standard deviations.
+    Labels count from 0 without gaps. Lines have their initial positions `line_xy` (L, 2) as priors;
+    rows of lines with NaN are ignored, without `line_xy` all rows of lines. `sigma_scale` is a
+    factor on the discs' standard deviations.
     """
     circles, lines = recording.circles, recording.lines
     poses = chain_steps(recording.steps) if path is None else path
@@ -110,11 +110,11 @@ def solve_path(
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
-# Largest squared error of a loop whose odometry errs at random; and of how many standard deviations
-# the systematic error of each step may be.
+# Largest squared error of a loop with random errors of odometry; largest systematic error of each
+# step, in standard deviations.
 _MOST_SQUARED = float(chdtri(3, 1e-6))
 _SYSTEMATIC_SIGMAS = 2.0
-# Weight of a step that says nothing: just enough to keep the equations solvable.
+# Weight of a lost step: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
 NO_STEPS = np.zeros(0, dtype=np.int64)
 # Labels farther apart than this are not compared.
@@ -122,7 +122,7 @@ _FARTHEST_M = 0.35
 
 
 def seen_together(frames: IntArray, labels: IntArray) -> list[set[int]]:
-    """Of each label those that rows of one frame have: surely others, and never to be merged.
+    """For each label, those in the same frame: distinct landmarks, never to be merged.
 
     Takes `frames, labels` (n,).
     """
@@ -137,7 +137,7 @@ def seen_together(frames: IntArray, labels: IntArray) -> list[set[int]]:
 def merge_labels(
     frames: IntArray, labels: IntArray, pairs: Iterable[tuple[int, int]]
 ) -> tuple[IntArray, int]:
-    """Give labels that are one landmark the same number.
+    """Merge labels that are the same landmark.
 
     Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
@@ -157,7 +157,7 @@ def merge_labels(
 
 
 def in_order(labels: IntArray) -> IntArray:
-    """Number labels from 0 without gaps, in the order of their first rows; -1 stays.
+    """Renumber labels from 0 without gaps, in the order of their first rows; -1 stays.
 
     Takes `labels` (n,); returns (n,).
     """
@@ -169,7 +169,7 @@ def in_order(labels: IntArray) -> IntArray:
 
 
 def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
-    """The pairs of labels (k, 2) of all matches, those that most matches agree on first."""
+    """The pairs of labels (k, 2) of all matches, by decreasing number of matches."""
     votes = Counter((min(a, b), max(a, b)) for pairs in matches for a, b in pairs.tolist())
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
@@ -177,7 +177,7 @@ def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
 def pairs_in_place(
     stretches: Sequence[Stretch], covariance: FloatArray, gate_probability: float
 ) -> list[tuple[int, int]]:
-    """Pairs of labels that lie at the same position, in stretches known to be the same place.
+    """Pairs of labels at the same position, in stretches known to be the same place.
 
     Takes `covariance` (M, 2, 2).
     """
@@ -203,20 +203,20 @@ def pairs_in_place(
 def consistent_matches(
     matches: Sequence[Match], closed: Sequence[Match], path: FloatArray, step_covariance: FloatArray
 ) -> list[Match]:
-    """Matches that neither odometry nor other matches contradict: rooms may look alike.
+    """Matches that neither odometry nor other matches contradict, since rooms may look alike.
 
-    Two loops make a third: from the earlier frame of one to that of the other, across, and back
-    along the later ones. It has to close as well as the odometry of these ways allows (J. G.
-    Mangelson, D. Dominic, R. M. Eustice, R. Vasudevan, "Pairwise consistent measurement set
-    maximization for robust multi-robot map merging", ICRA 2018), and so has each loop by itself.
-    Those that odometry agrees with best are taken first, each if all that were taken agree.
+    Two loops form a third one: from the earlier frame of one to that of the other, across, and back
+    along the later ones. It has to close as well as the odometry along it allows (J. G. Mangelson,
+    D. Dominic, R. M. Eustice, R. Vasudevan, "Pairwise consistent measurement set maximization for
+    robust multi-robot map merging", ICRA 2018), and so has each single loop. Matches are accepted
+    in the order of their agreement with odometry, each if it is consistent with all accepted ones.
 
-    Odometry may err systematically: each step by two standard deviations, all in one direction.
+    Odometry may have systematic errors: two standard deviations in each step, in one direction.
 
-    Takes matches that are new and those that the path has `closed` already, `path` (N + 1, 3),
-    `step_covariance` (N, 3, 3).
+    Takes new matches and those already `closed` in the path, `path` (N + 1, 3), `step_covariance`
+    (N, 3, 3).
     """
-    # A step's error moves all that follows, and turns it about the pose after the step.
+    # A step's error moves everything after it, and rotates it about the pose after the step.
     by_error = np.zeros((len(path) - 1, 3, 3))
     by_error[:, :2, :2] = rotation(path[:-1, 2])
     by_error[:, :, 2] = np.stack([path[1:, 1], -path[1:, 0], np.ones(len(path) - 1)], axis=1)
@@ -229,7 +229,7 @@ def consistent_matches(
     motion[: len(closed)] = 0.0
 
     def excess(k: int, other_frames: IntArray, other_motion: FloatArray) -> FloatArray:
-        """By how much the squared errors of the loops of match k with others exceed the bound."""
+        """Excess of the squared errors of the loops of match k with others over the bound."""
         low, high = np.minimum(frames[k], other_frames), np.maximum(frames[k], other_frames)
         # The loop begins and ends with the later frame.
         x, y = path[frames[k, 1] + 1, :2]
@@ -239,7 +239,7 @@ def consistent_matches(
         systematic = _SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
         return np.asarray(squared_mahalanobis(gap, spread) - systematic - _MOST_SQUARED)
 
-    # By itself a match makes a loop with none: that of its earlier frame with itself.
+    # A single match forms a loop with the trivial one of its earlier frame with itself.
     alone = {
         k: excess(k, frames[[k]][:, [0, 0]], np.zeros((1, 3)))[0]
         for k in range(len(closed), len(both))
@@ -253,14 +253,14 @@ def consistent_matches(
 def closed_path(
     path: FloatArray, matches: Sequence[Match], lost: IntArray = NO_STEPS
 ) -> FloatArray:
-    """A path that satisfies the matches: where least squares over everything may start from.
+    """A path that satisfies the matches, as a start for least squares over everything.
 
-    Headings first, then places: each of the two problems is linear (L. Carlone, R. Aragues, J. A.
-    Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph optimization",
-    International Journal of Robotics Research 33, 2014). So it does not matter how far off the path
-    was.
+    Headings first, then positions: each of the two problems is linear (L. Carlone, R. Aragues,
+    J. A. Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph
+    optimization", International Journal of Robotics Research 33, 2014). So the path before may be
+    arbitrarily wrong.
 
-    Takes `path` (N + 1, 3), and the steps that say nothing; returns (N + 1, 3).
+    Takes `path` (N + 1, 3), and the lost steps; returns (N + 1, 3).
     """
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)

@@ -1,11 +1,11 @@
-"""Loops: which parts of a run's map are one place, found by the landmarks' mutual distances.
+"""Detects loops: parts of a run's map that are the same place, by mutual distances of landmarks.
 
-Landmarks seen in a short stretch of the run form a constellation that odometry's drift bends by
-little. Two constellations of one place are aligned by a rigid motion that pairs of landmarks vote
-for. A match is accepted if as many landmarks agree as would by chance in less than one of a
-thousand runs. The criterion is the expected number of matches at least as good among random
-constellations, over all motions tried ("number of false alarms", A. Desolneux, L. Moisan,
-J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 40, 2000).
+Landmarks seen in a short stretch of the run form a constellation that the drift of odometry hardly
+deforms. Two constellations of one place are aligned by a rigid motion that pairs of landmarks vote
+for. A match is accepted if that many landmarks would agree by chance in less than one of a thousand
+runs. The criterion is the expected number of matches at least as good among random constellations,
+over all motions tried ("number of false alarms", A. Desolneux, L. Moisan, J.-M. Morel, "Meaningful
+alignments", International Journal of Computer Vision 40, 2000).
 """
 
 from __future__ import annotations
@@ -29,17 +29,16 @@ _CELL_M = 0.05
 _NEIGHBOURS = 5
 
 
-# By how much the lengths of two pairs of landmarks may differ to vote, and how long these have to
-# be (m).
+# Largest difference of the lengths of two pairs of landmarks that vote, and least length (m).
 _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
 #: Largest distance of landmarks that agree (m).
 REACH_M = 0.12
 
 
 class Search(NamedTuple):
-    """How constellations are compared, and which."""
+    """Parameters of the search."""
 
-    # Largest motion that brings one constellation onto the other.
+    # Largest motion between the two constellations.
     most_turn_rad: float = 0.8
     most_shift_m: float = 8.0
     # Least number of agreeing landmarks, whatever the number of false alarms.
@@ -57,7 +56,7 @@ class Search(NamedTuple):
 
 @kernel()
 def _nearest_by_cell(fixed: FloatArray) -> tuple[float, float, IntArray]:
-    """Low corner, and for every cell the landmark next to its centre, -1 with none in reach."""
+    """Low corner, and for every cell the landmark nearest to its centre, -1 if out of reach."""
     margin = REACH_M + _CELL_M
     low_x, low_y = fixed[:, 0].min() - margin, fixed[:, 1].min() - margin
     columns = int((fixed[:, 0].max() + margin - low_x) / _CELL_M) + 1
@@ -85,9 +84,9 @@ def _best_motion(
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
-    Every pair of landmarks of the first with every pair of the second of the same length says what
-    the motion would be; it is counted how many landmarks agree. Returns the turn about the first
-    constellation's centre and the shift, how many agree, and how many motions were tried.
+    Every pair of landmarks of the first with every pair of the second of the same length gives a
+    motion; agreeing landmarks are counted. Returns the rotation about the first constellation's
+    centre and the shift, the number of agreeing landmarks, and the number of motions tried.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -153,7 +152,7 @@ def _best_motion(
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
 _GRID_M = 0.15
-#: Frames whose landmarks form a constellation, and from one constellation to the next.
+#: Number of frames whose landmarks form a constellation, and from one constellation to the next.
 STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
@@ -165,10 +164,10 @@ class Stretch:
 
     middle_frame: int
     labels: IntArray  # (n,): ascending
-    xy: FloatArray  # (n, 2): their places in the map (m)
+    xy: FloatArray  # (n, 2): their positions in the map (m)
 
     def without(self, other: Stretch) -> Stretch:
-        """The landmarks that another stretch has not."""
+        """The landmarks that another stretch does not have."""
         own = ~np.isin(self.labels, other.labels)
         return Stretch(self.middle_frame, self.labels[own], self.xy[own])
 
@@ -180,10 +179,10 @@ class Match:
     # Middle frames of the two.
     earlier_frame: int
     later_frame: int
-    pairs: IntArray  # (k, 2): labels of the earlier and of the later stretch that are one landmark
-    # (3,): pose that takes the later stretch's landmarks, in the map, onto the earlier one's.
+    pairs: IntArray  # (k, 2): labels of the same landmark in the earlier and the later stretch
+    # (3,): pose that maps the later stretch's landmarks, in the map, onto the earlier one's.
     motion: FloatArray
-    # Logarithm of the number of matches as good that chance would bring about.
+    # Logarithm of the expected number of matches at least as good by chance.
     log10_false_alarms: float
 
 
@@ -196,7 +195,7 @@ def stretches_of(
     stride: int = STRIDE_FRAMES,
     least: int = Search().least_agreeing,
 ) -> list[Stretch]:
-    """The constellations of at least some landmarks along a run of `count` frames.
+    """The constellations with enough landmarks along a run of `count` frames.
 
     Takes `frames, labels` (n,), `xy` (M, 2).
     """
@@ -221,15 +220,15 @@ def sightings(stretches: Sequence[Stretch]) -> csr_array:
 
 
 def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
-    """(S, S) sparse int64, how many landmarks each two stretches have in common."""
+    """(S, S) sparse int64, number of landmarks that two stretches have in common."""
     seen = sightings(stretches)
     return csr_array(seen @ seen.T)
 
 
 def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
-    """All pairs of stretches that show one place more surely than by chance, the surest first.
+    """All pairs of stretches that show one place significantly, the most significant first.
 
-    Landmarks that two stretches share already are left out; stretches that share three or more need
+    Landmarks that two stretches already share are ignored; stretches that share three or more need
     no match.
     """
     candidates: list[tuple[Stretch, Stretch, Motion]] = []
@@ -264,11 +263,11 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
 
 
 class Motion(NamedTuple):
-    """A motion that lays landmarks on others."""
+    """A motion that aligns landmarks with others."""
 
     pose: FloatArray  # (3,)
-    agreeing: int  # landmarks that fall on others; 0 if too few do
-    tried: int  # motions that were tried
+    agreeing: int  # number of landmarks that fall on others; 0 if too few
+    tried: int  # number of motions tried
 
 
 def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
@@ -282,10 +281,10 @@ def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
 def settled(
     place: FloatArray, target: FloatArray, pose: FloatArray, least_agreeing: int
 ) -> tuple[FloatArray, IntArray] | None:
-    """The pose that lays landmarks on those they agree with, by least squares, and which these are.
+    """The pose that aligns landmarks with those they agree with, by least squares, and the pairs.
 
-    From a pose nearby; None if too few agree. Pairs are (k, 2), as of `mutual_pairs`: first the
-    target's.
+    From a pose nearby; None if too few agree. Pairs are (k, 2), as from `mutual_pairs`: the
+    target's first.
     """
     for _ in range(5):
         pairs = mutual_pairs(target, apply(pose, place), REACH_M)
@@ -310,10 +309,10 @@ def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntAr
 
 
 def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -> float:
-    """How many matches as good chance would bring about, as a logarithm.
+    """Logarithm of the expected number of matches at least as good by chance.
 
-    Two of the landmarks agree because the motion was made from them; of the others each agrees by
-    chance with probability `chance`.
+    Two of the landmarks agree because they define the motion; each of the others agrees by chance
+    with probability `chance`.
     """
     with np.errstate(divide="ignore"):
         tail = float(np.log(bdtrc(agreeing - 3, max(present - 2, 0), min(chance, 1.0))))
@@ -328,7 +327,7 @@ def chance_of_agreeing(xy: FloatArray) -> float:
 def _refined(
     earlier: Stretch, later: Stretch, pose: FloatArray, tried: int, search: Search
 ) -> Match | None:
-    """Match by least squares over all landmarks that agree; None if too few agree then."""
+    """Refine a match by least squares over all agreeing landmarks; None if too few agree then."""
     found = settled(later.xy, earlier.xy, pose, search.least_agreeing)
     if found is None:
         return None

@@ -1,13 +1,13 @@
-"""Where a constellation of discs lies in a map: of a robot that wakes up, or of another run.
+"""Locates a constellation of discs in a map: global localisation, or registration of another run.
 
-Nothing is known of the pose. The constellation is laid on the map by the motion that pairs of discs
-vote for (`loops`). It is believed if as many discs agree as would by chance in less than one of a
-thousand maps, and if the rest of the map has no place that fits nearly as well: buildings repeat
-themselves.
+Nothing is known about the pose. The constellation is aligned with the map by the motion that pairs
+of discs vote for (`loops`). The motion is accepted if that many discs would agree by chance in less
+than one of a thousand maps, and if no other place of the map fits nearly as well, since buildings
+have repetitive structure.
 
-Odometry puts the discs of a robot's first frames together, of more and more until they have such a
-place. Of another run, each stretch is placed by itself. Stretches that are placed by chance, or in
-a room like another, do not agree with each other.
+For global localisation, odometry combines the discs of the first frames, of more and more until the
+place is unique. For another run, each stretch is located separately; stretches located by chance,
+or in a similar room, do not agree with each other.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.recording import Recording
 
-#: Frames that are tried, and by how much more each time.
+#: Fewest frames that are tried, growth of their number, and most frames.
 _FEWEST_FRAMES, _MORE, _MOST_FRAMES = 5, 1.5, 400
-#: Rows nearer than this are of one disc (m).
+#: Rows closer together than this belong to one disc (m).
 ONE_DISC_M = 0.25
-#: Another place may fit with this share of the agreeing discs at most.
+#: Largest share of the agreeing discs with which another place may fit.
 _RIVAL_SHARE = 0.7
-#: Standard deviation of a disc at least (m): of raw rows, seen by a camera that leans.
+#: Least standard deviation of a disc (m): that of raw rows from a leaning camera.
 _DISC_SIGMA_M = 0.25
 ANYWHERE = Search(math.inf, math.inf, least_agreeing=5)
-# How far stretches of one run may disagree, by the drift of its odometry.
+# Largest disagreement of stretches of one run, due to the drift of odometry.
 _DRIFT = Search()
 
 
 class Place(NamedTuple):
-    """Where a constellation lies in a map."""
+    """Location of a constellation in a map."""
 
     pose: FloatArray  # (3,) m, m, rad
-    pairs: IntArray  # (k, 2): discs of the map and of the constellation that agree
+    pairs: IntArray  # (k, 2): agreeing discs of the map and of the constellation
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +59,13 @@ class Waking:
 
     pose: FloatArray  # (3,) m, m, rad
     covariance: FloatArray  # (3, 3)
-    frames: int  # of the run that it took
-    discs: int  # of these,
-    agreeing: int  # and how many of them are in the map
+    frames: int  # number of frames used
+    discs: int  # number of discs in these
+    agreeing: int  # number of these discs that are in the map
 
 
 def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
-    """The pose at the start of a run by the discs of its first frames; None if none is certain.
+    """The pose at the start of a run from the discs of its first frames; None if not certain.
 
     Identifiers are not used. Takes the map's discs (M, 2) (m).
     """
@@ -78,7 +78,7 @@ def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
     frames, before = min(_FEWEST_FRAMES, most), -1
     while True:
         discs = _merged(at[rows.frame < frames])
-        # Where nothing new came into view there is nothing to be found.
+        # Without new discs the result would be the same.
         if len(discs) != before:
             found = placed(discs, disc_xy)
             if found is not None:
@@ -92,7 +92,7 @@ def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
 
 
 def _merged(xy: FloatArray) -> FloatArray:
-    """(n, 2) means of rows that are near each other."""
+    """(n, 2) means of rows close to each other."""
     means: list[FloatArray] = []
     counts: list[int] = []
     for row in xy:
@@ -110,7 +110,7 @@ def _merged(xy: FloatArray) -> FloatArray:
 def placed(
     discs: FloatArray, disc_xy: FloatArray, false_alarms: float = ANYWHERE.false_alarms
 ) -> Place | None:
-    """The only place of a map that a constellation fits.
+    """The unique place of a constellation in a map, if there is one.
 
     Takes `discs` (n, 2), `disc_xy` (M, 2) of the map.
     """
@@ -137,7 +137,7 @@ def placed(
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
-    """Of a pose that lays discs on targets, by how far they are off."""
+    """Covariance of a pose that aligns discs with targets, from the residuals."""
     lever = discs @ rotation(pose[2]).T
     one, none = np.ones(len(lever)), np.zeros(len(lever))
     by_x, by_y = (one, none, -lever[:, 1]), (none, one, lever[:, 0])
@@ -148,7 +148,7 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
 
 
 def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> FloatArray:
-    """What odometry along the way adds: the discs as a whole are moved, and turned about them."""
+    """Covariance added by odometry along the way: all discs are moved, and rotated together."""
     total = step_covariance.sum(axis=0)
     from_discs = rotation(pose[2]) @ -discs.mean(axis=0)
     turned = np.array([-from_discs[1], from_discs[0], 1.0])
@@ -159,23 +159,23 @@ def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> 
 def lay_together(
     places: Sequence[FloatArray], stretches: Sequence[Sequence[Stretch]]
 ) -> tuple[FloatArray, list[IntArray], list[int]]:
-    """Lay maps on the first one, or on those that are laid on it.
+    """Register maps in the first one, or in those already registered.
 
     Parameters
     ----------
     places : K arrays of (M, 2)
-        Landmarks of each map (m); NaN where they have no place.
+        Landmarks of each map (m); NaN if unknown.
     stretches : K lists of Stretch
-        Of each map, which share no frames; their labels are the landmarks' indices.
+        Stretches of each map, without common frames; their labels are the landmarks' indices.
 
     Returns
     -------
     motions : (K, 3) float64
         Poses of the maps' frames in the first one's.
     pairs : list of (k, 2) int64
-        Landmarks that are one, numbered through all maps.
+        Identical landmarks, numbered through all maps.
     apart : list of int
-        Maps that nothing lays on the others.
+        Maps that cannot be registered in the others.
     """
     offsets = np.cumsum([0, *map(len, places)])
     names = np.flatnonzero(np.isfinite(places[0][:, 0]))
@@ -199,13 +199,13 @@ def lay_together(
 def lay_on(
     stretches: Sequence[Stretch], xy: FloatArray
 ) -> tuple[FloatArray, list[tuple[IntArray, IntArray]]] | None:
-    """The motion that lays a run's map on another, and the landmarks that are the same then.
+    """The motion that registers a run's map in another one, and the identical landmarks.
 
-    Each stretch is placed by itself. The motion is taken that most of them agree with, as far as
-    drift lets them, if these are more than half; else there is none.
+    Each stretch is located separately. The result is the motion on which most of them agree, within
+    drift, if these are more than half; else there is none.
 
-    Takes `xy` (M, 2), the other map's landmarks; returns a pose (3,) and of each stretch that
-    agrees indices into `xy` and labels, both (k,).
+    Takes `xy` (M, 2), the other map's landmarks; returns a pose (3,) and, for each agreeing
+    stretch, indices into `xy` and labels, both (k,).
     """
     alarms = ANYWHERE.false_alarms / max(len(stretches), 1)
     tried = [(stretch, placed(stretch.xy, xy, alarms)) for stretch in stretches]

@@ -1,4 +1,4 @@
-"""Which rows of a run show the same landmark: frame to frame, then from place to place.
+"""Associates the rows of a run: from frame to frame, then by closing loops.
 
 First, every row is associated with recently seen landmarks
 (`redetect.slam.association.frame_to_frame`). The result is nearly always right, but a landmark that
@@ -8,8 +8,8 @@ possible drift of the odometry, later rounds everywhere, since each closed loop 
 distortion. Verticals, which the local association often confuses, are then associated again along
 the path that the discs give (`redetect.slam.association.line_points`).
 
-Several runs are one with steps of which nothing is known (`redetect.slam.recording.joined`). Loops
-are closed in each, their maps laid on each other (`redetect.slam.association.placing`), and loops
+Several runs are treated as one with lost steps in between (`redetect.slam.recording.joined`). Loops
+are closed in each, their maps are registered (`redetect.slam.association.placing`), and loops are
 closed again in the whole.
 """
 
@@ -62,9 +62,9 @@ _SAME_PLACE = 0.999
 _LINE_REACH_M = 0.05
 # Covariance of a step that leads nowhere (m^2, rad^2).
 _HARDLY_ANY = 1e-6 * np.eye(3)
-# Rounds of closing loops at most.
+# Most rounds of closing loops.
 _MOST_ROUNDS = 6
-# Frames are attached that are farther apart than a landmark is in view or waited for locally.
+# Least gap between frames, longer than a landmark stays visible or is waited for locally.
 _EVERYWHERE = Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
 
 
@@ -72,14 +72,14 @@ _EVERYWHERE = Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_f
 class RunAssociation:
     """Labels of a run's rows, numbered from 0 in the order of first sight."""
 
-    # (n,): of each row at the end; -1 where a row of a disc fits none, or none that is seen often.
+    # (n,): final label of each row; -1 if a row of a disc fits none, or none that is seen often.
     circle_labels: IntArray
     line_labels: IntArray
     # (n,): from frame to frame only.
     local_circle_labels: IntArray
     local_line_labels: IntArray
     matches: tuple[Match, ...]  # the loops that were closed
-    path: FloatArray | None  # (N + 1, 3): the path that goes with them; None without map level
+    path: FloatArray | None  # (N + 1, 3): the corresponding path; None without map level
 
 
 def associate_run(
@@ -166,9 +166,9 @@ def _associated_locally(
 class _Closed(NamedTuple):
     """A run whose loops are closed."""
 
-    labels: IntArray  # (n,): of discs if there are any, whose rows give positions, else of lines
-    path: FloatArray  # (N + 1, 3): the path that the labels say
-    xy: FloatArray  # (M, 2): the landmarks' places (m)
+    labels: IntArray  # (n,): of discs, whose rows give positions, if there are any, else of lines
+    path: FloatArray  # (N + 1, 3): the path solved with these labels
+    xy: FloatArray  # (M, 2): the landmarks' positions (m)
     matches: tuple[Match, ...]  # the loops
 
 
@@ -179,9 +179,9 @@ def _closed_by_parts(
     camera_xy: ArrayLike,
     report: Progress,
 ) -> _Closed:
-    """Loops closed in each part between which odometry is lost, and then in the whole.
+    """Close loops in each part between lost steps of odometry, and then in the whole.
 
-    The parts' maps are laid on each other in between; the first stays where it is.
+    In between, the parts' maps are registered; the first one stays.
     """
     frames = _frames_of_labels(recording)
     starts = [0, *recording.lost.tolist()]
@@ -189,7 +189,7 @@ def _closed_by_parts(
     stretches: list[list[Stretch]] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
-        if parts:  # it begins with its own start, not with the end of the part before
+        if parts:  # a part begins with its own start, not with the end of the one before
             known = np.concatenate([_HARDLY_ANY[None], part.step_covariance[1:]])
             part = replace(part, step_covariance=known)
         rows = slice(*np.searchsorted(frames, [first, end]))
@@ -208,8 +208,8 @@ def _closed_by_parts(
     motions, pairs, left = lay_together([part.xy for part in parts], stretches)
     if left:
         raise SlamError(
-            f"nothing says where the frames from {recording.prefixes[starts[left[0]]]} "
-            f"({starts[left[0]] + 1}) on lie among the others: expected landmarks that both saw"
+            f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "
+            "cannot be registered with the others: expected common landmarks"
         )
     counts = np.cumsum([0, *(len(part.xy) for part in parts)])
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
@@ -229,7 +229,7 @@ def _closed(
     report: Progress,
     path: FloatArray | None = None,
 ) -> _Closed:
-    """All loops closed, from a path (by default odometry) on."""
+    """Close all loops, starting from a path (by default odometry)."""
     by_discs = len(recording.circles) > 0
     frames = _frames_of_labels(recording)
     swayed, search = _swayed(recording, setting), Search()
@@ -240,7 +240,7 @@ def _closed(
         )
 
     def solved(path: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """Path and places of the landmarks by the labels."""
+        """Path and positions of the landmarks with these labels."""
         line_xy = None
         if not by_discs:
             start = chain_steps(recording.steps) if path is None else path
@@ -282,7 +282,7 @@ def _closed(
 
 
 def _frames_of_labels(recording: Recording) -> IntArray:
-    """(n,) frames of the rows of discs, or of lines where there are none."""
+    """(n,) frames of the rows of discs, or of lines if there are none."""
     return recording.circles.frame if len(recording.circles) else recording.lines.frame
 
 
@@ -291,7 +291,7 @@ def _without_lines(recording: Recording) -> Recording:
 
 
 def _swayed(recording: Recording, setting: AssociateSettings) -> Recording:
-    """The run with the robot's sway in its discs' covariances."""
+    """The run with the robot's sway added to its discs' covariances."""
     if setting.tilt_sigma_rad == 0.0:
         return recording
     moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy)
@@ -302,12 +302,12 @@ def _swayed(recording: Recording, setting: AssociateSettings) -> Recording:
 def _without_clutter(
     recording: Recording, labels: IntArray, path: FloatArray, setting: AssociateSettings
 ) -> IntArray:
-    """Labels of discs, -1 for rows that fit none, and for those of discs that too few rows fit."""
+    """Labels of discs, -1 for outliers, and for rows of discs with too few rows."""
     gate = chdtri(2, 1.0 - setting.kept_probability)
     circles = recording.circles
     kept = np.ones(len(labels), dtype=np.bool_)
     none = np.zeros(0, dtype=np.int64)
-    # The second time without the rows that the first one found.
+    # The second pass excludes the rows found by the first.
     for _ in range(2):
         known, numbers = np.unique(labels[kept], return_inverse=True)
         fitting = _without_lines(replace(recording, circles=circles.only(kept)))
@@ -324,10 +324,10 @@ def _without_clutter(
 def _spread(
     recording: Recording, path: FloatArray, labels: IntArray, sigma_scale: float
 ) -> FloatArray:
-    """(M, 2, 2) how far labels of one disc may lie from each other in the map, as covariances.
+    """(M, 2, 2) covariances of the positions of labels of one disc in the map.
 
-    The mean information of a label's rows: their errors are common (calibration, lean, one side of
-    the disc), so that many rows are hardly better than one.
+    They use the mean information of a label's rows, whose errors are common (calibration, lean, one
+    side of the disc), so that many rows are hardly better than one.
     """
     circles = recording.circles
     turn = rotation(path[circles.frame + 1, 2])
@@ -363,7 +363,7 @@ def _merged_lines(
     lines = recording.lines
     xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)[labels]
     off = bearing_of_vertical(path[lines.frame + 1], xy, camera_xy) - lines.bearing_rad
-    # Lines without a place have nothing that their rows could contradict.
+    # Rows of lines without a position cannot contradict it.
     gate = lines.sigma_rad * np.sqrt(chdtri(1, 1.0 - setting.kept_probability))
     kept = ~(np.abs(wrap_angle(off)) > gate)
     kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= setting.fewest_rows

@@ -1,4 +1,4 @@
-"""How well labels found for a run's rows agree with the IDs that the file has."""
+"""Scores labels found for a run's rows against the IDs in the file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from redetect.array_types import IntArray
 
 @dataclass(frozen=True)
 class AssociationScore:
-    """Labels against the file's IDs; rows without ID are left out."""
+    """Scores of labels against the file's IDs; rows without ID are ignored."""
 
-    rows: int  # rows that were scored
-    # Of these, rows without a label: they count as landmarks seen once, and as no splits.
+    rows: int  # number of rows scored
+    # Of these, rows without a label: they count as landmarks seen once, and not as splits.
     unlabelled_rows: int
     # Different IDs, and different labels, among them.
     true_landmarks: int

@@ -1,4 +1,4 @@
-"""``slam associate``: identifiers for a run's rows, and how well they agree with the file's own."""
+"""``slam associate``: identifiers for a run's rows, and their scores against the file's own."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from redetect.slam.recording import UNKNOWN_ID, Recording, joined
 from redetect.storage import demand_free
 from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 
-#: Of each kind's rows those before and those after the map level.
+#: Scores of each kind's rows, before and after the map level.
 Scores = dict[str, dict[str, AssociationScore]]
 
 
@@ -92,7 +92,7 @@ def perform(options: Associate) -> int:
 def score_run(recording: Recording, found: RunAssociation) -> Scores:
     """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
 
-    Kinds are those of which a row has an ID; stages ``local`` and, after the map level, ``map``.
+    Kinds are those with any ID in the file; stages ``local`` and, after the map level, ``map``.
     """
     discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
     scores: Scores = {}
@@ -124,7 +124,7 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
 def identified_rows(
     rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray, source: Path
 ) -> Iterator[Row]:
-    """Rows of a file with the IDs found, counted from 1, -1 without; everything else as it was."""
+    """Rows of a file with the IDs found, from 1, or -1; everything else unchanged."""
     numbers: dict[type, Iterator[int]] = {}
     for kind, labels in ((CircleLandmark, circle_labels), (LineLandmark, line_labels)):
         count = sum(isinstance(row.record, kind) for row in rows)
@@ -142,7 +142,7 @@ def identified_rows(
 
 
 def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray) -> str:
-    """How many landmarks of each kind in a file were found."""
+    """The numbers of landmarks of each kind found in a file, in words."""
     parts = []
     for kind, labels, name in (
         (CircleLandmark, circle_labels, "discs"),
@@ -151,12 +151,12 @@ def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray
         if any(isinstance(row.record, kind) for row in rows):
             parts.append(f"{len(np.unique(labels[labels >= 0]))} {name}")
             if np.any(labels < 0):
-                parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that show none of them"
+                parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that match none of them"
     return ", ".join(parts) or "no landmarks"
 
 
 def _target(options: Associate, run: int, source: Path, several: bool) -> Path:
-    """The file to write for one of a run's."""
+    """The output file for one of a run's files."""
     output = options.output
     if output is None:
         return source.with_name(f"associated{source.suffix}")

@@ -59,7 +59,7 @@ def perform(options: Options) -> int:
 
 
 def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
-    """Rows of a file, those that contradict mended or left out; all others as they were."""
+    """Rows of a file, contradicting ones corrected or dropped, all others unchanged."""
     new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
     disc = -1
     for row in rows:
@@ -71,7 +71,7 @@ def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]
 
 
 def _table(recording: Recording, audit: Audit, rows: Iterable[Row]) -> list[list[object]]:
-    """The rows that contradict, with columns as `_COLUMNS`."""
+    """The contradicting rows, with columns as in `_COLUMNS`."""
     line = [row.line for row in rows if isinstance(row.record, CircleLandmark)]
     table: list[list[object]] = []
     for group in audit.groups:
@@ -128,7 +128,7 @@ def _draw(
             k, disc = seen[row]
             file = picture_of_frame(images, frames[k].step.prefix)
             if file is not None:
-                # Levelled positions are turned back to where the camera saw them.
+                # Levelled positions are mapped back to where the camera saw them.
                 vector = [*(frames[k].levelled_by or (0.0, 0.0)), 0.0]
                 turn = Rotation.from_rotvec(vector).as_matrix()
                 u, v = camera.project_robot(np.array([disc.px, disc.py, 0.0]) @ turn)

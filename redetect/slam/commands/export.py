@@ -67,7 +67,7 @@ def _export_tum(command: Export) -> int:
 
 
 def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
-    """Times of a path's poses: of the file named, or the first beside the run that has them all."""
+    """Times of a path's poses, from the given file, or the first complete one beside the run."""
     folder = command.run if command.run.is_dir() else command.run.parent
     for file in [command.times] if command.times else sorted(folder.glob("*.times")):
         times = read_times(file)
@@ -117,7 +117,7 @@ def _import(command: Import) -> int:
 
 
 def _import_data_set(command: Import) -> int:
-    """Of the UTIAS data set a robot's run, its true path or the landmarks; of Victoria Park all."""
+    """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
     file = command.file
     if file.name == data_sets.LANDMARKS:

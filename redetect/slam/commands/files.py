@@ -1,4 +1,4 @@
-"""Files of the commands: the run and its camera, what they write."""
+"""Files of the commands: the run, its camera, and outputs."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def read_runs(flags: RunFlags) -> list[Recording]:
 
 
 def recordings_of(flags: RunFlags) -> list[Recording]:
-    """`read_runs`, and print what is assumed of their odometry."""
+    """`read_runs`, and print the assumptions about their odometry."""
     recordings = read_runs(flags)
     for recording in recordings:
         if recording.unstated_steps:
             print(
-                f"{recording.unstated_steps} of {len(recording)} steps state no covariance: taken "
-                f"for {flags.odometry_noise.sentence()} (--odometry-noise)",
+                f"{recording.unstated_steps} of {len(recording)} steps have no covariance: assumed "
+                f"{flags.odometry_noise.sentence()} (--odometry-noise)",
                 file=sys.stderr,
             )
     return recordings
@@ -60,7 +60,7 @@ def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
     """Read the calibration that belongs to a run, a folder or a file in one.
 
     By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
-    there is none, `camera.CameraError` if it is not clear which.
+    there is none, `camera.CameraError` if it is ambiguous.
     """
     if camera is not None:
         return read_camera(camera)
@@ -69,13 +69,13 @@ def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
     if found is None:
         raise SlamError(
             f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
-            "calibrate` makes one, `camera convert` brings one over from other programs"
+            "calibrate` makes one, `camera convert` converts one of another program"
         )
     return found
 
 
 def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
-    """(2,) the camera's centre in the robot frame (m); zero where no line needs it."""
+    """(2,) the camera's centre in the robot frame (m); zero if no line needs it."""
     if not len(recording.lines):
         return NO_CAMERA
     return np.array(camera_of_run(run, camera).centre[:2])

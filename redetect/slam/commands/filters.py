@@ -47,7 +47,7 @@ from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
 ERROR_PICTURE = "errors.png"
 
 
-#: What a filter found: the run, the map, and what else is said of it.
+#: Results of a filter: the run, the map, and further lines for the terminal.
 _Result = tuple[FilterRun, LandmarkMap, list[str]]
 
 
@@ -120,14 +120,14 @@ def _localized(command: Localize, recording: Recording) -> _Result:
         landmark_map = with_joint_covariance(landmark_map, command.map)
         if landmark_map.joint_covariance is None:
             name = covariance_file(command.map).name
-            said.append(f"errors of the map taken as independent: no {name}")
+            said.append(f"errors of the map are assumed independent: no {name}")
     return localized_run_of(command, recording, landmark_map), landmark_map, said
 
 
 def localized_run_of(
     command: Localize, recording: Recording, landmark_map: LandmarkMap
 ) -> FilterRun:
-    """What a command asks for: a run's rows localised in a map.
+    """Localise a run's rows in a map, as a command asks.
 
     Raises `SlamError` if no row shows a landmark of the map, or a flag is out of its range.
     """
@@ -140,8 +140,8 @@ def localized_run_of(
         start,
         covariance,
         camera_xy_of(recording, command.run, command.camera),
-        # Considering the map's errors makes the filter slow to pull itself back onto it, which
-        # costs little as long as the pairs are right, and the track if they are to be found.
+        # Considering the map's errors makes the filter slow to converge to it, which does little
+        # harm with known pairs, but loses track if pairs have to be found.
         exact=command.association != "known",
     )
     associator = Associator(command.association, command.gate_probability)
@@ -157,18 +157,18 @@ def localized_run_of(
 def _woken_up(
     command: Localize, recording: Recording, landmark_map: LandmarkMap
 ) -> tuple[FloatArray, FloatArray]:
-    """The pose at the start and its covariance, by the discs of the first frames."""
+    """The pose at the start and its covariance, from the discs of the first frames."""
     if any(command.start) or any(command.start_sigma):
         raise SlamError("--lost and --start: expected one of them")
     woken = wake_up(recording, landmark_map.discs.xy)
     if woken is None:
         raise SlamError(
-            f"{command.run}: no place in {command.map} is certain by the discs of the first frames:"
-            " expected five or more that no other place has as well; --start says where"
+            f"{command.run}: the discs of the first frames have no certain place in {command.map}: "
+            "expected five or more that fit no other place as well; or give the pose by --start"
         )
     x, y, heading = woken.pose
     print(
-        f"woke up at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {woken.agreeing} "
+        f"located at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {woken.agreeing} "
         f"of {woken.discs} discs of the first {woken.frames} frames are in the map"
     )
     return woken.pose, woken.covariance
@@ -189,12 +189,12 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     said = [f"landmarks         {discs} discs, {lines} lines"]
     waiting = len(ekf.line_slots) - lines
     if waiting:
-        said.append(f"                  {waiting} lines more, seen under too little parallax")
+        said.append(f"                  {waiting} more lines, seen with too little parallax")
     return run, landmark_map, said
 
 
 def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
-    """How far a path is from another one of the same run in the same map, `reference` (N, 3).
+    """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
 
     Root mean square, median and largest distance of positions (m) and headings (rad), and those of
     the last pose.
@@ -215,7 +215,7 @@ def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
 
 
 def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
-    """How far landmarks are from those of another map with the same identifiers."""
+    """Distance of landmarks from those of another map with the same identifiers."""
     offsets, covariances = [], []
     for some, others in (
         (landmark_map.discs, reference.discs),
@@ -238,7 +238,7 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
 
 
 def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any]:
-    """What the JSON file says of any filter."""
+    """Figures of any filter for the JSON file."""
     count = run.count
     figures: dict[str, Any] = {
         "steps": len(run.path.poses) - 1,

@@ -76,7 +76,7 @@ def perform(command: Map) -> int:
         final = mapped.landmarks_jointly()
     write_map(output / MAP_NAME, final, head, overwrite=command.force)
     if not few:
-        # One of another map must not stay beside this one.
+        # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     ends = first_poses(runs)
     for first, end, own in zip(ends, ends[1:], paths):
@@ -87,7 +87,7 @@ def perform(command: Map) -> int:
     if not few:
         print(
             f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
-            "localize` takes their errors to be independent"
+            "localize` assumes independent errors"
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
     write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
@@ -100,7 +100,7 @@ def perform(command: Map) -> int:
 
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
-    """The map of a run's rows that a command asks for."""
+    """The map of a run's rows, as a command asks."""
     demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0)
     camera = None
     if command.calibrate or len(recording.lines):
@@ -149,8 +149,8 @@ def _left_out_lines(left_out: LeftOut) -> list[str]:
     said = [
         (left_out.rows_without_id, "rows without an identifier were not used"),
         (left_out.discs_seen_once, "discs were seen once"),
-        (left_out.lines_without_parallax, "lines had too little parallax and are left out"),
-        (left_out.line_rows, "rows of lines show one of those and are left out"),
+        (left_out.lines_without_parallax, "lines had too little parallax and were not used"),
+        (left_out.line_rows, "rows of these lines were not used"),
     ]
     return [f"{count} {what}" for count, what in said if count]
 

@@ -1,15 +1,15 @@
 """EKF-SLAM: the pose and all landmarks with one joint covariance, updated frame by frame in place.
 
-Landmarks join the state when they are first seen, with the correlations that follow from the pose
-they were seen from (Smith, Self, Cheeseman: Estimating uncertain spatial relationships in robotics,
-1990). All rows of a frame are one measurement, so that all of them are linearised at the pose the
-odometry leads to.
+Landmarks are added to the state when they are first seen, with the correlations due to the pose
+from which they were seen (Smith, Self, Cheeseman: Estimating uncertain spatial relationships in
+robotics, 1990). All rows of a frame are one measurement, so that all of them are linearised at the
+pose predicted from odometry.
 
-A vertical line is seen by its bearing only. It is kept as the ray of its first sight, which begins
-at the camera's place then, and the inverse of its distance along the ray. In these four numbers
-bearings are nearly linear from the first sight on, however far the line may be (J. Civera, A. J.
-Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on
-Robotics 24(5), 2008).
+Of a vertical line only the bearing is measured. It is represented by the ray of its first sight,
+from the camera's position then, and the inverse of its distance along the ray. In these four
+numbers bearings are nearly linear from the first sight on, however far away the line may be
+(J. Civera, A. J. Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM",
+IEEE Transactions on Robotics 24(5), 2008).
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ from redetect.slam.filters.frames import (
 from redetect.slam.models import tilt_jacobian
 from redetect.slam.recording import Recording
 
-#: A line is in the map if its distance is known to this share: what uses its place as x and y
-#: takes bearings to be linear in these.
+#: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
+#: assume that bearings are linear in these.
 LARGEST_RANGE_SIGMA = 0.05
 # Inverse distance of a line at first sight, and its standard deviation: half a metre to infinity
 # within two of these (1/m).
 _INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
 
-# Most iterations of an update with bearings, below which change it ends, and the largest change of
-# an inverse distance in one of them (1/m).
+# Most iterations of an update with bearings, the change below which it ends, and the largest change
+# of an inverse distance in one iteration (1/m).
 _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
 _POSE = np.arange(POSE_SIZE)
-# By as many numbers the state grows; some too many cost less than moving its covariance often.
+# Increment of the state's size; some unused numbers cost less than copying its covariance often.
 _CHUNK = 64
 
 
@@ -63,10 +63,10 @@ class EkfSlam(Filter):
     Parameters
     ----------
     start, start_covariance, camera_xy : array_like
-        As of `Filter`.
+        As in `Filter`.
     tilt_sigma_rad : float
-        Standard deviation of the robot's sway about both axes of the floor, beyond what the rows'
-        covariances say.
+        Standard deviation of the robot's sway about both axes of the floor, in addition to the
+        rows' covariances.
     """
 
     line_size = 4
@@ -98,7 +98,7 @@ class EkfSlam(Filter):
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of the frame: known landmarks first, then new ones.
 
-        Rows of several lines of which not all are in the state then are left out.
+        Rows of several lines are ignored unless all of them are in the state then.
         """
         known, others = self._known(rows)
         self._update(known)
@@ -114,7 +114,7 @@ class EkfSlam(Filter):
         self.count.leave_out("row of lines not in the map yet", len(unknown.lines))
 
     def landmark_map(self) -> LandmarkMap:
-        """The landmarks whose place is known, with their covariances."""
+        """The landmarks with known positions, with their covariances."""
         of_discs = numbers_from([*self.disc_slots.values()], 2)
         of_lines = numbers_from([*self.line_slots.values()], self.line_size)
         inverse = self._state[of_lines[:, 3]]
@@ -145,7 +145,7 @@ class EkfSlam(Filter):
         )
 
     def forget(self, discs: set[int], lines: set[int]) -> None:
-        """Take landmarks out of the state."""
+        """Remove landmarks from the state."""
         if not discs and not lines:
             return
         sizes = ((self.disc_slots, 2, discs), (self.line_slots, self.line_size, lines))
@@ -202,12 +202,12 @@ class EkfSlam(Filter):
         self.count.lines += 1
 
     def _turned_about(self, xy: FloatArray) -> FloatArray:
-        """(2, 3) derivative of a place that the robot carries along, by its pose."""
+        """(2, 3) derivative of a position fixed to the robot, by its pose."""
         x, y = xy - self._linearised[:2]
         return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
     def _append(self, by_pose: FloatArray, noise: FloatArray, value: FloatArray) -> int:
-        """`_put` numbers that follow from the pose at the end of the state; returns where."""
+        """`_put` numbers that depend on the pose at the end of the state; returns their slot."""
         slot, self.size = self.size, self.size + len(value)
         if self.size > len(self._state):
             self._grow(_CHUNK)
@@ -216,7 +216,7 @@ class EkfSlam(Filter):
 
 
 def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
-    """Which rows show one landmark alone that none before them shows alone."""
+    """Mask of rows that are the first to show a single landmark alone."""
     first: dict[int, int] = {}
     for k, numbers in enumerate(ids):
         if len(numbers) == 1:
@@ -227,16 +227,16 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
 
 
 def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
-    """`run_filter` with EKF-SLAM, which holds the map afterwards.
+    """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
-    If identities are found out, discs that are far from all others are new ones, numbered from 1 in
-    the order of their first sight; lines may be anywhere on a ray at first, so that they can't
-    be found again by it: their rows must be known, else `SlamError` is raised.
+    If identities have to be found, discs far from all others are new ones, numbered from 1 in the
+    order of their first sight; lines may be anywhere on a ray at first, so that they cannot be
+    recognised: their rows must have identifiers, else `SlamError` is raised.
     """
     pairing = associator or Associator()
     if pairing.method != "known" and len(recording.lines):
         raise SlamError(
-            f"association {pairing.method} with lines: EKF-SLAM finds out the identity of discs "
-            "only; expected known association, or a run without lines"
+            f"association {pairing.method} with lines: EKF-SLAM finds identities of discs only: "
+            "expected known association, or a run without lines"
         )
     return run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))

@@ -1,7 +1,7 @@
-"""A recording frame by frame, as input of the filters: innovations, pairing, the way through a run.
+"""A recording frame by frame, as input of the filters: innovations, pairing, the loop over a run.
 
-Rows without identifiers are paired with landmarks of the filter's state, discs and lines apart from
-each other, each frame for itself, by `redetect.slam.association.compatibility`.
+Rows without identifiers are paired with landmarks of the filter's state, discs and lines
+separately, frame by frame, by `redetect.slam.association.compatibility`.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ class FrameRows(NamedTuple):
     lines: LineRows
 
     def only(self, discs: BoolArray, lines: BoolArray) -> FrameRows:
-        """Some of the rows."""
+        """The selected rows."""
         return FrameRows(self.circles.only(discs), self.lines.only(lines))
 
 
 class Prediction(NamedTuple):
-    """How d discs and e lines of a filter's state are seen."""
+    """Predicted measurements of d discs and e lines of a filter's state."""
 
-    seen: FloatArray  # (2 d + e,): discs' places in the robot frame (m), lines' bearings (rad)
+    seen: FloatArray  # (2 d + e,): discs in the robot frame (m), lines' bearings (rad)
     jacobian: FloatArray  # (2 d + e, k): by these numbers of the state:
     numbers: IntArray  # (k,)
-    sway: FloatArray  # (2 d + e, 2): how tilts of the robot by their standard deviation move them
+    sway: FloatArray  # (2 d + e, 2): changes due to tilts of the robot by one standard deviation
 
 
 class Innovation(NamedTuple):
-    """Measured less predicted of a frame's rows, m numbers."""
+    """Measured minus predicted values of a frame's rows, m numbers."""
 
     error: FloatArray  # (m,)
     jacobian: FloatArray  # (m, k): of the prediction, by these numbers of the state:
@@ -64,7 +64,7 @@ class Innovation(NamedTuple):
 
 @dataclass
 class RowCount:
-    """How a run's rows were used."""
+    """Use of a run's rows."""
 
     # Rows that were used.
     discs: int = 0
@@ -72,7 +72,7 @@ class RowCount:
     left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
     # Sum of the squared innovations, normalised by their covariances.
     innovation_squared: float = 0.0
-    # Their degrees of freedom: if the covariances are right, what the sum is expected to be.
+    # Their degrees of freedom: the expectation of the sum if the covariances are right.
     innovation_numbers: int = 0
 
     def use(self, rows: FrameRows, whitened: FloatArray) -> None:
@@ -90,13 +90,13 @@ class RowCount:
 
 @dataclass(frozen=True, eq=False)
 class FilterRun:
-    """Poses of a run as a filter had them at the time, and what became of the rows."""
+    """Poses of a run as a filter estimated them at the time, and the use of the rows."""
 
     # The start, and the pose after each step and its frame, with covariances; theta is not wrapped.
     path: Path2D
     count: RowCount
-    # (n,): the disc that each row was taken to show, -1 where none: the file's, or what association
-    # found; the same of lines, empty where none.
+    # (n,): the disc of each row, -1 for none, from the file or from association; the same for
+    # lines, empty for none.
     disc_ids: IntArray
     line_ids: tuple[tuple[int, ...], ...]
 
@@ -118,32 +118,32 @@ _POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
 
 
 class Filter(ABC):
-    """The pose and landmarks of a robot with their joint covariance, to be taken through a run.
+    """The pose and landmarks of a robot with their joint covariance, updated along a run.
 
-    What the heading turns is evaluated at the poses as predicted and at the first estimates of
-    landmarks (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
-    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010):
-    at the latest ones, corrections would look like knowledge of how the map as a whole is turned.
+    Jacobians by the heading are evaluated at predicted poses and first estimates of landmarks
+    (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing
+    consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010): at the
+    latest estimates, corrections would add spurious information on the map's orientation.
 
     Parameters
     ----------
     start : (3,) array_like
         Pose at the start (m, m, rad).
     start_covariance : (3, 3) array_like or None
-        Its covariance; none if the start defines the map.
+        Its covariance; None if the start defines the map.
     camera_xy : (2,) array_like
         The camera's centre in the robot frame (m); only lines need it.
 
     Attributes
     ----------
     disc_slots, line_slots : dict of int to int
-        Where in the state landmarks begin, by their identifiers.
+        Index of each landmark's first number in the state, by identifier.
     count : RowCount
     size : int
-        How many numbers the state has.
+        Number of numbers in the state.
     """
 
-    #: How many numbers of the state a line has.
+    #: Number of the state's numbers for a line.
     line_size = 2
     #: Standard deviation of a tilt that moves all discs of a frame together (rad).
     tilt_sigma_rad = 0.0
@@ -164,7 +164,7 @@ class Filter(ABC):
 
     @property
     def state(self) -> FloatArray:
-        """The pose, then landmarks, as the slots say: (n,)."""
+        """The pose, then landmarks at their slots: (n,)."""
         return self._state[: self.size]
 
     @property
@@ -177,7 +177,7 @@ class Filter(ABC):
         return np.asarray(self._covariance[np.ix_(index, index)])
 
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """The robot moves by an odometry step (3,), of covariance (3, 3)."""
+        """Predict the pose after an odometry step (3,) of covariance (3, 3)."""
         at = self._linearised
         pose = move(self._state[_POSE], step)
         by_pose, by_step = move_jacobians(self._state[_POSE], step)
@@ -192,16 +192,16 @@ class Filter(ABC):
         """
 
     def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Lines as homogeneous points (e, 3): the place is x / w, y / w.
+        """Lines as homogeneous points (e, 3): the position is x / w, y / w.
 
-        Takes their numbers of the state (e, k), and returns the derivatives (e, 3, k) by these,
-        too.
+        Takes their numbers of the state (e, k), and also returns the derivatives (e, 3, k) by
+        these.
         """
         points = np.insert(self._state[numbers], 2, 1.0, axis=1)
         return points, np.tile(np.eye(3, 2), (len(numbers), 1, 1))
 
     def predicted(self, discs: ArrayLike, lines: ArrayLike) -> Prediction:
-        """How discs and lines are seen; takes where in the state they begin, (d,) and (e,)."""
+        """Predicted measurements of discs and lines with the slots (d,) and (e,)."""
         of_discs = numbers_from(discs, 2)
         of_lines = numbers_from(lines, self.line_size)
         pose, turn, d, e = self._state[:3], rotation(self._state[2]), len(of_discs), len(of_lines)
@@ -227,7 +227,7 @@ class Filter(ABC):
             every = np.arange(e)[:, None]
             jacobian[2 * d + every, 3 + 2 * d + np.arange(of_lines.size).reshape(e, -1)] = by_line
             jacobian[2 * d :, :2] = -points[:, 2:] * by_xy
-        # Turning the robot is turning the landmarks about it the other way.
+        # Rotating the robot is rotating the landmarks about it the other way.
         turned = [np.zeros(of_discs.shape), np.zeros(of_lines.shape)]
         for own, places in zip(turned, (of_discs, of_lines[:, :2])):
             x, y = (self._linearised[places] - self._linearised[:2]).T
@@ -257,9 +257,9 @@ class Filter(ABC):
     def compared(
         self, rows: CircleRows | LineRows, names: IntArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rows of one kind against m landmarks of it, as `compatible` takes them.
+        """Rows of one kind against m landmarks of that kind, as input of `compatible`.
 
-        Returns innovations (n, m, d) and the covariances of what is expected (m d, m d) and of the
+        Returns innovations (n, m, d) and the covariances of the predictions (m d, m d) and of the
         rows (n, d, d).
         """
         if isinstance(rows, LineRows):
@@ -285,10 +285,10 @@ class Filter(ABC):
     def _whitened(
         self, rows: FrameRows, before: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """The state's covariance with an innovation (n, m), and the innovation (m,), both whitened.
+        """Cross-covariance of state and innovation (n, m), and the innovation (m,), both whitened.
 
-        That is, over a root of the innovation's covariance; `SlamError` where there is none. The
-        innovation is that of the state `before`, if the present one is where it is linearised.
+        That is, divided by a root of the innovation's covariance; `SlamError` if there is none.
+        `before` is the state of the innovation, if linearised at the current one.
         """
         error, jacobian, index, noise = self.innovation_of(rows)
         if before is not None:
@@ -305,7 +305,7 @@ class Filter(ABC):
         return both[:-1], both[-1]
 
     def _grow(self, count: int) -> None:
-        """Lengthen the arrays by some numbers, 0 so far. BLAS has matrices by columns."""
+        """Extend the arrays by some zeros. In column-major order, as BLAS needs it."""
         before = len(self._state)
         self._state = np.pad(self._state, (0, count))
         self._linearised = np.pad(self._linearised, (0, count))
@@ -323,8 +323,8 @@ class Filter(ABC):
     ) -> None:
         """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
 
-        Takes where the others are, `index` (k,), its derivative by them, `jacobian` (d, k), and the
-        measurement's covariance, `noise` (d, d).
+        Takes the indices of the others, `index` (k,), the derivative by them, `jacobian` (d, k),
+        and the measurement's covariance, `noise` (d, d).
         """
         own = slice(slot, slot + len(value))
         columns = self._covariance[:, index] @ jacobian.T
@@ -336,7 +336,7 @@ class Filter(ABC):
 
 
 def numbers_from(slots: ArrayLike, size: int) -> IntArray:
-    """(n, size) numbers of the state from (n,) slots on."""
+    """(n, size) indices of the state from (n,) slots on."""
     return np.asarray(slots, dtype=np.int64).reshape(-1, 1) + np.arange(size)
 
 
@@ -344,7 +344,7 @@ Association = Literal["known", "nearest", "joint"]
 
 #: A row shows a new disc if its distance from all known discs is this many times the gate.
 NEW_DISC_GATES = 4.0
-#: Lines farther than this from the camera are not taken to be in view (m): walls hide them.
+#: Largest distance at which lines are expected to be visible (m), since walls hide others.
 FARTHEST_LINE_M = 15.0
 
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
@@ -353,18 +353,18 @@ _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
 @dataclass(frozen=True)
 class Associator:
-    """How rows are paired with landmarks."""
+    """Pairs rows with landmarks."""
 
     method: Association = "known"  # `known`, `nearest` or `joint`
-    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of right rows that pass
-    # The identifier of the next new disc; None: there are none.
+    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of correct rows that pass
+    # The identifier of the next new disc; None: no new discs.
     new_id: Callable[[], int] | None = None
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)
 
     def identified(self, rows: FrameRows, estimate: Filter) -> FrameRows:
-        """Rows with the identifiers of the landmarks they are found to show."""
+        """Rows with the identifiers of their paired landmarks."""
         if self.method == "known":
             return rows
         discs = self._discs(rows.circles, estimate)
@@ -402,10 +402,10 @@ def run_filter(
     estimate: Filter,
     associator: Associator | None = None,
 ) -> FilterRun:
-    """Take a filter, which is at the start, through a run.
+    """Run a filter, which is at the start, over a run.
 
-    Rows are paired with landmarks by their identifiers, unless an associator says otherwise; those
-    without are left out. Raises `SlamError`, which names the step, if an update is not possible.
+    Rows are paired with landmarks by their identifiers, unless an associator is given; those
+    without are ignored. Raises `SlamError`, which names the step, if an update is not possible.
     """
     pairing = associator or Associator()
     disc_ids: list[int] = []
@@ -439,7 +439,7 @@ def _names_and_slots(of: dict[int, int]) -> tuple[IntArray, IntArray]:
 
 
 def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:
-    """The discs that any of the rows may show."""
+    """The discs near any of the rows."""
     names, slots = _names_and_slots(estimate.disc_slots)
     state, spread = estimate.state, estimate.pose_covariance
     away = np.linalg.norm(state[slots[:, None, None] + _XY] - apply(state[:3], seen_xy), axis=2)

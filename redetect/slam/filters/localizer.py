@@ -1,9 +1,9 @@
 """Localisation in a known map: an extended Kalman filter of the pose alone.
 
-The map has errors of its own. They are the same each time a landmark is seen, so that adding its
-covariance to each measurement's would let the filter average them away, which it can't. The filter
-*considers* them: it carries the correlation of the pose with each landmark's error along without
-estimating the landmarks anew (Schmidt-Kalman filter).
+The map has errors of its own. They are the same each time a landmark is seen, so if its covariance
+were added to that of each measurement, the filter would wrongly average them out. The filter
+*considers* them instead: it propagates the correlation of the pose with each landmark's error
+without estimating the landmarks again (Schmidt-Kalman filter).
 
 Landmarks of a map made by driving share most of their error with their neighbours. The joint
 covariance describes this (`LandmarkMap.joint_covariance`); without it landmarks are
@@ -26,11 +26,11 @@ class Localizer(Filter):
     Parameters
     ----------
     landmark_map : LandmarkMap
-        Where the landmarks are.
+        The landmarks.
     start, start_covariance, camera_xy : array_like
-        As of `Filter`; the pose is in the map.
+        As in `Filter`; the pose is in the map.
     exact : bool
-        Take the map for exact, whatever its covariances.
+        Assume that the map is exact, whatever its covariances.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Localizer(Filter):
         self._grow(len(places))
         self.size = len(self._state)
         self._state[POSE_SIZE:] = self._linearised[POSE_SIZE:] = places
-        if exact:  # it is known how such a map is turned: derivatives are those at the latest pose
+        if exact:  # such a map has a known orientation: Jacobians are those at the latest pose
             self._linearised = self._state
         elif len(places):
             joint = landmark_map.joint_covariance
@@ -60,7 +60,7 @@ class Localizer(Filter):
             self._covariance[POSE_SIZE:, POSE_SIZE:] = joint
 
     def measure(self, rows: FrameRows) -> None:
-        """Use the rows of a frame whose landmarks are in the map; the others are left out."""
+        """Update with the rows of a frame whose landmarks are in the map; others are ignored."""
         known, others = self._known(rows)
         self.count.leave_out("disc not in the map", len(others.circles))
         self.count.leave_out("line not in the map", len(others.lines))

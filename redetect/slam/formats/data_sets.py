@@ -31,18 +31,18 @@ from redetect.slam.errors import SlamError
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
 
-#: How the names of a robot's odometry and of the files beside it end.
+#: Suffixes of the names of a robot's odometry and of the files beside it.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
 LANDMARKS, BARCODES = "Landmark_Groundtruth.dat", "Barcodes.dat"
 _ROBOTS = 5
 
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
-# The car: distance of the axles, of the encoder from the middle, and the scanner's place (m).
+# The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
 _AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
 _BEAMS = 361
 _FARTHEST_M = 75.0
-# Neighbouring beams on one trunk differ by less; what is behind a trunk is farther by more.
+# Largest range difference of neighbouring beams on a trunk, and least one to the background.
 _SAME_M, _BEHIND_M = 0.5, 1.5
 _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
 
@@ -75,9 +75,9 @@ def _steps_between(
     along: Callable[[IntArray, FloatArray], FloatArray],
     ends: tuple[float, float],
 ) -> FloatArray:
-    """Movements (N, 3) to each time, from the first of `ends` on; what was logged holds till next.
+    """Movements (N, 3) to each time, from the first of `ends` on; log rows hold until the next.
 
-    `along` gives the movements under rows of the log (k,) held for some seconds (k,).
+    `along` gives the movements for rows of the log (k,) held for some seconds (k,).
     """
     knots = np.union1d(np.append(logged, ends[1]), times)
     knots = knots[knots >= ends[0]]
@@ -97,7 +97,7 @@ class _Seen(NamedTuple):
 
 
 def _seen_by_robot(odometry: Path) -> _Seen:
-    """The measurements beside a robot's odometry; other robots that it saw are left out."""
+    """The measurements beside a robot's odometry; sightings of other robots are ignored."""
     seen = _table(_beside(odometry, MEASUREMENTS), "time barcode range bearing")
     barcodes = _table(odometry.with_name(BARCODES), "subject barcode")
     subject = {int(barcode): int(number) for number, barcode in barcodes}
@@ -109,7 +109,7 @@ def _seen_by_robot(odometry: Path) -> _Seen:
 
 
 def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
-    """What a robot logged, its landmarks as discs; steps state no covariance.
+    """A robot's log, with landmarks as discs; steps have no covariance.
 
     Takes the standard deviations of ranges and bearings.
     """
@@ -153,7 +153,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
 
 
 def _velocity_steps(velocity: FloatArray, times: FloatArray) -> FloatArray:
-    """Movements from the odometry's begin to each time, along arcs by their chords."""
+    """Movements from the start of the odometry to each time, arcs approximated by their chords."""
     first = min(velocity[0, 0], times[0])
     last = max(times[-1], velocity[-1, 0]) + 1.0
 
@@ -176,7 +176,7 @@ def _table(path: Path, names: str) -> FloatArray:
 
 
 def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
-    """What the car logged, the trees found in its scans as discs; see `read_robot`."""
+    """The car's log, with the trees found in its scans as discs; see `read_robot`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
@@ -193,13 +193,13 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
 
 
 def trees_of(scan: FloatArray) -> FloatArray:
-    """Trunks in a scan: runs of beams of nearly one range with nothing near beside them.
+    """Trunks in a scan: runs of beams with nearly equal range and a distant background.
 
     Takes `scan` (361,); returns (n, 2).
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
-    # What the scan's border hides is unknown.
+    # Trunks at the scan's border are skipped, since their width is unknown.
     before = np.concatenate([[0.0], scan[starts[1:] - 1]])
     after = np.concatenate([scan[ends[:-1]], [0.0]])
     found = []

@@ -7,10 +7,9 @@ is vertex B + n, where B is the smallest power of ten above the last pose's numb
 
 The error of an EDGE_SE2 is measured in the axes at the *end* of the step, (measured)^-1 * (from^-1
 * to), while the covariance of a STEP row is of dx and dy in the axes before it: the information is
-rotated by dphi, so that a graph's error is the one of this project's models.
+rotated by dphi, so that a graph's error equals that of this project's models.
 
-Comments stand at the end: GTSAM's reader ignores all edges after the first row that it does not
-know.
+Comments are at the end: GTSAM's reader ignores all edges after the first unknown row.
 """
 
 from __future__ import annotations
@@ -38,15 +37,15 @@ from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage import write_text
 from redetect.storage.bounded import read_text
 
-#: The largest number of a vertex: other tools keep it in 31 bits.
+#: The largest number of a vertex: other tools store it in 31 bits.
 LARGEST_NUMBER = 2**31 - 1
 _LARGEST_BYTES = 1 << 28
-# Less has no inverse that is finite (m^-2, rad^-2).
+# Less has no finite inverse (m^-2, rad^-2).
 _LEAST_INFORMATION = 1e-100
 
 
 class RunGraph(NamedTuple):
-    """A run of discs that all have an identifier, with estimates; in the data set's axes."""
+    """A run whose discs all have identifiers, with estimates; in the data set's axes."""
 
     recording: Recording
     poses: FloatArray  # (N + 1, 3): estimates, the start first
@@ -64,14 +63,14 @@ def graph_of_run(recording: Recording) -> RunGraph:
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:
-    """The number that a disc's identifier is added to: the power of ten above all poses."""
+    """Offset of the discs' vertex numbers: the power of ten above all poses."""
     return int(10 ** len(str(last_pose_vertex)))
 
 
 def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
-    """Covariances (N, 3, 3) of steps as seen from axes that are turned by angles (N,).
+    """Covariances (N, 3, 3) of steps in axes rotated by angles (N,).
 
-    Turned by their own dphi: in the axes at their end, as errors of SE(2) edges are measured.
+    Rotated by their own dphi, they are in the axes at the end, as errors of SE(2) edges.
     """
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
@@ -129,7 +128,7 @@ def _numbers(values: FloatArray) -> str:
 
 
 _POSE, _DISC, _STEP, _SIGHT, _FIX = "VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX"
-# Of each kind of row: how many vertices it names, and its numbers.
+# For each kind of row: its number of vertices, and its numbers.
 _KINDS = {
     _POSE: (1, ("x", "y", "theta")),
     _DISC: (1, ("x", "y")),
@@ -145,10 +144,10 @@ class _Row(NamedTuple):
 
 
 def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
-    """Read a graph of a run; frames are called by the numbers of their poses' vertices.
+    """Read a graph of a run; frames are named by the numbers of their poses' vertices.
 
-    Discs whose vertices all have numbers above the power of ten over the poses' are counted from
-    there, others named by the vertex.
+    If all discs' vertices are above the power of ten over the poses', identifiers are counted from
+    there, otherwise they are the vertices' numbers.
 
     Raises `SlamError` if the file cannot be read, a row is malformed or names a vertex that is
     missing, an information matrix is not positive definite, or the poses are no chain from each to
@@ -203,7 +202,7 @@ def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
 
 
 def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
-    """The rows of each kind; `FIX` is left out, as is what is behind ``#``."""
+    """The rows of each kind, without `FIX` and text after ``#``."""
     rows: dict[str, list[_Row]] = {kind: [] for kind in _KINDS}
     known: set[tuple[int, ...]] = set()  # vertices, and those between which there is a step
     text = read_text(path, _LARGEST_BYTES, "g2o graph", SlamError)
@@ -239,7 +238,7 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
 
 
 def _chain(path: str | os.PathLike[str], order: list[int], steps: list[_Row]) -> list[_Row]:
-    """The steps in the poses' order, where there is one from each to the next and no other."""
+    """The steps in the poses' order; there has to be one from each to the next and no other."""
     if len(order) < 2:
         raise SlamError(f"{path}: {len(order)} {_POSE} rows: expected a run of at least one step")
     found: dict[tuple[int, ...], _Row] = {row.vertices: row for row in steps}
@@ -262,7 +261,7 @@ def _table(rows: Sequence[_Row], width: int) -> FloatArray:
 
 
 def _symmetric(rows: Sequence[_Row], size: int) -> FloatArray:
-    """Information matrices from their upper triangles, which are last in each row."""
+    """Information matrices from their upper triangles at the end of each row."""
     triangle = np.triu_indices(size)
     count = len(triangle[0])
     matrices = np.zeros((len(rows), size, size))

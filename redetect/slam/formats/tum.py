@@ -1,6 +1,6 @@
 """Paths as TUM trajectories: a row ``t x y z qx qy qz qw`` for each pose; X forward, Y left.
 
-Comments begin with ``#``. A path on the floor has z, qx and qy 0. Of a run without times t is the
+Comments begin with ``#``. A path on the floor has z, qx and qy 0. For a run without times, t is the
 number of the step, 0 for the start.
 """
 
@@ -19,7 +19,7 @@ from redetect.storage import write_text
 from redetect.storage.bounded import rows_of_numbers
 
 _COLUMNS = "t x y z qx qy qz qw"
-# How far a pose may lie off the floor (m; quaternion) and still be a pose on it.
+# Tolerance of poses on the floor (m; quaternion).
 _FLAT = 1e-6
 _UNIT = 1e-3
 

@@ -1,10 +1,10 @@
 """Finds rows of discs whose identifier contradicts the rest of a run, and what they show instead.
 
-A robust map leaves out the rows that do not fit. Each of them is then held against the map that the
-others make: the squared error of measurements added to a least-squares problem is
+Suspects are the rows that a robust map rejects. Each of them is then compared with the map of the
+others: the squared error of measurements added to a least-squares problem is
 ``r^T (I + J P J^T)^-1 r`` with r and J their whitened errors and Jacobians and P the covariance
 before (Y. Bar-Shalom, X. Li, T. Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, section 5.4). The same number says whether another landmark, or one of its own,
+Navigation, 2001, section 5.4). The same number decides whether another landmark, or a new one,
 explains rows better.
 """
 
@@ -30,15 +30,15 @@ from redetect.slam.recording import UNKNOWN_ID, Recording
 
 Kind = Literal["exchange", "split", "drop"]
 
-# Standard deviations from which on rows pull less.
+# Scale of the robust loss, standard deviations.
 _LOSS_SCALE = 3.0
-# Rows whose squared error in the robust map is this share of the gate are held against the others.
+# Rows whose squared error in the robust map is this share of the gate are suspects.
 _SUSPECT_SHARE = 0.25
-# Rows of an identifier further apart than this belong to different groups (frames).
+# Rows of an identifier farther apart than this belong to different groups (frames).
 _LONGEST_GAP = 10
-# How far a landmark may be from where a group lies, to be tried (m).
+# Largest distance of a landmark that is tried from a group (m).
 _NEAR_M = 1.0
-# Rows are explained by a landmark unless their squared error is less probable.
+# Rows are explained by a landmark unless their squared error is less probable than this.
 _LEAST_PROBABILITY = 1e-3
 
 
@@ -46,13 +46,13 @@ _LEAST_PROBABILITY = 1e-3
 class Group:
     """Rows of one identifier in neighbouring frames that contradict the rest."""
 
-    rows: IntArray  # (k,): which rows of the recording's discs
+    rows: IntArray  # (k,): indices of the rows among the recording's discs
     id: int  # their identifier in the file
-    # Whether they show another landmark, one of their own, or nothing that could be said.
+    # Whether they show another landmark, a new one, or nothing that is known.
     kind: Kind
     new_id: int  # that landmark; -1 for `drop`
-    xy: FloatArray  # (k, 2): where the rows lie in the map (m)
-    own_m: float  # how far the median of these is from the landmark of that identifier
+    xy: FloatArray  # (k, 2): positions of the rows in the map (m)
+    own_m: float  # distance of their median from the landmark of that identifier
     # (k,): squared error of each row against the map without any of the suspects.
     row_chi_squared: FloatArray
     # Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
@@ -62,7 +62,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """What contradicts; chi-squared with all rows, without those, with mended identifiers."""
+    """Contradicting rows; chi-squared with all rows, without those, with corrected identifiers."""
 
     groups: tuple[Group, ...]  # by frame
     before: ChiSquared
@@ -114,7 +114,7 @@ def audit_run(
     dropped = fit.table
 
     groups = []
-    # The largest first: what they show may be what smaller ones show as well.
+    # The largest groups first, since smaller ones may show the same landmark.
     for rows in sorted(_groups(recording, accused), key=lambda rows: (-len(rows), rows[0])):
         group = _explained(recording, fit, rows, np.array([score[int(k)] for k in rows]))
         groups.append(group)
@@ -131,7 +131,7 @@ def _fit(
     camera: Camera | None,
     weighting: Weighting,
 ) -> _Fit:
-    """The map with these identifiers; discs start at the median of where their rows lie."""
+    """The map with these identifiers; discs start at the median of their rows' positions."""
     graph = graph_of_recording(
         replace(recording, circles=replace(recording.circles, ids=ids)), camera
     )
@@ -148,7 +148,7 @@ def _fit(
 def _misfit(
     recording: Recording, fit: _Fit, rows: IntArray, number: int, at: FloatArray | None = None
 ) -> float:
-    """By how much chi-squared grows if rows are added as those of a landmark, a new one if `at`."""
+    """Increase of chi-squared if rows are added to a landmark, a new one near `at` if given."""
     error, spread, by_new = _innovation(recording, fit, rows, np.full(len(rows), number), at)
     root = np.linalg.cholesky(spread)
     error, by_new = np.linalg.solve(root, error), np.linalg.solve(root, by_new)
@@ -163,7 +163,7 @@ def _innovation(
     """Whitened errors (2 k,) of rows against a map without them, and their covariance.
 
     With `at` they show a new landmark near there: the third result (2 k, 2) is the derivative by
-    its place. The camera's mounting counts as known.
+    its position. The camera's mounting is assumed to be known.
     """
     circles, graph, estimate = recording.circles, fit.graph, fit.estimate
     if at is not None:
@@ -184,7 +184,7 @@ def _innovation(
 
 
 def _groups(recording: Recording, accused: IntArray) -> list[IntArray]:
-    """Accused rows of an identifier between which none that fits and no long gap lies."""
+    """Accused rows of an identifier, without a fitting row or a long gap in between."""
     ids, frame = recording.circles.ids, recording.circles.frame
     guilty = np.zeros(len(ids), dtype=bool)
     guilty[accused] = True
@@ -197,13 +197,13 @@ def _groups(recording: Recording, accused: IntArray) -> list[IntArray]:
 
 
 def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArray) -> Group:
-    """What the rows of a group show."""
+    """The best explanation of the rows of a group."""
     circles, graph = recording.circles, fit.graph
     number = int(circles.ids[rows[0]])
     xy = apply(fit.estimate.poses[circles.frame[rows] + 1], circles.xy[rows])
     place = np.median(xy, axis=0)
     away = np.linalg.norm(fit.estimate.disc_xy - place, axis=1)
-    # A landmark shows up once in a frame.
+    # A landmark appears once in a frame.
     taken = graph.disc_index[np.isin(graph.disc_pose, circles.frame[rows] + 1)]
     free = np.setdiff1d(np.flatnonzero(away < _NEAR_M), taken)
     others = {int(k): _misfit(recording, fit, rows, int(k)) for k in graph.disc_ids[free]}

@@ -1,4 +1,4 @@
-"""All measurements of a run as one least-squares problem, and a value for each of its unknowns."""
+"""The measurements of a run as one least-squares problem, and estimates of its unknowns."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ class Graph:
     steps: FloatArray  # (N, 3): odometry (m, m, rad)
     step_whitening: FloatArray  # (N, 3, 3)
     disc_ids: IntArray  # (M,): ascending
-    # (n,): from which pose each row saw which disc, by its index in `disc_ids`.
+    # (n,): pose of each row, and its disc as an index of `disc_ids`.
     disc_pose: IntArray
     disc_index: IntArray
-    disc_xy: FloatArray  # (n, 2): where, in the robot frame (m)
+    disc_xy: FloatArray  # (n, 2): measured position in the robot frame (m)
     disc_whitening: FloatArray  # (n, 2, 2)
     line_ids: IntArray  # (K,): of vertical lines, ascending
-    line_pose: IntArray  # (q,): from which pose each row saw its lines
+    line_pose: IntArray  # (q,): pose of each row of lines
     bearing_rad: FloatArray  # (q,)
     bearing_sigma_rad: FloatArray  # (q,)
-    # (e,): which rows show which lines, by their index in `line_ids`; a row may show several.
+    # (e,): pairs of row and line (an index of `line_ids`); a row may show several lines.
     member_row: IntArray
     member_line: IntArray
-    camera_xy: FloatArray  # (2,): where in the robot frame bearings are taken from (m)
-    camera: Camera | None = None  # as calibrated; needed where the mounting is estimated
-    # (K, 2): where lines are believed to be (m), which bounds those that bearings leave open.
+    camera_xy: FloatArray  # (2,): origin of bearings in the robot frame (m)
+    camera: Camera | None = None  # as calibrated; needed if the mounting is estimated
+    # (K, 2): priors of lines (m), which bound those that bearings do not determine.
     line_prior: FloatArray | None = None
 
     @property
     def disc_row_counts(self) -> IntArray:
-        """(M,) how many rows show each disc."""
+        """(M,) number of rows of each disc."""
         return np.bincount(self.disc_index, minlength=len(self.disc_ids)).astype(np.int64)
 
     @property
     def line_row_counts(self) -> IntArray:
-        """(K,) how many rows show each line."""
+        """(K,) number of rows of each line."""
         return np.bincount(self.member_line, minlength=len(self.line_ids)).astype(np.int64)
 
 
@@ -60,14 +60,14 @@ class Estimate:
     poses: FloatArray  # (N + 1, 3): x, y (m), theta (rad); the first is given, not estimated
     disc_xy: FloatArray  # (M, 2): discs in the map (m)
     line_xy: FloatArray  # (K, 2): vertical lines in the map (m)
-    # (3, 4): robot_from_camera as mounted; None: as calibrated, and discs are taken as rows say.
+    # (3, 4): robot_from_camera as mounted; None: as calibrated, and rows of discs are used as is.
     mounting: FloatArray | None = None
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
-    """The problem that a run's odometry and discs pose; lines come in by `with_lines`.
+    """The problem of a run's odometry and discs; `with_lines` adds lines.
 
-    Rows without an identifier are left out.
+    Rows without an identifier are ignored.
     """
     circles = recording.circles
     known = circles.ids >= 0
@@ -113,9 +113,9 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
 
 
 def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
-    """Poses as odometry chains them from the first (3,), discs where they were first seen.
+    """Poses chained by odometry from the first (3,), discs where they were first seen.
 
-    Lines are not placed: `line_xy` is NaN.
+    Lines have no initial position: `line_xy` is NaN.
     """
     poses = chain_steps(graph.steps, start)
     _, first = np.unique(graph.disc_index, return_index=True)

@@ -25,14 +25,14 @@ from redetect.storage.bounds import Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
 
-#: Rotation about robot x, y, z, and place in robot x, y, z.
+#: Rotation about robot x, y, z, and position in robot x, y, z.
 MOUNTING = 6
 
-#: Standard deviation of the camera's place over the floor about the calibrated one (m), for runs
-#: that turn too little to tell.
+#: Standard deviation of the prior of the camera's horizontal position (m), for runs with too little
+#: rotation to determine it.
 PLACE_PRIOR_M = 0.1
 
-#: Standard deviation of where lines are believed to be, if anywhere (m).
+#: Standard deviation of lines' priors, if there are any (m).
 LINE_PRIOR_M = 3.0
 
 
@@ -40,16 +40,16 @@ LINE_PRIOR_M = 3.0
 class Weighting:
     """The cost function and the unknowns."""
 
-    loss: LossKind = "none"  # how much a landmark row counts; odometry always counts in full
-    loss_scale: Positive = 3.0  # standard deviations from which on rows pull less
-    calibrate: bool = False  # whether the camera's mounting is unknown, of discs alone
-    # Whether that is its place over the floor (x, y), too, which discs show when the robot turns;
-    # else its rotation and height.
+    loss: LossKind = "none"  # robust loss of landmark rows; odometry always has full weight
+    loss_scale: Positive = 3.0  # scale of the loss, standard deviations
+    calibrate: bool = False  # whether the camera's mounting is unknown, with discs only
+    # Whether that includes its horizontal position (x, y), which discs determine when the robot
+    # turns, or only rotation and height.
     place: bool = True
-    # Where rows and discs are compared when the mounting is unknown. `corrected`: the row's pixel
-    # is put on the floor by the camera as mounted, under the row's own covariance. `recorded`: the
-    # row that the calibrated camera would have written is compared with the one it wrote, which is
-    # where that covariance belongs.
+    # How rows and discs are compared if the mounting is unknown. `corrected`: the row's pixel is
+    # projected to the floor by the camera as mounted, with the row's own covariance. `recorded`:
+    # the row that the calibrated camera would have written is compared with the actual one, to
+    # which that covariance belongs.
     row_errors: RowErrors = "recorded"
 
     def __post_init__(self) -> None:
@@ -57,14 +57,14 @@ class Weighting:
 
     @property
     def unknown_mounting(self) -> list[int]:
-        """Which of the numbers of the mounting are unknown."""
+        """Indices of the unknown numbers of the mounting."""
         if not self.calibrate:
             return []
         return list(range(MOUNTING)) if self.place else [0, 1, 2, 5]
 
 
 class Layout(NamedTuple):
-    """Where in the vector of unknowns each kind begins: poses except the first are first."""
+    """Offsets of each kind in the vector of unknowns: poses except the first come first."""
 
     first_disc: int
     first_line: int
@@ -83,10 +83,10 @@ class Errors:
     """Whitened errors by kind, not robustified."""
 
     odometry: FloatArray  # (N, 3)
-    discs: FloatArray  # (n, 2): NaN where a disc would be out of the camera's sight
+    discs: FloatArray  # (n, 2): NaN if the camera could not see a disc
     lines: FloatArray  # (q,)
-    prior: FloatArray  # (K, 2) or (0, 2): lines less where they are believed to be
-    place: FloatArray  # (1, 2) or (0, 2): the camera less where it was calibrated to be
+    prior: FloatArray  # (K, 2) or (0, 2): lines minus their priors
+    place: FloatArray  # (1, 2) or (0, 2): the camera's position minus the calibrated one
 
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
@@ -106,7 +106,7 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
 
 
 def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
-    """The function to minimise; infinite if a disc would be out of the camera's sight."""
+    """The function to minimise; infinite if the camera could not see a disc."""
     error = errors(graph, estimate, weighting)
     loss = Loss(weighting.loss, weighting.loss_scale)
     return robust_cost(
@@ -121,10 +121,10 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
 
 
 def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
-    """The problem near an estimate, its unknowns as in `Layout`; shared is the mounting.
+    """The problem linearised at an estimate, with unknowns as in `Layout`; the mounting is shared.
 
-    The mounting changes by a rotation vector in the robot frame, applied from the left, and place:
-    by as much of these as is unknown.
+    The mounting changes by a rotation vector in the robot frame, applied from the left, and a
+    translation, restricted to the unknown numbers.
     """
     layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
@@ -135,7 +135,7 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
         graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
     )
     unknown = weighting.unknown_mounting
-    of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is no unknown
+    of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is not unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
     whiten = graph.step_whitening
     blocks = [
@@ -161,9 +161,9 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 def _disc_rows(
     graph: Graph, estimate: Estimate, weighting: Weighting
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(n, 2) discs as rows would have them, less the rows (m).
+    """(n, 2) predicted minus measured rows of discs (m).
 
-    And its derivatives (n, 2, k) by pose, disc and mounting.
+    Also their derivatives (n, 2, k) by pose, disc and mounting.
     """
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
     seen, (by_pose, by_disc) = disc_in_robot(pose, disc), disc_jacobians(pose, disc)
@@ -207,7 +207,7 @@ def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss
     )
     scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
     by_pose, by_line = by_pose * scale, by_line * scale
-    # The k-th line of each row; rows of fewer lines have none there.
+    # The k-th line of each row; rows with fewer lines have none there.
     order = np.argsort(graph.member_row, kind="stable")
     count = np.bincount(graph.member_row, minlength=len(graph.line_pose))
     start = np.cumsum(count) - count

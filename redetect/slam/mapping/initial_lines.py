@@ -13,9 +13,9 @@ from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.models import bearing_jacobians, disc_in_robot
 from redetect.slam.recording import LineRows
 
-#: Farther from their intersection rays do not agree with it, in standard deviations.
+#: Largest distance of a ray from the intersection it agrees with, in standard deviations.
 MOST_MISS = 10.0
-#: Lines whose place is less certain, the poses being known, are left out.
+#: Lines with a less certain position, given the poses, are dropped.
 MOST_SIGMA_M = 0.5
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
@@ -23,19 +23,19 @@ _LOCAL_PATH_M = 15.0
 
 @dataclass(frozen=True, eq=False)
 class InitialLines:
-    """Lines that can be placed, and the others."""
+    """Lines that can be triangulated, and the others."""
 
-    ids: IntArray  # (K,): lines that can be placed, ascending
+    ids: IntArray  # (K,): triangulated lines, ascending
     xy: FloatArray  # (K, 2): their positions in the map (m)
     unplaced: IntArray  # (U,): lines never seen, alone in a row, under enough parallax
 
 
 def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> InitialLines:
-    """Triangulate lines from poses that are known well enough.
+    """Triangulate lines from sufficiently accurate poses.
 
-    Only rows of a single line are used: two lines that were always joined cannot be separated. A
-    line is triangulated from its views along some metres of path from its first sight on; if these
-    leave it uncertain, from all of its views. Half of them have to agree with its place.
+    Only rows of a single line are used, since two lines that were always joined cannot be
+    separated. A line is triangulated from its views along some metres of path after its first
+    sight; if it stays uncertain, from all its views. Half of them have to agree with its position.
 
     Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
@@ -63,7 +63,7 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
 
 
 def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
-    """Which lines of an estimate the bearings of its poses place.
+    """Mask of the lines of an estimate whose position the bearings determine.
 
     Returns (K,).
     """
@@ -90,11 +90,11 @@ def meeting_points(
     camera_xy: ArrayLike,
     least_information: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The places nearest to the rays of each line, a ray's miss counted as an angle.
+    """The points nearest to the rays of each line, by angular distance.
 
-    Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). Returns places
-    (count, 2), NaN where the information (m^-2) is less in some direction; of each ray how far
-    along it its place is (n,) (m), and by how many standard deviations it misses it (n,).
+    Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). Returns points
+    (count, 2), NaN if the information (m^-2) is less in some direction; for each ray the distance
+    of the point along it (n,) (m), and from it in standard deviations (n,).
     """
     centre = apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2)))
     angle = (
@@ -104,7 +104,7 @@ def meeting_points(
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     offset = np.sum(normal * centre, axis=1)
     distance = np.full(len(poses), 3.0)
-    for _ in range(4):  # the farther a line, the less its bearing says
+    for _ in range(4):  # reweighting, since a bearing is less accurate in metres at a distance
         weight = 1.0 / (sigma_rad * np.maximum(distance, 0.3)) ** 2
         information = np.zeros((count, 2, 2))
         np.add.at(information, labels, weight[:, None, None] * normal[:, :, None] * normal[:, None])

@@ -1,6 +1,6 @@
 """A run's least-squares map, from its rows to poses and landmarks with covariances.
 
-With the chi-squared table of the solution, as the data set's report prints it.
+Includes the chi-squared table of the solution, as in the data set's report.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from redetect.slam.recording import Recording
 
 @dataclass(frozen=True)
 class ChiSquared:
-    """How large the errors are, and how large they should be."""
+    """Squared errors of a map, and their expectation."""
 
     poses: int  # p: the start and one per step
     landmarks: int  # n: discs and lines
@@ -48,11 +48,11 @@ class ChiSquared:
     lines: float
     # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
     chi_squared: float
-    expected: int  # dim(z) - dim(x): numbers measured less numbers estimated
-    # chi_squared / expected: the variances' factor that would make both equal; NaN where nothing is
-    # measured twice.
+    expected: int  # dim(z) - dim(x): numbers measured minus numbers estimated
+    # chi_squared / expected: the factor on the variances that would make both equal; NaN without
+    # redundancy.
     factor: float
-    root: float  # its root: the standard deviations' factor
+    root: float  # its root: the factor on the standard deviations
 
 
 def chi_squared(
@@ -63,10 +63,10 @@ def chi_squared(
     parts = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
-    # The start is measured (it is the origin) and estimated, so it adds as much as it takes.
+    # The start is measured (it is the origin) and estimated, so it does not change the difference.
     measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose)
     unknown = 3 * poses + 2 * landmarks + len(weighting.unknown_mounting)
-    # What a lost step says is as good as nothing.
+    # A lost step contributes practically nothing.
     expected = measured - unknown - 3 * lost_steps
     factor = sum(parts) / expected if expected > 0 else math.nan
     return ChiSquared(
@@ -112,9 +112,9 @@ Solver = Literal["separable", "gtsam"]
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
-# Near enough to the minimum for the final optimisation.
+# Tolerance before the final optimisation.
 _COARSE = 1e-3
-# Multiples of the scale of a loss that is not convex, from nearly least squares down.
+# Multiples of the scale of a non-convex loss, from nearly least squares down.
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 
@@ -124,25 +124,25 @@ class LeftOut:
 
     rows_without_id: int
     discs_seen_once: int  # they are in the map, but nothing checks them
-    # Lines never seen, alone in a row, under enough parallax, or that do not stay placed.
+    # Lines without enough parallax in rows of their own, or whose position is lost later.
     lines_without_parallax: int
-    line_rows: int  # rows of lines that show one of those
+    line_rows: int  # rows of these lines
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """A camera's mounting as the run has it."""
+    """A camera's mounting as estimated from the run."""
 
-    # (6,): rotation vector in the robot frame (rad) and place (m), true less calibrated.
+    # (6,): rotation vector in the robot frame (rad) and position (m), true minus calibrated.
     change: FloatArray
-    covariance: FloatArray  # (6, 6), zero where a number was no unknown
+    covariance: FloatArray  # (6, 6), zero for numbers that were not estimated
     robot_from_camera: FloatArray  # (3, 4)
-    gain: float  # by how much less the sum of squares is than with the mounting as calibrated
+    gain: float  # decrease of the sum of squares from the mounting as calibrated
 
 
 @dataclass(frozen=True, eq=False)
 class MappedRun:
-    """A least-squares map and how it came about."""
+    """A least-squares map and its history."""
 
     prefixes: tuple[str, ...]  # names of the poses: the start, then the frames
     graph: Graph
@@ -152,8 +152,8 @@ class MappedRun:
     covariance: Marginals
     table: ChiSquared
     left_out: LeftOut
-    cost: float  # what was minimised: chi-squared, or less under a robust loss
-    steps: int  # of all descents together
+    cost: float  # the minimised cost: chi-squared, or less with a robust loss
+    steps: int  # total number of steps
     mounting: Mounting | None
 
     @property
@@ -194,23 +194,23 @@ def map_run(
 ) -> MappedRun:
     """Least squares over all poses and landmarks of a run; the first pose is fixed.
 
-    First odometry and discs from first sight; then lines are triangulated from those poses and all
-    is fitted together; then the loss and the mounting, if asked for, start from there.
+    First odometry and discs are fitted, starting from first sight; then lines are triangulated from
+    those poses and everything is fitted together; a robust loss and the mounting start from there.
 
     Parameters
     ----------
     recording : Recording
-        The run. Rows without an identifier do not count.
+        The run. Rows without an identifier are ignored.
     camera : Camera, optional
-        As calibrated: for lines (where bearings are taken from) and where the mounting is unknown.
+        As calibrated: needed for lines (the origin of bearings), and if the mounting is unknown.
     weighting : Weighting, optional
         Loss and unknowns; plain least squares by default.
     start : (3,)
         The first pose (m, m, rad).
     solver : "separable" or "gtsam"
-        The solver that does the final optimisation.
+        The solver for the final optimisation.
     name : str
-        What messages call the run.
+        Name of the run in messages.
 
     Raises
     ------
@@ -240,8 +240,8 @@ def map_run(
         placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
         if not len(placed.ids) and not len(graph.disc_ids):
             raise SlamError(
-                f"{name}: none of {len(placed.unplaced)} lines is seen, alone in a row, under "
-                "enough parallax: there is nothing to map"
+                f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its "
+                "own: there is nothing to map"
             )
         graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
     if only_start:
@@ -271,11 +271,11 @@ def map_run(
 def _with_parts_in_place(
     recording: Recording, graph: Graph, begin: Estimate, name: str
 ) -> Estimate:
-    """A start at which parts between which odometry is lost lie on each other, by their discs.
+    """An initial estimate with the parts between lost steps registered by their common discs.
 
-    Each part is mapped by itself. The first stays; next is always the part that has most discs in
-    common with those that lie. Verticals may join a part, too, which then begins where odometry has
-    it. `SlamError` where a part shares fewer than two landmarks with the others.
+    Each part is mapped separately. The first stays; the next is always the part with most discs in
+    common with those registered. A part may also be connected by verticals; it then starts from
+    odometry. Raises `SlamError` if a part shares fewer than two landmarks with the others.
     """
     lost, discs = recording.lost, len(graph.disc_ids)
     part = np.searchsorted(lost, graph.disc_pose - 1, side="right")
@@ -321,7 +321,7 @@ def _with_lines(
     placed: InitialLines,
     keep: Callable[[Minimum[Estimate]], Estimate],
 ) -> tuple[Graph, Estimate]:
-    """The problem with the lines that stay well placed while all is fitted together."""
+    """The problem with the lines whose positions stay determined when everything is fitted."""
     ids, xy = placed.ids, placed.xy
     robust = Weighting(loss="huber")
     while True:
@@ -337,10 +337,10 @@ def _with_lines(
 
 
 def _on_the_way(wanted: Weighting) -> list[Weighting]:
-    """By what a robust loss is reached: least squares; then, if it isn't convex, wider scales.
+    """Stages towards a robust loss: least squares; then, if it is not convex, wider scales.
 
-    Graduated non-convexity: from where it is nearly least squares, rows that do not fit are let go
-    one by one (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
+    Graduated non-convexity: starting from nearly least squares, outliers are released one by one
+    (A. Blake, A. Zisserman, Visual Reconstruction, 1987).
     """
     if wanted.loss == "none":
         return []
@@ -354,7 +354,7 @@ def _descent(
 ) -> Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]:
     if solver == "gtsam":
         return solve_gtsam
-    # A robust loss converges slowly at last: reweighting is no Newton's method.
+    # A robust loss converges slowly at the end, since reweighting is not Newton's method.
     return partial(solve, tolerance=1e-10 if loss == "none" else 1e-7)
 
 
@@ -379,7 +379,7 @@ def _check_usable(
     if weighting.calibrate and camera is not None:
         if len(recording.lines):
             raise SlamError(
-                f"{name}: bearings do not say how the camera is mounted: expected discs alone"
+                f"{name}: bearings do not determine the camera's mounting: expected discs alone"
             )
         check_rows_fit_camera(camera, recording.circles.xy)
 

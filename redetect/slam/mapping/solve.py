@@ -1,9 +1,9 @@
-"""The least squares of a map, solving for positions exactly while headings move.
+"""Least squares of a map, with exact positions for each iterate of the headings.
 
-With headings given, odometry and discs are linear in all positions. So each step of the headings is
-followed by the positions that fit them best (K. Khosoussi, S. Huang, G. Dissanayake, Exploiting the
-separable structure of SLAM, RSS 2015; the projection is that of Golub and Pereyra). Without it, a
-chain of thousands of poses creeps along a curved valley.
+Given the headings, odometry and discs are linear in all positions. So after each step of the
+headings, the positions that fit best are computed (K. Khosoussi, S. Huang, G. Dissanayake,
+Exploiting the separable structure of SLAM, RSS 2015; variable projection of Golub and Pereyra).
+Otherwise, a chain of thousands of poses converges slowly along a curved valley.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ _MOST_STEPS = 200
 
 @dataclass(frozen=True, eq=False)
 class Marginals:
-    """Covariance of each unknown, all others unknown too."""
+    """Marginal covariance of each unknown."""
 
     poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
     discs: FloatArray  # (M, 2, 2)
     lines: FloatArray  # (K, 2, 2)
-    # (6, 6): of the rotation vector (rad) and the place (m), zero where that is no unknown.
+    # (6, 6): of the rotation vector (rad) and the position (m), zero for known numbers.
     mounting: FloatArray | None
 
 
 @dataclass(frozen=True, eq=False)
 class _MapProblem:
-    """A graph as `redetect.least_squares.solver.minimise` takes it."""
+    """A graph as input of `redetect.least_squares.solver.minimise`."""
 
     graph: Graph
     weighting: Weighting
@@ -96,9 +96,9 @@ def solve(
 ) -> Minimum[Estimate]:
     """Minimise the sum of squared (or robust) whitened errors.
 
-    As a start, odometry and first sight do for thousands of poses. The descent ends at a step that
-    lowers the cost by less than `tolerance`, a share of it. Raises `SlamError` if the start is not
-    finite, the steps run out, or the measurements do not determine the unknowns.
+    Odometry and first sight are a sufficient start for thousands of poses. The iteration ends at a
+    relative decrease of the cost below `tolerance`. Raises `SlamError` if the start is not finite,
+    the number of steps is exceeded, or the measurements do not determine the unknowns.
     """
     estimate = _with_unknowns(graph, start, weighting)
     problem = _MapProblem(graph, weighting)
@@ -113,7 +113,7 @@ def solve(
             )
     except StartError:
         raise SlamError(
-            "least squares cannot begin: a disc lies where the camera as mounted cannot see it"
+            "least squares cannot begin: the camera as mounted could not see one of the discs"
         ) from None
     if not found.converged:
         raise SlamError(
@@ -125,7 +125,7 @@ def solve(
 
 @contextmanager
 def _determined(what: str) -> Iterator[None]:
-    """Say where the measurements do not determine the unknowns."""
+    """Raise `SlamError` if the measurements do not determine the unknowns."""
     try:
         yield
     except np.linalg.LinAlgError:
@@ -142,8 +142,8 @@ def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> Norm
 def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Marginals:
     """Covariances of all poses and landmarks at a minimum of `solve`.
 
-    Under a robust loss, rows' information is multiplied by their weights. Raises `SlamError` if the
-    measurements do not determine the unknowns.
+    With a robust loss, the information of rows is multiplied by their weights. Raises `SlamError`
+    if the measurements do not determine the unknowns.
     """
     layout = layout_of(graph)
     blocks = [
@@ -162,7 +162,7 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
 
 
 def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
-    """Joint covariance of all landmarks at a minimum of `solve`, as `marginals` has their own.
+    """Joint covariance of all landmarks at a minimum of `solve`; see `marginals`.
 
     Returns (2 M, 2 M): discs, then lines (m^2).
     """
@@ -173,7 +173,7 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
 
 
 def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:
-    """An estimate after a step (K,) of all unknowns but the mounting, and (6,) of that."""
+    """An estimate after a step (K,) of all unknowns except the mounting, and (6,) of that."""
     poses, discs, lines = np.split(step, [layout.first_disc, layout.first_line])
     after = replace(
         estimate,
@@ -190,7 +190,7 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
 
 
 def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estimate:
-    """A start that has all that is unknown: the mounting as calibrated."""
+    """A start with all unknowns, including the mounting as calibrated."""
     if not weighting.calibrate:
         return replace(start, mounting=None)
     if graph.camera is None:

@@ -1,11 +1,11 @@
-"""The least squares of discs by GTSAM, a standard solver of the field, as a check.
+"""The least squares of discs by GTSAM, a standard solver, as a check.
 
-GTSAM has no factor for a point of the plane in the robot frame with a full covariance, but
-`PlanarProjectionFactor2` is one, exactly: a camera one metre below the robot's centre that looks up
-sees a disc at height 0 at the pixel (x, y). (`BetweenFactorPose2` on a disc with an idle heading
-is not: its error is the logarithm, which mixes heading into place.) For odometry
-`BetweenFactorPose2` serves; its logarithm differs from the report's error in the second order only.
-There is none for bearings of several lines in a row, nor for the camera's mounting.
+GTSAM has no factor for a planar point in the robot frame with a full covariance, but
+`PlanarProjectionFactor2` is equivalent: a camera one metre below the robot's centre that looks up
+sees a disc at height 0 at the pixel (x, y). (`BetweenFactorPose2` on a disc with an unused heading
+is not: its error is the logarithm, which mixes heading and position.) Odometry uses
+`BetweenFactorPose2`, whose logarithm differs from the report's error to second order only. There
+are no factors for bearings of several lines in a row, or for the camera's mounting.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def estimate_of_values(graph: Graph, values: Any, start: Estimate) -> Estimate:
     first_disc = len(start.poses)
     poses = [values.atPose2(k) for k in range(first_disc)]
     found = np.array([(p.x(), p.y(), p.theta()) for p in poses])
-    # GTSAM keeps headings in (-pi, pi]: back to the turns that odometry counted.
+    # GTSAM wraps headings to (-pi, pi]: restore the full turns of odometry.
     found[:, 2] = start.poses[:, 2] + wrap_angle(found[:, 2] - start.poses[:, 2])
     placed = [values.atPoint3(first_disc + j)[:2] for j in range(len(graph.disc_ids))]
     return replace(start, poses=found, disc_xy=np.array(placed).reshape(-1, 2))

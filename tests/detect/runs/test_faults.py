@@ -28,7 +28,7 @@ NOBODY = 65534
 REASONS = {
     "missing": "no image of that name in the run",
     "empty": "is empty",
-    "truncated-jpeg": "cut off",
+    "truncated-jpeg": "truncated",
     "truncated-png": "cannot be decoded",
     "wrong-size": "is 767x288 px: expected 768x288",
     "no-image": "cannot be decoded: expected an image",

@@ -440,4 +440,4 @@ def test_a_bag_that_defines_images_in_its_own_way(
     write_camera(published_camera, cam)
     assert main(["circles", str(bag), "--camera", str(cam)]) == 1
     *_, line = capsys.readouterr().err.splitlines()  # a table may have been told of before
-    assert line.startswith(f"error: {bag}: own.0000: a message differs from ROS.s type: ")
+    assert line.startswith(f"error: {bag}: own.0000: a message differs from ROS's type: ")

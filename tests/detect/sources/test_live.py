@@ -89,7 +89,7 @@ def test_a_camera_that_ends(plugged: Plugged, caplog: pytest.LogCaptureFixture) 
     with caplog.at_level("INFO", logger="redetect"):
         frames = list(open_source(Path("camera:0")).frames)
     assert len(frames) == 3
-    assert "gives no more images" in caplog.text
+    assert "yields no more images" in caplog.text
 
 
 def test_an_interrupt_finishes_cleanly(

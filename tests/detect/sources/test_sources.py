@@ -219,7 +219,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
     ),
     "odometry topic without a bag": (
         lambda tmp_path, run: [str(run), "--odometry", "/odom"],
-        "holds no topic /odom: only bags do",
+        "has no topic /odom: only bags do",
     ),
     "no odometry": (
         lambda tmp_path, run: [str(run), "--odometry", str(tmp_path / "gone.txt")],
@@ -227,7 +227,7 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
     ),
     "trajectory without times": (
         lambda tmp_path, run: [str(run), "--odometry", str(tmp_path / "a.tum")],
-        "no times of the images: a trajectory needs them",
+        "no times of the images, which a trajectory needs",
     ),
 }
 
