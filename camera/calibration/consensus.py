@@ -17,8 +17,8 @@ from camera.calibration.start import best_poses, first_estimate, normals_spread_
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray
 
-# A view contradicts the others by so many times their median residual: with one coefficient of the
-# lens, which leaves residuals of its own in the image's corners, and with all of them.
+# A view contradicts the others above this multiple of their median residual: with one coefficient
+# of the lens, which leaves systematic residuals in the image's corners, and with all of them.
 _FAR_AT_FIRST, _FAR = 10.0, 3.0
 # A view's farthest points are ignored for that, since single outliers are excluded separately.
 _COUNTED_SHARE = 0.95

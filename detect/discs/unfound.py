@@ -154,7 +154,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
 
 @dataclass(frozen=True)
 class _Scene:
-    """An image and what is found in it."""
+    """An image and the detections in it."""
 
     image: GreyImage
     camera: Camera

@@ -1,6 +1,6 @@
-"""Scans in sets, the background that the scanners see, and finding the robot in a set anywhere.
+"""Sets of scans, the scanners' static background, and global localisation of the robot in a set.
 
-New readings, which are nearer than the background, form heaps; at each heap the outline is tried in
+New readings, which are nearer than the background, form clusters; at each the outline is tried in
 every heading.
 """
 
@@ -94,7 +94,7 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
 
 @dataclass(frozen=True, eq=False)
 class ScanSets:
-    """Scans that belong together."""
+    """Sets of scans, at most one per scanner, taken at about the same time."""
 
     times_s: FloatArray  # (sets,): mean time of the set's scans
     # (sets, scanners): row of `ranges_mm` per scanner; -1 where the scanner has none in the set.

@@ -44,15 +44,15 @@ _FLOOR_M = 0.001
 _WEAK_M = 0.02
 _LONE_STEPS = 30
 _MOST_STEPS = 500
-# Pairs are begun from the measured headings turned by these.
+# Start headings of the pairs, relative to the measured ones.
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
-# A scanner whose place on the map is farther from that among the other scanners is named.
+# Largest consistent distance between a scanner's position on the map and among the scanners.
 _INCONSISTENT_M = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where the scanners were found."""
+    """Estimated poses of the scanners."""
 
     scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
     # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
@@ -62,11 +62,11 @@ class Alignment:
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
     undetermined: tuple[str, ...]  # Scanners whose view of the map leaves a direction open
-    inconsistent: tuple[str, ...]  # Scanners whose place on the map is not that among the others
+    inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 
 
 class StillScan(NamedTuple):
-    """What a scanner sees while nothing moves: its readings, averaged beam by beam."""
+    """Readings of a scanner while nothing moves, averaged beam by beam."""
 
     range_m: FloatArray  # (n,)
     direction: FloatArray  # (n, 2): of the beams, in the scanner's frame
@@ -101,12 +101,12 @@ def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
 
 
 class WallFit(NamedTuple):
-    """Where scanners that are fixed to each other are, by the walls that they see."""
+    """Pose of scanners that are fixed to each other, from the walls that they see."""
 
     pose: FloatArray  # (3,): of their common frame on the map
     covariance: FloatArray  # (3, 3): from the residuals' size and the geometry
     by_mounts: FloatArray  # (3, 3 scanners): derivative of the pose by theirs in the common frame
-    used: int  # Readings that it rests on
+    used: int  # Number of readings used
     rms_m: float  # Of their distances from the walls
     open_directions: int  # Directions that the walls leave open
 
@@ -136,7 +136,7 @@ def fit_to_walls(
     start : (3,) float64
         Of the common frame on the map.
     gate_m : float
-        Farthest that a reading may lie from its wall at first.
+        Largest distance of a reading from its wall at first.
     narrowing_m : sequence of float
         Standard deviations of readings, wall and map together, as the fit narrows; farther than
         three of them is of no wall. Last, the residuals themselves say how large it is.
@@ -278,7 +278,7 @@ def _chained(
     shares: dict[tuple[int, int], float],
     relative: dict[tuple[int, int], FloatArray],
 ) -> FloatArray:
-    """Poses by the pairs that agree best, from the first scanner, whose pose stays."""
+    """Poses chained along the best-matching pairs, from the first scanner, which stays fixed."""
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):

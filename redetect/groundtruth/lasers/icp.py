@@ -24,8 +24,8 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.plane import apply
 
-# How often the last gate of a match of scans is repeated at most, and its damping: a millimetre's
-# worth, so that a direction without evidence stays where it is.
+# Most repetitions of the last gate of a match of scans, and its damping, worth a millimetre
+# so that a direction without evidence keeps its start.
 _REPEATED, _DAMPING = 10, 1e-3
 
 

@@ -127,7 +127,7 @@ def normalised_errors(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
 
 
 def normalised_band(count: int) -> tuple[float, float]:
-    """Between which 95 % of the means of so many independent, right normalised errors lie."""
+    """Band of 95 % of the means of `count` independent normalised errors, if consistent."""
     low, high = (float(v) / (3 * count) for v in chdtri(3 * count, (0.975, 0.025)))
     return low, high
 
