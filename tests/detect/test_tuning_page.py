@@ -133,7 +133,7 @@ def test_covariances_are_those_of_a_calibration_that_states_none(
     [
         ({"radius_m": -1.0}, "radius_m"),
         ({"radius_m": "a"}, "radius_m"),
-        ({"radius": 0.1}, "radius is no parameter"),
+        ({"radius": 0.1}, "radius is not a parameter"),
         ({"samples": True}, "samples"),
     ],
 )

@@ -246,7 +246,7 @@ def test_the_same_bytes_and_nothing_overwritten(tmp_path: Path, to: str, capsys:
     [
         (None, [], "no such landmark file"),
         ("# nothing\n", ["-o", "o.csv"], None),
-        (FILES["circles"], ["--to", "mcap"], 'no time of "a.0000": messages need one'),
+        (FILES["circles"], ["--to", "mcap"], 'no time for "a.0000": messages need one'),
         (FILES["circles"], ["--rate-hz", "0"], "rate_hz is 0: expected above 0"),
         (FILES["circles"], ["--times", "gone.times"], "gone.times: no such file of times"),
         ("LANDMARK_C 1 2\n", [], "x.circles:1: LANDMARK_C with 2 values"),
