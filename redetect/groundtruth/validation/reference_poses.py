@@ -155,7 +155,8 @@ class Measured(NamedTuple):
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    Levenberg-Marquardt from all starts at once: all round, in all headings.
+    Levenberg-Marquardt from all starts at once: all round, in all headings. Hundreds of problems
+    with three unknowns are one pass of NumPy; one by one, by SciPy, they would take seconds.
     """
     poses = _starts(measured)
     damping = np.full(len(poses), 1e-3)
