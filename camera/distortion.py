@@ -30,7 +30,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial.polynomial import polyroots
+from numpy.polynomial.polynomial import polyadd, polyder, polymul, polymulx, polyroots, polysub
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
@@ -104,41 +104,27 @@ def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
     """
     a2, a3, b1, b2, b3 = coef
     k1, k2, k3 = polynomial
-    # Coefficients of powers of r, the lowest first: NumPy's polynomials take much longer.
+    # Coefficients of powers of r, the lowest first; NumPy's classes for them take much longer.
     numerator, denominator = [0.0, a2, a3], [1.0, b1, b2, b3]
-    whole = [1.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3]
+    polynomial_growth = [1.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3]
     # g' D^2; at r = 0 it is 1, so g grows until the first positive root.
-    growth = _product(_product(denominator, denominator), whole)
-    growth += _product(numerator, denominator)
-    by_numerator = _product([a2, 2.0 * a3], denominator)
-    growth[1:] += (by_numerator - _product(numerator, [b1, 2.0 * b2, 3.0 * b3]))[:-1]
+    growth = polymul(polymul(denominator, denominator), polynomial_growth)
+    growth = polyadd(growth, polymul(numerator, denominator))
+    of_numerator = polymul(polyder(numerator), denominator)
+    of_denominator = polymul(numerator, polyder(denominator))
+    growth = polyadd(growth, polymulx(polysub(of_numerator, of_denominator)))
     # Stay a little short of a root, so that rounding does not reach past it: near a pole even of
     # second order the denominator must remain more than rounding.
     fold = _first_positive_root(growth) * (1.0 - 1e-12)
-    pole = _first_positive_root(np.array(denominator)) * (1.0 - 1e-7)
+    pole = _first_positive_root(denominator) * (1.0 - 1e-7)
     return min(fold, pole)
 
 
-def _product(one: ArrayLike, other: ArrayLike) -> FloatArray:
-    """The product of two polynomials, as (13,) coefficients."""
-    # Which of them is longer decides in which order the products are summed.
-    some = np.convolve(_without_zeros(one), _without_zeros(other))
-    product = np.zeros(13)
-    product[: len(some)] = some
-    return product
-
-
-def _without_zeros(coefficients: ArrayLike) -> FloatArray:
-    """Without those at the end."""
-    coefficients = np.asarray(coefficients, np.float64)
-    there = np.flatnonzero(coefficients)
-    return coefficients[: there[-1] + 1 if len(there) else 1]
-
-
-def _first_positive_root(coefficients: FloatArray) -> float:
+def _first_positive_root(polynomial: ArrayLike) -> float:
     """The smallest positive root of a polynomial in r whose constant term is 1."""
     # In 1/r the polynomial is monic and the root sought the largest one, so that it is found well
     # even when the higher coefficients all but vanish.
+    coefficients = np.asarray(polynomial, np.float64)
     last = np.flatnonzero(np.abs(coefficients) > _NEGLIGIBLE)[-1]
     inverse = polyroots(coefficients[last::-1])
     # Rounding can make a conjugate pair of a double root.

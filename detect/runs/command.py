@@ -200,10 +200,10 @@ def _print_results(job: Job, summary: RunSummary) -> None:
             print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
     if summary.lean is not None:
         print(lean_sentence(summary.lean))
-    if summary.unlevelled_deg is not None:
+    if summary.unlevelled_deg is not None and "tilt" not in places and not job.known.tilts:
         print(
-            "the camera leans, and positions are not levelled: they are taken to be wrong by "
-            f"{summary.unlevelled_deg:g} degrees of pitch and roll (detect all levels them)"
+            "the camera leans, and positions are not levelled: pitch and roll are assumed unknown "
+            f"within {summary.unlevelled_deg:g} degrees (detect all levels them)"
         )
     camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:
@@ -225,7 +225,7 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     others = summary.frames - summary.failed - summary.found["tilts"]
     if plan.circles is None or plan.levelling == "none" or others == 0:
         return ""
-    sigma_deg = math.degrees(plan.circles.tilt_sigma_rad)
+    sigma_deg = summary.unlevelled_deg or math.degrees(plan.circles.tilt_sigma_rad)
     if sigma_deg == 0.0:
         return f"; the other {others} are assumed exactly level (see --circles.tilt-sigma-deg)"
     return f"; the other {others} are assumed level within {sigma_deg:g} degrees"

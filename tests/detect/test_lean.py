@@ -82,6 +82,21 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     assert 0.3 < squared_mahalanobis(off, covariance).mean() / 2.0 < 1.4
 
 
+def test_what_is_said_of_positions_that_are_not_levelled(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = project_root / "images" / "e"
+    camera = tmp_path / "wrong.cam"
+    write_camera(wrong_by(read_camera(run / "e.cam"), (2.3, 0.0)), camera)
+    rest = ["--camera", str(camera), "--jobs", "1", "-o", str(tmp_path / "some")]
+    assert main(["circles", str(run), *rest]) == 0
+    assert "positions are not levelled: pitch and roll" in capsys.readouterr().out
+    assert main(["all", str(run), *rest[:-1], str(tmp_path / "all"), "--tilt", "frame"]) == 0
+    said = capsys.readouterr().out
+    assert "not levelled" not in said
+    assert "assumed level within 1." in said
+
+
 def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Path) -> None:
     image = sorted(((project_root / "images" / "e") / "images").iterdir())[30]
     camera = read_camera((project_root / "images" / "e") / "e.cam")

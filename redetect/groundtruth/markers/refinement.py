@@ -116,6 +116,7 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
 
     The weights are those of correlated corners and change with the pose, which the sparse solver
     of `redetect.least_squares` does not handle: this is a loop of its own, of six unknowns.
+
     A marker's four corners are weighted together, by Huber's loss. `start` (4, 4) is a pose
     `world_from_robot`. Raises `GeometryError` if a corner is behind its camera there, or the
     corners do not determine a pose.

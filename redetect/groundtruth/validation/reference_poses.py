@@ -100,11 +100,8 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
-# Bearings, and headings, that the search begins from.
-_DIRECTIONS = 12
-_SAME_M = 1e-4
-# Steps of the descent, and when they are as good as none (m, rad).
-_STEPS, _SETTLED = 60, 1e-10
+# Bearings, and headings, that the search begins from, and minima that are the same (m, rad).
+_DIRECTIONS, _SAME_M = 12, 1e-4
 # Distances that fit less well than this share of right ones contradict each other.
 _GROSS_PROBABILITY = 1e-4
 # Another pose within this squared normalised misfit of the best makes it ambiguous.
@@ -155,27 +152,20 @@ class Measured(NamedTuple):
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    Levenberg-Marquardt from all starts at once: all round, in all headings. Hundreds of problems
-    with three unknowns are one pass of NumPy; one by one, by SciPy, they would take seconds.
+    Levenberg-Marquardt from many starts: all round, in all headings.
     """
-    poses = _starts(measured)
-    damping = np.full(len(poses), 1e-3)
-    residuals, jacobians = distance_residuals(poses, measured)
-    for _ in range(_STEPS):
-        gradient = np.einsum("ski,sk->si", jacobians, residuals)
-        normal = np.einsum("ski,skj->sij", jacobians, jacobians)
-        diagonal = np.einsum("sii->si", normal)
-        diagonal += damping[:, None] * (diagonal + 1e-6)
-        step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
-        tried = distance_residuals(poses + step, measured)
-        better = np.sum(tried[0] ** 2, axis=1) <= np.sum(residuals**2, axis=1)
-        poses[better] += step[better]
-        residuals[better], jacobians[better] = tried[0][better], tried[1][better]
-        damping = np.clip(np.where(better, 0.1 * damping, 10.0 * damping), 1e-9, 1e9)
-        if np.abs(step).max() < _SETTLED:
-            break
+
+    def residuals(pose: FloatArray) -> FloatArray:
+        return distance_residuals(pose, measured)[0]
+
+    def jacobian(pose: FloatArray) -> FloatArray:
+        return distance_residuals(pose, measured)[1]
+
+    poses = np.array(
+        [least_squares(residuals, pose, jacobian, method="lm").x for pose in _starts(measured)]
+    )
     poses[:, 2] = wrap_angle(poses[:, 2])
-    cost = np.sum(residuals**2, axis=1) / measured.sigma_m**2
+    cost = np.sum(distance_residuals(poses, measured)[0] ** 2, axis=1) / measured.sigma_m**2
     kept = _distinct(poses, cost, _SAME_M)
     return poses[kept], cost[kept]
 
