@@ -38,11 +38,11 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        raise GroundTruthError(f"{path}:{error.lineno}: is no JSON: {error.msg}") from None
+        raise GroundTruthError(f"{path}:{error.lineno}: invalid JSON: {error.msg}") from None
     except RecursionError:
-        raise GroundTruthError(f"{path}: is no JSON that can be read: nested too deep") from None
+        raise GroundTruthError(f"{path}: invalid JSON: nested too deeply") from None
     except ValueError:  # Python converts no more than some thousand digits
-        raise GroundTruthError(f"{path}: is no JSON that can be read: a number too long") from None
+        raise GroundTruthError(f"{path}: invalid JSON: a number is too long") from None
     if not isinstance(content, dict):
         raise GroundTruthError(f"{path}: expected a JSON object")
     return content
@@ -200,8 +200,8 @@ def _laid_out(value: Any, indent: str = "") -> str:
 def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
     """The text of a file (UTF-8, perhaps with a byte order mark), packed (``.gz``) or not.
 
-    `largest_bytes`: a larger file is refused. `expected`: what should be in it, for the message
-    about a file that is no text.
+    `largest_bytes`: larger files are rejected. `expected`: the expected content, for the message
+    about a file that is not text.
     """
     content = read_content(path, largest_bytes, "file", GroundTruthError)
     try:
@@ -212,9 +212,9 @@ def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -
                 raise GroundTruthError(f"{path}: unpacked, it has more than {largest_bytes} bytes")
         return content.decode("utf-8-sig")
     except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise GroundTruthError(f"{path}: is no complete gzip file") from None
+        raise GroundTruthError(f"{path}: incomplete or damaged gzip file") from None
     except UnicodeDecodeError:
-        raise GroundTruthError(f"{path}: is no text: expected {expected}") from None
+        raise GroundTruthError(f"{path}: not text: expected {expected}") from None
 
 
 def read_rows(

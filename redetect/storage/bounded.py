@@ -82,7 +82,7 @@ def read_text(
     try:
         return read_content(path, largest_bytes, kind, error).decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise error(f"{path}: cannot be read as a {kind}: it is no text") from None
+        raise error(f"{path}: cannot be read as a {kind}: it is not text") from None
 
 
 def rows_of_numbers(

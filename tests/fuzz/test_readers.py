@@ -158,7 +158,7 @@ NASTY = [
     ("camera info", b"!!python/object/apply:os.system ['true']\n", "expected YAML"),
     ("kalibr", b"a: {intrinsics: 1}\n" + b"b" * 900 + b": {intrinsics: 1}\n", "it holds a, bbb"),
     ("floor points", b"u,v,x,y\n\"" + b"1" * 200_000, "expected floor points"),
-    ("floor points", b"\xff\n", "floor points: it is no text"),
+    ("floor points", b"\xff\n", "floor points: it is not text"),
     ("settings", b"# settings threshold=1-2\n", "expected a number"),
     ("settings", b"# settings polarity=" + b"x" * 60_000, "expected one of"),
     # The time of a message in SQLite's own column is bytes.

@@ -1,7 +1,7 @@
 """Sets of scans, the scanners' static background, and global localisation of the robot in a set.
 
-New readings, which are nearer than the background, form clusters; at each the outline is tried in
-every heading.
+Readings nearer than the background are new and are clustered; at each cluster the outline is fitted
+from every heading.
 """
 
 from __future__ import annotations
@@ -44,16 +44,15 @@ from redetect.groundtruth.settings import LaserSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose, invert, rotation
 
-# A beam's readings have at least this deviation (m); one is new if it is this many of them nearer
-# than the nearest object that the beam saw, which is at this quantile of its readings.
+# Least standard deviation of a beam's readings (m); a reading is new if it is this many of them
+# nearer than the beam's nearest object, which is at this quantile of its readings.
 _LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
 
 
 class Background(NamedTuple):
     """A scanner's static background, beam by beam."""
 
-    # (readings,): a reading below this is something that was not there; infinite where the beam
-    # sees nothing
+    # (readings,): a reading below this is of a new object; infinite if the beam sees nothing
     near_m: FloatArray
     quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
 
@@ -61,9 +60,9 @@ class Background(NamedTuple):
 def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
     """Learn the background of the beams from scans (N, readings) of the empty area.
 
-    Readings are 0, or `max_range_m` and more, where nothing came back. The nearest object of a beam
-    is at a low quantile of its readings: beams along an edge see near and far in turn, and nearer
-    readings than that are treated as passing objects.
+    Readings without a return are 0, or `max_range_m` and more. The nearest object of a beam is at a
+    low quantile of its readings: beams along an edge jump between near and far. Nearer readings are
+    treated as passing objects.
     """
     if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
         raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
@@ -78,7 +77,7 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
         return np.asarray(values[row, beams])
 
     median = quantile(ordered, 0.5)
-    # Two readings in a hundred scans say nothing about the background.
+    # Fewer than two readings in a hundred scans are no evidence of a background.
     seen = count >= max(1, round(0.02 * len(ranges_mm)))
     deviation = np.full_like(metres, np.inf)
     np.subtract(metres, median, out=deviation, where=hit)
@@ -97,7 +96,7 @@ class ScanSets:
     """Sets of scans, at most one per scanner, taken at about the same time."""
 
     times_s: FloatArray  # (sets,): mean time of the set's scans
-    # (sets, scanners): row of `ranges_mm` per scanner; -1 where the scanner has none in the set.
+    # (sets, scanners): row of `ranges_mm` per scanner; -1 if the scanner has none in the set.
     rows: IntArray
     ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
     ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
@@ -110,7 +109,7 @@ class ScanSets:
 
 
 def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> FixedScanners:
-    """Arrange scanners, and the background in their scans of the empty area, for the kernels."""
+    """Arrange scanners, and the background from their scans of the empty area, for the kernels."""
     if not scanners:
         raise GroundTruthError("no scanners: expected some")
     backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
@@ -126,17 +125,17 @@ def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> Fix
         near,
         direction,
         np.stack([scanner.pose[:2] for scanner in scanners]),
-        # Rounding to a quantum is an error more, evenly spread over it.
+        # Rounding adds an error that is uniform over a quantum.
         np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
         block_diag(*(scanner.covariance for scanner in scanners)),
     )
 
 
 def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
-    """Put the scans of scanners that run independently, by scanner, into sets.
+    """Group the scans of scanners that run independently into sets.
 
-    Going through all scans in the order of time, a set ends where a scanner would come a second
-    time, or where its first scan is longer ago than the median time between a scanner's scans. So
+    `scans` has an entry per scanner. In the order of time, a new set begins if it would contain a
+    scanner twice, or if its first scan is older than the median time between a scanner's scans. So
     each scan is in one set, and scanners that run slightly faster than others occasionally have a
     set of their own.
     """
@@ -170,7 +169,7 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
 def load_session(
     folder: Path, calibration: Path
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
-    """Read fixed scanners, robot, scans, and learn the background.
+    """Read fixed scanners, robot and scans, and learn the background.
 
     Raises `GroundTruthError` if a file is missing or does not fit the others.
     """
@@ -186,13 +185,13 @@ def load_session(
 def outline_faces(outline: ArrayLike) -> FloatArray:
     """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    Of corners (k, 2) in order, either way round (m). Raises `GroundTruthError` if two corners that
-    follow each other are one, faces cross, or the outline encloses nothing.
+    `outline`: corners (k, 2) in order, in either direction (m). Raises `GroundTruthError` if two
+    consecutive corners coincide, faces cross, or the outline encloses no area.
     """
     corners = np.asarray(outline, dtype=np.float64)
     following = np.roll(corners, -1, axis=0)
     if np.any(np.hypot(*(following - corners).T) < 1e-6):
-        raise GroundTruthError("outline: two corners that follow each other are the same")
+        raise GroundTruthError("outline: two consecutive corners are the same")
     area = 0.5 * float(np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]))
     if abs(area) < 1e-6:
         raise GroundTruthError(f"outline: encloses {abs(area):g} m2")
@@ -214,16 +213,16 @@ def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
 
 
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
-    """Motions (s, 3) other than none that map the outline onto itself, by rising theta from -pi on.
+    """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
 
     A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
-    0 for an outline that shows where the front is, 1 for a box, 3 for a square. No point of the
-    turned outline is farther from the outline than the tolerance.
+    0 for an outline without symmetries, 1 for a box, 3 for a square. No point of the turned outline
+    is farther from the outline than the tolerance.
     """
     along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
     points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)
     points = np.ascontiguousarray(points)
-    # A symmetry keeps the centre of the area where it is.
+    # A symmetry keeps the centroid in place.
     x1, y1, x2, y2 = faces.T
     twice = x1 * y2 - x2 * y1
     centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
@@ -237,7 +236,7 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
     for i, error in enumerate(errors):
         if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
             continue
-        # Where an ICP of the whole outline to itself ends.
+        # Refined by an ICP of the whole outline to itself.
         pose, _, _ = fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)
         pose = invert(pose)
         pose[2] = _turn(pose[2])
@@ -253,7 +252,7 @@ def _farthest_m(points: FloatArray, faces: FloatArray, pose: FloatArray) -> floa
 
 
 def _turn(angle: float) -> float:
-    """An angle taken to [-pi, pi), -pi also where rounding made it just less than pi."""
+    """An angle wrapped to [-pi, pi); -pi also if rounding made it slightly less than pi."""
     return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
 
 
@@ -292,7 +291,7 @@ def refine(
 
 
 def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
-    """Prepare an outline (k, 2); raises `GroundTruthError` if it is none."""
+    """Prepare an outline (k, 2); raises `GroundTruthError` if it is not valid."""
     faces = outline_faces(outline)
     middle, radius = outline_radius_m(faces)
     return Body(faces, middle, radius, outline_symmetries(faces, symmetry_m))
@@ -303,11 +302,11 @@ def acquire(
 ) -> FloatArray | None:
     """Find the robot in one set of scans: x, y (m), theta (rad), or None.
 
-    New readings that are close to each other are heaps; at each heap the ICP is begun from every
-    heading. A pose counts only if the beams that should see the robot see it: neither background
-    through it nor much that hides it. Where the two best poses differ by more than one of the
-    outline's symmetries and explain the scans about as well, none is returned; with a symmetric
-    outline it is one of the equivalent poses.
+    New readings are clustered; at each cluster an ICP is started from every heading. A pose is
+    accepted only if the beams that should hit the robot do, neither passing through it nor, mostly,
+    being blocked before it. If another pose explains the scans about as well as the best, and they
+    differ by more than a symmetry of the outline, None is returned; with a symmetric outline it is
+    one of the equivalent poses.
     """
     seen = new_points(scans, fixed, np.zeros(2), _EVERYWHERE_M, np.zeros(5))
     if len(seen.points) < settings.acquire_readings:
@@ -329,20 +328,20 @@ def acquire(
 
 
 def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
-    """Where the robot's middle might be: the middles of heaps, those of parts of large ones."""
+    """Possible centres of the robot: the centres of clusters, and of parts of large clusters."""
     label = fclusterdata(points, settings.link_m, criterion="distance", method="single")
     places: list[FloatArray] = []
     for k in np.unique(label):
-        heap = points[label == k]
-        if len(heap) < settings.least_readings:
+        cluster = points[label == k]
+        if len(cluster) < settings.least_readings:
             continue
-        low, high = heap.min(axis=0), heap.max(axis=0)
+        low, high = cluster.min(axis=0), cluster.max(axis=0)
         if math.hypot(*(high - low)) <= 2.2 * body.radius_m:
             places.append(0.5 * (low + high))
             continue
-        cell = np.floor((heap - low) / body.radius_m).astype(np.int64)
+        cell = np.floor((cluster - low) / body.radius_m).astype(np.int64)
         for corner in np.unique(cell, axis=0):
-            part = heap[np.max(np.abs(cell - corner), axis=1) <= 1]
+            part = cluster[np.max(np.abs(cell - corner), axis=1) <= 1]
             if len(part) >= settings.least_readings:
                 places.append(np.asarray(part.mean(axis=0)))
     return places
@@ -356,7 +355,7 @@ def _search(
     body: Body,
     settings: LaserSettings,
 ) -> list[tuple[float, FloatArray]]:
-    """Poses that explain the beams, with how many more beams agree than disagree."""
+    """Poses that explain the beams, with a score: beams that agree less those that disagree."""
     found: list[tuple[float, FloatArray]] = []
     tried: list[FloatArray] = []
     for k in range(settings.headings):

@@ -1,8 +1,8 @@
-"""Poses of fixed scanners, aligned with each other and with the building, in steps.
+"""Poses of fixed scanners, aligned with each other and with the building, step by step.
 
-The order is that of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners by ICP; the scans merged
-one after the other; each scanner aligned again with the others' merged scans; all together until
-nothing moves; and the whole, then each scanner, to the building map.
+The steps are those of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners are aligned by ICP;
+their scans are merged one after the other; each scanner is aligned again with the others' merged
+scans, in rounds until none moves; finally all as one body, then each scanner, with the map.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refin
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert, rotation
 
-#: Steps of the published order, by which results are named.
+#: The steps in the published order; results are named after them.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
 
 # Of lines through a scan's points: the longest step to a neighbour (m), neighbours on either side,
-# and the largest extent across of that along.
+# and the largest ratio of the extents across and along.
 _NORMALS = (0.4, 4, 0.2)
 _JUDGED_M = 0.05
 _ROUNDS = 50
@@ -61,7 +61,7 @@ class Alignment:
     pairs: dict[tuple[int, int], float]
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
-    undetermined: tuple[str, ...]  # Scanners whose view of the map leaves a direction open
+    undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 
 
@@ -81,8 +81,8 @@ class StillScan(NamedTuple):
 def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
     """Average scans (N, readings) in which nothing moves.
 
-    Beams without a reading in half of the scans, and those along an edge, which see near and far
-    in turn, are left out; a beam's readings far off its median, which passed by, too.
+    Excluded are beams without a reading in half of the scans and those along an edge, which jump
+    between near and far; also a beam's readings far from its median, of passing objects.
     """
     metres = ranges_mm * 1e-3
     hit = scanner.has_return(ranges_mm)
@@ -101,14 +101,14 @@ def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
 
 
 class WallFit(NamedTuple):
-    """Pose of scanners that are fixed to each other, from the walls that they see."""
+    """Pose of rigidly connected scanners, from the walls that they see."""
 
     pose: FloatArray  # (3,): of their common frame on the map
     covariance: FloatArray  # (3, 3): from the residuals' size and the geometry
     by_mounts: FloatArray  # (3, 3 scanners): derivative of the pose by theirs in the common frame
     used: int  # Number of readings used
     rms_m: float  # Of their distances from the walls
-    open_directions: int  # Directions that the walls leave open
+    open_directions: int  # Number of directions that the walls do not determine
 
 
 def fit_to_walls(
@@ -138,18 +138,18 @@ def fit_to_walls(
     gate_m : float
         Largest distance of a reading from its wall at first.
     narrowing_m : sequence of float
-        Standard deviations of readings, wall and map together, as the fit narrows; farther than
-        three of them is of no wall. Last, the residuals themselves say how large it is.
+        Joint standard deviations of readings, wall and map as the fit narrows; readings farther
+        away than three of them are rejected. In the last step the residuals determine it.
     weak_sigma_m : float
-        Directions along which the standard deviation would be larger are open; they hold on to the
-        start.
+        Directions along which the standard deviation would be larger are undetermined, and are
+        held at the start.
 
     Raises
     ------
     GeometryError
-        If fewer than ten readings are on walls.
+        If fewer than ten readings match walls.
     """
-    # The kernel moves faces to points: here the map to the scanners' frame.
+    # The kernel moves faces onto points: here the map into the scanners' frame.
     faces = np.vstack([walls, walls[:, [2, 3, 0, 1]]])
     seen = Seen(
         np.concatenate([apply(mount, scan.points) for mount, scan in zip(mounts, scans)]),
@@ -194,16 +194,16 @@ def align_scanners(
     scanners : sequence of Scanner
         With poses measured by hand.
     empties : sequence of Scans
-        Scans of the empty area, as many.
+        Scans of the empty area, one for each scanner.
     building : (k, 4) float64
         The map's walls x1, y1, x2, y2 (m).
 
     Raises
     ------
     GroundTruthError
-        If there are no scanners, or one sees nothing.
+        If there are no scanners, or one has too few readings.
     GeometryError
-        If a scanner's readings do not reach the map within the gate.
+        If too few of a scanner's readings are within the gate of the map.
     """
     s = AlignmentSettings() if settings is None else settings
     if not scanners:
@@ -255,7 +255,7 @@ def align_scanners(
 def _pairs(
     scans: list[Scan], measured: FloatArray, s: AlignmentSettings
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], FloatArray]]:
-    """ICP of every pair, from the measured poses: shares explained, and poses j in i."""
+    """ICP of every pair from the measured poses: shares explained, and poses of j in i."""
     shares: dict[tuple[int, int], float] = {}
     relative: dict[tuple[int, int], FloatArray] = {}
     gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
@@ -314,7 +314,7 @@ def _merged(
     scans: list[Scan], poses: FloatArray, shares: dict[tuple[int, int], float],
     s: AlignmentSettings,
 ) -> FloatArray:  # fmt: skip
-    """One scan after the other, best overlapping first, aligned with those merged already."""
+    """Align one scan after the other, the best overlapping first, with those merged already."""
     poses = poses.copy()
     members = [0]
     gates = np.geomspace(s.gate_m, 0.08, 8)
@@ -327,7 +327,7 @@ def _merged(
 
 
 def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
-    """Each scanner but the first aligned again with the merged scans of all others."""
+    """Align each scanner but the first again with the merged scans of all others."""
     poses = poses.copy()
     gates = np.geomspace(0.15, 0.06, 4)
     for k in range(1, len(scans)):
@@ -350,7 +350,7 @@ def _whole_to_map(
     scans: list[Scan], poses: FloatArray, measured: FloatArray, building: FloatArray,
     s: AlignmentSettings,
 ) -> FloatArray:  # fmt: skip
-    """All scanners as one rigid body on the map, from where they were measured."""
+    """Align all scanners, as one rigid body, with the map, from their measured poses."""
     if len(poses) > 1:
         body = fitted(poses[:, :2], measured[:, :2])
     else:
@@ -369,10 +369,10 @@ def _whole_to_map(
 def icp_by_step(
     points: FloatArray, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
 ) -> FloatArray:
-    """(steps + 1,) root mean square distances (m) from the map of the readings that count.
+    """(steps + 1,) root mean square distances (m) of the readings used from the map.
 
-    Those of an ICP of a scanner's points (n, 2) to the map, from a start (3,), after each of its
-    steps.
+    They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
+    (3,).
     """
     return np.array(
         [

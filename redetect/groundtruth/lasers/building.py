@@ -1,6 +1,6 @@
-"""Building maps: straight pieces of wall, from rows of numbers or from a drawing (DXF).
+"""Building maps: wall segments, from rows of numbers or from a drawing (DXF).
 
-``building.csv`` has the head ``x1_m,y1_m,x2_m,y2_m`` and a row per piece.
+``building.csv`` has the head ``x1_m,y1_m,x2_m,y2_m`` and a row per segment.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from redetect.groundtruth.files import read_table
 from redetect.storage.bounded import read_content
 from redetect.storage.messages import one_line
 
-#: Curved walls are cut into straight pieces no farther from the curve than this (m).
+#: Curved walls are approximated by segments no farther from the curve than this (m).
 CURVE_TOLERANCE_M = 0.002
 MOST_SEGMENTS = 1_000_000
 
@@ -38,7 +38,7 @@ def find_building(folder: str | os.PathLike[str]) -> Path:
     for name in ("building.csv", "building.dxf"):
         if (path := Path(folder) / name).is_file():
             return path
-    raise GroundTruthError(f"{Path(folder)}: neither building.csv nor building.dxf in it")
+    raise GroundTruthError(f"{Path(folder)}: contains neither building.csv nor building.dxf")
 
 
 def read_building(path: str | os.PathLike[str]) -> FloatArray:
@@ -47,20 +47,20 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
     Parameters
     ----------
     path : path
-        ``.dxf``: lines, polylines and curves of its model space, those in blocks included; height
-        is left out. Other entities (texts, dimensions, hatches, ...) are no walls. Anything else
+        ``.dxf``: lines, polylines and curves of its model space, including those in blocks, without
+        their heights. Other entities (texts, dimensions, hatches, ...) are ignored. Any other file
         is read as rows of four numbers.
 
     Returns
     -------
     (S, 4) float64
-        x1, y1, x2, y2 of straight pieces of wall in the world (m), as a scanner's plane cuts them.
+        x1, y1, x2, y2 of wall segments in the world (m), in the scanners' plane.
 
     Raises
     ------
     GroundTruthError
-        If the file cannot be read, has no walls, more than `MOST_SEGMENTS` pieces, or one that ends
-        a million metres away.
+        If the file cannot be read, has no walls, more than `MOST_SEGMENTS` segments, or one that
+        ends a million metres away.
     """
     if Path(path).suffix.lower() == ".dxf":
         segments = _read_drawing(path)
@@ -84,16 +84,16 @@ def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
         unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
         for curve in _curves(path, drawing.modelspace(), CURVE_TOLERANCE_M / unit_m):
-            # Equal neighbours occur where curves meet, and where a line is vertical.
+            # Equal neighbours occur where curves meet, and if a line is vertical.
             far = np.hypot(*np.diff(curve, axis=0).T) * unit_m > _SHORTEST_M
             pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
             if len(pieces) > MOST_SEGMENTS:
                 raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
     except GroundTruthError:
         raise
-    except Exception as error:  # a damaged drawing may fail anywhere within the library
+    except Exception as error:  # a damaged drawing may fail anywhere in the library
         text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
-        raise GroundTruthError(f"{path}: is no DXF that can be read: {text}") from None
+        raise GroundTruthError(f"{path}: unreadable DXF: {text}") from None
     return unit_m * np.array(pieces, dtype=np.float64)
 
 
@@ -101,7 +101,7 @@ def _curves(
     path: str | os.PathLike[str], space: Iterable[Any], tolerance: float
 ) -> Iterator[list[tuple[float, float]]]:
     """Lines and curves of a drawing as chains of points, in its units."""
-    # Not ezdxf's own decomposition: it makes lines of dimensions and leaders, too.
+    # Not ezdxf's own decomposition: it also converts dimensions and leaders to lines.
     waiting: list[tuple[int, Iterator[Any]]] = [(0, iter(space))]
     seen = 0
     while waiting:

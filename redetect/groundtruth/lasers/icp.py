@@ -2,8 +2,8 @@
 
 Each step pairs every point with the nearest target within a gate, keeps the best share of the pairs
 and moves the points rigidly: onto segments by singular values (in the plane: in closed form), until
-the root mean square error changes by less than a threshold; onto a scan by the distances to its
-lines. Points are (n, 2), poses (x, y, theta) that take the points to the target's frame (m, rad).
+the root mean square error changes by less than a threshold; onto a scan by point-to-line distances.
+Points are (n, 2); poses (x, y, theta) transform them to the target's frame (m, rad).
 
 References
 ----------
@@ -24,14 +24,14 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.plane import apply
 
-# Most repetitions of the last gate of a match of scans, and its damping, worth a millimetre
-# so that a direction without evidence keeps its start.
+# Most repetitions of the last gate in a match of scans, and its damping (a pair weighs up to 1), so
+# that an undetermined direction keeps its start.
 _REPEATED, _DAMPING = 10, 1e-3
 
 
 @kernel()
 def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
-    """Which of (n,) squared distances (m^2) are within the gate and among the best share."""
+    """(n,) mask of squared distances (m^2) that are within the gate and in the best share."""
     within = squared <= gate_m * gate_m
     count = np.count_nonzero(within)
     if kept < 1.0 and count > 0:
@@ -47,7 +47,7 @@ class Scan:
     ----------
     points : (n, 2) float64
     normals : (n, 2) float64
-        Of the lines; zeros where there is none.
+        Of the lines; zeros if there is none.
     """
 
     def __init__(self, points: FloatArray, normals: FloatArray) -> None:
@@ -55,17 +55,17 @@ class Scan:
         self._tree = cKDTree(points)
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Squared distances to the nearest of the scan's points, and which they are."""
+        """Squared distances to the nearest of the scan's points, and their indices."""
         distance, index = self._tree.query(points)
         return distance**2, index
 
 
 def scan_normals(points: FloatArray, radius_m: float, reach: int, spread: float) -> FloatArray:
-    """Normals (n, 2) of lines through a scan's points in the order of the beams; zeros without.
+    """Normals (n, 2) of lines through a scan's points in the order of the beams; zeros if none.
 
     The neighbours of a point are those of the `reach` points before and after that can be reached
-    by steps no longer than `radius_m`. They are on a line if there are three or more and their
-    extent across is at most `spread` of that along.
+    by steps no longer than `radius_m`. They form a line if there are three or more points, and
+    their extent across it is at most `spread` times that along it.
     """
     at = np.arange(len(points))
     jumps = np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > radius_m)
@@ -91,9 +91,9 @@ def align_scans(
     """Pose of a scan's points in the frame of a target scan, from a start.
 
     Each step pairs every point with its nearest target point within the step's gate, keeps the best
-    share, and solves the linearised, robust least squares of the distances to the targets' lines
-    (to the points, at a tenth of the weight, where there is no line). The last gate is repeated
-    until the pose moves by less than `threshold`. NaN where fewer than three pairs are left.
+    share, and minimises the linearised, robust squared distances to the targets' lines
+    (to the points, at a tenth of the weight, if there is no line). The last gate is repeated
+    until the pose moves by less than `threshold`. NaN if fewer than three pairs are left.
     """
     pose, gates = np.array(start, dtype=np.float64), np.atleast_1d(np.asarray(gates_m))
     for step, gate in enumerate([*gates, *np.repeat(gates[-1:], _REPEATED)]):
@@ -124,8 +124,8 @@ def align_scans(
 def explained(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float) -> float:
     """How well a pose explains both scans: mean over all points of exp(-d^2 / 2 sigma^2).
 
-    d is the distance to the nearest point of the other scan; both directions count, so that a pose
-    which lays one scan on a small part of the other does not win.
+    d is the distance to the nearest point of the other scan. Both directions count; otherwise a
+    pose that fits one scan to a small part of the other could win.
     """
     world = apply(pose, points)
     there, _ = target.nearest(world)
@@ -139,7 +139,7 @@ def nearest_on_segments(
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Nearest points on (k, 4) segments x1, y1, x2, y2: (n, 2), their segments, squared distances.
 
-    Where two segments are equally near the first one is taken.
+    If two segments are equally near, the first is used.
     """
     count = points.shape[0]
     nearest = np.empty((count, 2))
@@ -167,7 +167,7 @@ def nearest_on_segments(
 def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatArray:
     """Pose (3,) with the least sum of squared distances between the used pairs of points.
 
-    The plane's closed form of the fit by singular values (Arun, Huang, Blostein 1987).
+    The closed form, in the plane, of the fit by singular values (Arun, Huang, Blostein 1987).
     """
     # Plain loops: NumPy's sums and parts of arrays take seconds to compile.
     n, px, py, qx, qy = 0, 0.0, 0.0, 0.0, 0.0
@@ -193,7 +193,7 @@ def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatA
 
 @kernel()
 def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Points taken by a pose."""
+    """Points transformed by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     there = np.empty((len(points), 2))
     for i in range(len(points)):
@@ -212,9 +212,9 @@ def fit_outline(
     threshold_m: float,
     most_steps: int,
 ) -> tuple[FloatArray, float, int]:
-    """Trimmed ICP of segments to points: pose, root mean square error, pairs used.
+    """Trimmed ICP of segments to points: pose, root mean square error, number of pairs used.
 
-    The pose takes the segments to the points.
+    The pose moves the segments onto the points.
     """
     pose = start.copy()
     before = np.inf

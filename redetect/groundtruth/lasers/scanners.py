@@ -1,13 +1,13 @@
-"""Laser scanners in a plane, the robot that they see, their readings over time; and the files.
+"""Planar laser scanners, the robot that they see, their scans over time, and the files.
 
 ``scanners.json``, ``robot.json``
-    A scanner has its x axis along its middle beam where its beams lie symmetrically, as SICK's do;
-    beams are counted counter-clockwise. Its pose is that of the scanner in the world for a fixed
-    one, in the robot's frame for one on board.
+    If a scanner's beams are symmetric, as SICK's are, its x axis is along its middle beam; beams
+    are counted counter-clockwise. Poses of fixed scanners are in the world, those of scanners on
+    board in the robot's frame.
 ``<name>.scans.npz``
     `times_s` (N,) float64 and `ranges_mm` (N, readings) uint16, nothing pickled.
 ``<name>.scans.csv``, ``<name>.scans.csv.gz``
-    rows t, r0, r1, ... in seconds and metres, perhaps with a running number before t.
+    rows t, r0, r1, ... in seconds and metres, optionally with a running number before t.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ class Scanner:
     name: str  # Its scans are in ``<name>.scans.npz``
     # (3,): x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame
     pose: FloatArray
-    # (3, 3): of the pose, (x, y, theta) in the same frame; zeros where it is known exactly.
+    # (3, 3): of the pose, (x, y, theta) in the same frame; zeros if it is known exactly.
     covariance: FloatArray
     # Beam i points to first_angle + i step in the scanner's frame.
     first_angle_rad: Annotated[float, FINITE]
     angle_step_rad: Positive
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
-    max_range_m: Positive  # A reading as long as this or longer is none
+    max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class Scanner:
         """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
         millimetres.
 
-        NaN where nothing was hit.
+        NaN if nothing was hit.
         """
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
         angles = self.angles_rad
@@ -97,11 +97,11 @@ class Scanner:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot as laser tracking needs it."""
+    """A robot to be tracked by laser scanners."""
 
     # (K, 2): corners of the closed polygon that the scanners see, in the robot's frame (m)
     outline: FloatArray
-    largest_speed_m_s: float  # It moves no faster
+    largest_speed_m_s: float  # Upper bound of its speed
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
@@ -109,8 +109,8 @@ class Robot:
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
     """Read a ``scanners.json``: the scanners, in the file's order.
 
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing, impossible or of a
-    name given twice.
+    Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
+    scanners have the same name.
     """
     return _scanners(JsonObject.read(path))
 
@@ -145,7 +145,7 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
 
 
 def scanner_entry(scanner: Scanner) -> dict[str, Any]:
-    """A scanner as files have it."""
+    """A scanner as an entry of a file."""
     values = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
@@ -185,10 +185,10 @@ class Scans:
     Raises `GroundTruthError` if shapes or types disagree or a time is not finite.
     """
 
-    # (N,): seconds on the scanner's clock (a scan's middle beam), in the order of measuring. In
-    # some real logs they step back.
+    # (N,): seconds on the scanner's clock (of a scan's middle beam), in the order of measurement.
+    # In some real logs they step back.
     times_s: FloatArray
-    # (N, readings): readings in millimetres, 0 where nothing came back
+    # (N, readings): readings in millimetres, 0 if nothing was returned
     ranges_mm: NDArray[np.uint16]
 
     def __post_init__(self) -> None:
@@ -230,8 +230,8 @@ def read_scans(
     path : path
         ``.npz``, or rows of numbers, ``.gz`` or not.
     readings : int, optional
-        Readings per scan. In rows with one number more, the first is a running number and is left
-        out; without `readings` the first number of a row is the time.
+        Readings per scan. In rows with one number more, the first is a running number and is
+        ignored; without `readings` the first number of a row is the time.
     ordered : bool
         Whether times that step back are refused.
 
@@ -239,7 +239,7 @@ def read_scans(
     -------
     Scans
         Readings rounded to millimetres; those of 65.536 m and more, which these files cannot
-        hold, are taken for none.
+        store, are treated as no returns.
 
     Raises
     ------
@@ -268,7 +268,7 @@ def read_scans(
 
 
 def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
-    """Read the two arrays, checking sizes that the file claims and without unpickling."""
+    """Read the two arrays, checking the sizes stated in the file and without unpickling."""
     try:
         with zipfile.ZipFile(path) as archive:
             times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
@@ -279,13 +279,13 @@ def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint
         raise GroundTruthError(f"{path}: no such file") from None
     except OSError as error:
         raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
-    # Errors of damaged archives: names that are no UTF-8, offsets beyond any file, ...
+    # Errors of damaged archives: names that are not UTF-8, offsets beyond the file, ...
     except (
         zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
         struct.error,
     ) as error:  # fmt: skip
         said = one_line(str(error), 200)
-        raise GroundTruthError(f"{path}: is no .npz that can be read: {said}") from None
+        raise GroundTruthError(f"{path}: unreadable .npz: {said}") from None
 
 
 def _member(

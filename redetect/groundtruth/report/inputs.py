@@ -152,7 +152,7 @@ def _building(session: Path, inputs: Inputs) -> FloatArray | None:
 def _picture(path: Path) -> bytes:
     content = read_content(path, _MOST_PICTURE_BYTES, "picture", GroundTruthError)
     if not content.startswith(_PNG):
-        raise GroundTruthError(f"{path}: is no PNG")
+        raise GroundTruthError(f"{path}: not a PNG")
     return content
 
 

@@ -203,8 +203,8 @@ def test_clock_files_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is no JSON"),
-        ("[" * 100000, "is no JSON"),
+        ("{", "invalid JSON"),
+        ("[" * 100000, "invalid JSON"),
         ("[]", "expected a JSON object"),
         ('{"segments": []}', "segments is \\[\\]: expected a list"),
         ('{"segments": [3]}', "segments is \\[3\\]"),

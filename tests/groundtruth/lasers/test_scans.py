@@ -291,7 +291,7 @@ def test_files_that_are_no_text_or_cut_off_are_refused(tmp_path: Path) -> None:
         read_scans(path)
     plain = tmp_path / "b.scans.csv"
     plain.write_bytes(b"\xff\xfe\x00\n")
-    with pytest.raises(GroundTruthError, match="no text"):
+    with pytest.raises(GroundTruthError, match="not text"):
         read_scans(plain)
     with pytest.raises(GroundTruthError, match="no such file"):
         read_scans(tmp_path / "c.scans.csv")

@@ -167,7 +167,7 @@ def test_matrices_that_are_no_covariances_are_refused(
 
 @pytest.mark.parametrize(
     ("text", "problem"),
-    [("{", "is no JSON"), ("[]", "expected a JSON object"), ("[" * 100000, "nested too deep")],
+    [("{", "invalid JSON"), ("[]", "expected a JSON object"), ("[" * 100000, "nested too deep")],
 )
 def test_files_that_are_no_json_are_refused(tmp_path: Path, text: str, problem: str) -> None:
     path = tmp_path / "rig.json"

@@ -189,7 +189,7 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
     assert_harmless(page)
     assert page.text.count("<script>alert(1)</script>") > 10
     assert "\x00" not in page.text
-    assert "errors.png: is no PNG" in page.text
+    assert "errors.png: not a PNG" in page.text
     assert set(page.tags) <= KNOWN
 
 
@@ -257,7 +257,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     page = Page(output.read_bytes())
     assert_harmless(page)
     warnings = capsys.readouterr().err
-    for words in ("laser.csv:1: 'three'", "fused.json: is no JSON", "laser.json: expected a JSON",
+    for words in ("laser.csv:1: 'three'", "fused.json: invalid JSON", "laser.json: expected a JSON",
                   "clock.json: segm", "building.csv:1:"):  # fmt: skip
         assert words in page.text
         assert words in warnings

@@ -105,5 +105,5 @@ def test_files_that_are_no_text_or_not_there_are_refused(tmp_path: Path) -> None
     with pytest.raises(GroundTruthError, match="no such file"):
         read_distances(tmp_path / "distances.csv", SURVEY)
     (tmp_path / "distances.csv").write_bytes(b"\xff\xfe")
-    with pytest.raises(GroundTruthError, match="no text"):
+    with pytest.raises(GroundTruthError, match="not text"):
         read_distances(tmp_path / "distances.csv", SURVEY)
