@@ -1,4 +1,4 @@
-"""Checkerboards, and ``boards.json``: which is in which image of which camera.
+"""Checkerboards, and ``boards.json``, which lists the images and the board in each.
 
 ::
 
@@ -8,13 +8,13 @@
      "first_from_second": {"translation_m": [...], "quaternion_xyzw": [...], "sigmas": [...]},
      "images": [{"camera": "a", "image": "a/images/0001.png", "placement": 0, "board": "first"}]}
 
-``first`` and ``second`` are the double board; ``first_from_second`` may be absent, then it is
-estimated, and may have ``sigmas`` or a ``covariance``. Images of one placement were taken without
-moving the board. A camera's calibration is ``<camera>/<camera>.cam`` beside the file.
+``first`` and ``second`` are the double board; ``first_from_second`` may have ``sigmas`` or a
+``covariance``, and is estimated if absent. Images of one placement were taken without moving the
+board. A camera's calibration is ``<camera>/<camera>.cam`` beside the file.
 
 A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
-right, y up, z out of the print, held so that the square in its top left corner is black. With one
-even and one odd number of corners only one way to hold it is like that.
+right, y up, z out of the print, oriented so that the top left square is black. With one even and
+one odd number of corners, this orientation is unique.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from redetect.groundtruth.markers.session import parse_pose
 from redetect.storage.bounded import path_inside
 from redetect.storage.messages import excerpt
 
-#: Half the side of the window in which a corner is refined, as a share of its squares: calibrated
-#: cameras look from afar here, and blur and noise cause larger errors than the lens's distortion.
+#: Half the side of a corner's refinement window, as a fraction of a square: cameras are calibrated
+#: and far away here, so that blur and noise cause larger errors than the lens's distortion.
 _WINDOW = 0.4
 
 
@@ -56,10 +56,10 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class DoubleBoard:
-    """The boards `FIRST` and `SECOND`, held together."""
+    """The boards `FIRST` and `SECOND`, rigidly connected."""
 
     offset: FloatArray | None  # (4, 4): `first_from_second`; None if it is to be estimated.
-    covariance: FloatArray  # (6, 6): of its right perturbation; zeros if it is exactly known.
+    covariance: FloatArray  # (6, 6): of its right perturbation; zeros if known exactly.
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class BoardsFile:
 
 
 def read_boards(path: Path) -> BoardsFile:
-    """Read a ``boards.json``, or that of a folder, and the calibrations of its cameras.
+    """Read a ``boards.json``, or the one in a folder, and the calibrations of its cameras.
 
     Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
     missing or impossible.
@@ -95,8 +95,8 @@ def read_boards(path: Path) -> BoardsFile:
     unknown = sorted(set(boards) - {FIRST, SECOND, WORLD})
     if unknown or WORLD not in boards or (FIRST in boards) != (SECOND in boards):
         raise GroundTruthError(
-            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and first "
-            "and second or neither"
+            f"{path}: boards are {excerpt(sorted(boards))}: expected world, and both "
+            "or neither of first and second"
         )
     world = parse_pose(content.inner("world_from_board"))
     double = None
@@ -114,15 +114,15 @@ def read_boards(path: Path) -> BoardsFile:
 
 
 def calibration_of(camera: str) -> str:
-    """The file of a camera's calibration, relative to that of the boards."""
+    """Path of a camera's calibration, relative to the folder of the boards' file."""
     return f"{camera}/{camera}.cam"
 
 
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
-    """The corners of the board in an image.
+    """Find the corners of the board in an image.
 
-    Raises `GroundTruthError` if the image cannot be read, has another size than the calibration, or
-    shows no board.
+    Raises `GroundTruthError` if the image cannot be read, its size differs from the calibration's,
+    or no board is found.
     """
     try:
         grey = read_grey(image.image)
@@ -137,13 +137,13 @@ def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
         _, corners = find_board(grey, board, window=_WINDOW)
     except CalibrationError:
         raise GroundTruthError(
-            f"{image.image}: no checkerboard of {board.columns} x {board.rows} inner corners in it"
+            f"{image.image}: no checkerboard of {board.columns} x {board.rows} inner corners found"
         ) from None
     return BoardView(image.camera, image.board, corners)
 
 
 def _inside(path: Path, name: str) -> Path:
-    """The file that a file names, in its folder."""
+    """Path of a file named in the file `path`, inside its folder."""
     try:
         return path_inside(path.parent, name)
     except ValueError as error:

@@ -1,7 +1,7 @@
-"""Where the cameras are, from a double checkerboard that two of them see at a time.
+"""Poses of cameras, from a double checkerboard that two of them see at a time.
 
-One camera sees a board that is fixed in the world. From there the others are chained: a camera
-sees one face of the double board while another sees the other face. Then all is adjusted together.
+One camera sees a board that is fixed in the world. From it the others are chained: one camera sees
+one face of the double board while another sees the other face. Then all are adjusted jointly.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from redetect.groundtruth.trajectories.transforms import inverse, log_se3, trans
 
 @dataclass(frozen=True, eq=False)
 class NetworkEstimate:
-    """A network and what it was made from."""
+    """An estimated network, and the views used."""
 
     names: tuple[str, ...]  # The cameras
     world_from_camera: FloatArray  # (C, 4, 4)
@@ -43,12 +43,12 @@ class NetworkEstimate:
 def estimate_network(
     setup: BoardsFile, shots: Sequence[Sequence[BoardView]], settings: NetworkSettings
 ) -> NetworkEstimate:
-    """Estimate where the cameras are.
+    """Estimate the poses of the cameras.
 
     Parameters
     ----------
     setup : BoardsFile
-        The cameras, the boards, and where these are; its images are not read.
+        The cameras, the boards and their poses; its images are not read.
     shots : sequence of sequences of BoardView
         Boards seen at one time.
 
@@ -99,9 +99,9 @@ def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:
 def _estimated_offset(seen: _Seen) -> FloatArray:
     """`first_from_second`, from shots in which two cameras, or one, see both faces.
 
-    With A_k the pose of the first face in one camera and B_k that of the second in another, both
-    fixed, (A_1^-1 A_k) X = X (B_1^-1 B_k): the hand-eye problem. Of several pairs of cameras, that
-    with the most shots counts.
+    With A_k the pose of the first face in one camera and B_k that of the second in another, the
+    cameras fixed, (A_1^-1 A_k) X = X (B_1^-1 B_k): the hand-eye problem. Of several pairs of
+    cameras, the one with the most shots is used.
     """
     together: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for shot in seen:
@@ -122,7 +122,7 @@ def _estimated_offset(seen: _Seen) -> FloatArray:
 
 
 def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
-    """(4, 4) X with left_k X = X right_k in the sense of least squares (Park & Martin 1994)."""
+    """(4, 4) least-squares solution X of left_k X = X right_k (Park & Martin 1994)."""
     rotation = Rotation.align_vectors(log_se3(left)[:, 3:], log_se3(right)[:, 3:])[0]
     matrix = np.concatenate(left[:, :3, :3] - np.eye(3))
     vector = np.concatenate(rotation.apply(right[:, :3, 3]) - left[:, :3, 3])
@@ -133,10 +133,10 @@ def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
 def _chained(
     names: tuple[str, ...], seen: _Seen, parts: Mapping[str, FloatArray]
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
-    """Cameras (C, 4, 4), and the double board of each shot, in the world; from camera to camera."""
-    # Estimates of one frame in another: the world is number 0, the cameras follow.
+    """Poses of cameras (C, 4, 4), and of the double board in each shot, chained from the world."""
+    # Estimates of one frame in another: the world has index 0, the cameras follow.
     estimates: dict[tuple[int, int], list[FloatArray]] = {}
-    held: dict[int, list[tuple[int, FloatArray]]] = {}  # of each shot: `camera_from_body`
+    held: dict[int, list[tuple[int, FloatArray]]] = {}  # By shot: `camera_from_body`
     for number, shot in enumerate(seen):
         for view, pose in shot:
             camera = 1 + names.index(view.camera)
@@ -157,8 +157,8 @@ def _chained(
     if lost.size:
         raise GroundTruthError(
             f"camera {names[lost[0]]} is not connected to the world: expected shots "
-            "in which it sees a board of the world, or the double board together with a camera "
-            "that is connected"
+            "in which it sees the board of the world, or the double board together with a "
+            "connected camera"
         )
     bodies = {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
     return poses[1:], bodies
@@ -179,7 +179,7 @@ def _bundle(
     bodies: Mapping[int, FloatArray],
     corner_sigma_px: float,
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
-    """The bundle of all boards seen; its first body is the world, the others the double boards."""
+    """Bundle of all views; its first body is the world, the others are the double boards."""
     names, order = sorted(setup.cameras), list(parts)
     body_index = {number: 1 + i for i, number in enumerate(bodies)}
     views = [view for shot in seen for view, _ in shot]
@@ -210,7 +210,7 @@ def _bundle(
         second = len(names) + order.index(SECOND)
         free[second] = double.offset is None or bool(np.any(double.covariance))
         if free[second] and double.offset is not None:
-            # Exactly known poses beside uncertain ones are held to a micrometre.
+            # Exactly known poses among uncertain ones get a prior of a micrometre.
             priors = (PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),)
     bundle = Bundle(
         tuple(setup.cameras[name] for name in names),

@@ -1,8 +1,8 @@
-"""Relative poses of two markers: an estimate from each time that shows both, and a consensus.
+"""Relative poses of two markers: estimates at each time at which both are seen, and a consensus.
 
-A square has two solutions, so each time gives four estimates of a pair. The right one is the same
-at all times; wrong ones depend on where the camera stood. The consensus is the estimate that the
-others agree with best, each time free to choose among its four.
+A square has two solutions, so there are four estimates of a pair at each time. The right one is
+the same at all times; wrong ones depend on the pose of the camera. The consensus is the estimate
+that agrees best with the others, with the best of the four chosen at each time.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from redetect.groundtruth.trajectories.transforms import (
 )
 from redetect.landmarks import squared_mahalanobis
 
-# Squared normalised distance (6 dof) above which an estimate does not agree.
+# Squared normalised distance (6 dof) above which an estimate disagrees.
 _AGREES = 30.0
 _HYPOTHESES = 60
-# Estimates are linearised: no distance counts as better known than this.
+# Added to covariances, since estimates are linearised.
 _FLOOR = np.diag(np.square([0.002] * 3 + [0.005] * 3))
 
 
@@ -48,17 +48,17 @@ class PairConsensus:
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
     agrees: BoolArray  # (T,): which of them agree with it
-    # (T,): whether that is the combination of solutions that fit the image best
+    # (T,): whether these are the solutions that fit the image best
     first: BoolArray
 
     @property
     def support(self) -> int:
-        """At how many times the estimate agrees."""
+        """Number of times at which the estimate agrees."""
         return int(self.agrees.sum())
 
 
 def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
-    """Estimates of `a_from_b` from one time's solutions of both markers, every combination."""
+    """Estimates of `a_from_b` from all combinations of both markers' solutions at one time."""
     poses = inverse(a.poses)[:, None] @ b.poses
     own = inverse_covariance(a.poses, a.covariances)[:, None]
     covariances = composed_covariance(own, b.poses, b.covariances)
@@ -67,9 +67,9 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
 
 
 def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
-    """The transform that most times agree with.
+    """The transform with which the most times agree.
 
-    `times`: from `pair_estimates`, one for each time that shows both markers.
+    `times`: from `pair_estimates`, one for each time at which both markers are seen.
     """
     poses = np.concatenate([time.poses for time in times])
     covariances = np.concatenate([time.covariances for time in times])
@@ -77,14 +77,14 @@ def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     owner = np.repeat(np.arange(len(times)), [len(time.poses) for time in times])
 
     def nearest(pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Each time's estimate nearest to a pose: squared normalised distance, and which it is."""
+        """Each time's estimate nearest to a pose: squared normalised distance, and its index."""
         apart = log_se3(inverse(pose) @ poses)
         distance = squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
         order = np.lexsort((distance, owner))
         best = order[np.searchsorted(owner[order], np.arange(len(times)))]
         return distance[best], best
 
-    # The surest estimates are hypotheses: those of a marker seen large and aslant.
+    # Hypotheses are the most certain estimates: of markers seen large and at an angle.
     spread = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
     surest = np.argsort(spread, kind="stable")[:_HYPOTHESES]
     totals = []
@@ -96,7 +96,7 @@ def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     for _ in range(10):
         distance, best = nearest(consensus, covariance)
         agreeing = best[distance < _AGREES]
-        if not len(agreeing):  # not even the hypothesis: its own covariance is the floor's
+        if not len(agreeing):  # not even the hypothesis itself
             agreeing = np.array([chosen])
         new, covariance = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
         moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
@@ -114,14 +114,14 @@ def chained_poses(
     count: int,
     root: int,
 ) -> FloatArray:
-    """(count, 4, 4) poses of markers, or cameras, in the root's frame; NaN where not connected.
+    """(count, 4, 4) poses of markers, or cameras, in the root's frame; NaN if not connected.
 
-    Chained along the tree over the best supported pairs. `relative` are `a_from_b` of pairs a, b,
-    `support` how often each was seen.
+    Chained along the spanning tree of the best supported pairs. `relative`: `a_from_b` of pairs
+    (a, b); `support`: number of times that each was seen.
     """
     first, second = np.array(list(support), dtype=np.int64).reshape(-1, 2).T
     weights = coo_array((-np.array(list(support.values()), float), (first, second)), (count, count))
-    # Of negative weights: the tree with the most support.
+    # With negative weights: the tree with the most support.
     order, parents = breadth_first_order(minimum_spanning_tree(weights), root, directed=False)
     poses = np.full((count, 4, 4), np.nan)
     poses[root] = np.eye(4)

@@ -1,7 +1,7 @@
-"""What a session with markers has on disk: rig, network, the images and the markers found in them.
+"""The files of a session with markers: rig, network, images and the markers found in them.
 
-``rig.json`` holds `robot_from_marker` for each marker, ``network.json`` `world_from_camera` for
-each camera; both may say how uncertain that is (see docs/groundtruth.md).
+``rig.json`` contains `robot_from_marker` of each marker, ``network.json`` `world_from_camera` of
+each camera; both may contain covariances (see docs/groundtruth.md).
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ _WIDTH = Bounds("metres above 0", lambda x: x > 0.0)
 class Rig:
     """Square markers on a robot."""
 
-    dictionary: str  # Which set of markers the identifiers are from
+    dictionary: str  # The set of markers that defines the identifiers
     ids: tuple[int, ...]  # The markers, M of them
     widths_m: FloatArray  # (M,): widths of the black squares
-    # (M, 4, 4): marker frame: origin at the centre, x right, y up, z out of the printed face
+    # (M, 4, 4): a marker's frame has its origin at the centre, x right, y up, z out of the print
     robot_from_marker: FloatArray
-    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
-    # known.
+    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros if known
+    # exactly.
     covariance: FloatArray
 
     @property
@@ -54,12 +54,12 @@ class Network:
     """Cameras fixed in the world."""
 
     names: tuple[str, ...]  # The cameras, C of them
-    # Their calibrations. The mounting that a ``.cam`` file holds means nothing here.
+    # Their calibrations. The mounting in a ``.cam`` file is ignored.
     cameras: tuple[Camera, ...]
-    calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's own
+    calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's file
     world_from_camera: FloatArray  # (C, 4, 4)
-    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros where exactly
-    # known.
+    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros if known
+    # exactly.
     covariance: FloatArray
 
 
@@ -70,7 +70,7 @@ def marker_corners(width_m: float) -> FloatArray:
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read a ``rig.json``; its markers come in the order of their identifiers.
+    """Read a ``rig.json``; its markers are returned in the order of their identifiers.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
     """
@@ -91,7 +91,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 
 def read_network(path: str | os.PathLike[str]) -> Network:
-    """Read a ``network.json`` and the calibrations that it names; cameras by the order of names.
+    """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
     Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
     missing or impossible.
@@ -100,7 +100,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
     cameras = dict(sorted(content.objects("cameras").items()))
     calibrations = tuple(entry.text("calibration", "a file") for entry in cameras.values())
     for calibration, entry in zip(calibrations, cameras.values()):
-        # It may well lie beside the network's folder; but only a calibration is ever opened.
+        # It may be outside the network's folder; but only calibrations are ever opened.
         relative = not Path(calibration).is_absolute() and "\0" not in calibration
         if not relative or not calibration.endswith(".cam"):
             raise entry.wrong("calibration", "a .cam file by a relative path")
@@ -149,7 +149,7 @@ def write_network(
 
 
 def _with_covariance(key: str, entries: dict[str, Any], covariance: FloatArray) -> dict[str, Any]:
-    """Entries, and their joint covariance if there is one."""
+    """Entries, with their joint covariance if there is one."""
     content: dict[str, Any] = {key: entries}
     if np.any(covariance):
         content["covariance"] = {key: list(entries), "matrix": covariance.tolist()}
@@ -157,7 +157,7 @@ def _with_covariance(key: str, entries: dict[str, Any], covariance: FloatArray) 
 
 
 def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
-    """A (4, 4) pose as `parse_pose` reads it."""
+    """A (4, 4) pose in the form that `parse_pose` reads."""
     return {
         "translation_m": pose[:3, 3].tolist(),
         "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
@@ -184,8 +184,8 @@ def _joint_covariance(
         return np.asarray(block_diag(*(entry.uncertainty(6) for entry in entries.values())))
     if any("covariance" in entry or "sigmas" in entry for entry in entries.values()):
         raise GroundTruthError(
-            f"{content.place}: covariance for all {key} together and for one of them: expected one "
-            "of both"
+            f"{content.place}: a joint covariance of all {key}, and one of a single entry: "
+            "expected only one of them"
         )
     joint = content.values["covariance"]
     if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
@@ -224,7 +224,7 @@ class View:
 
 
 def find_runs(session: Path) -> list[Path]:
-    """The run folders of a session that have found markers.
+    """The run folders of a session that contain detected markers.
 
     Raises `GroundTruthError` if there are none.
     """
@@ -242,8 +242,8 @@ def find_runs(session: Path) -> list[Path]:
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
     """The markers found in a run's images, in the file's order, and the images' times.
 
-    The run folder has ``detected.markers`` and ``<name>.times``. Frames are numbered instead if
-    they need not be `timed`.
+    The run folder contains ``detected.markers`` and ``<name>.times``. Frames are numbered instead
+    if not `timed`.
     """
     times_path = run / f"{run.resolve().name}.times"
     times = read_times(times_path) if timed else {}
@@ -262,7 +262,7 @@ def group_by_time(
 ) -> list[tuple[MarkerFrame, ...]]:
     """Groups of images of different cameras, in order of time.
 
-    A group's images lie within the tolerance of its first; each camera is in it once.
+    A group's images are within the tolerance of its first; each camera occurs at most once.
     """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
@@ -275,7 +275,7 @@ def group_by_time(
 
 
 def rig_views(group: Sequence[MarkerFrame], rig: Rig) -> list[View]:
-    """The rig's markers among those of some images, in the images' order."""
+    """The rig's markers among those found in images, in the images' order."""
     index = {marker: i for i, marker in enumerate(rig.ids)}
     return [
         View(frame, marker, index[marker.id])

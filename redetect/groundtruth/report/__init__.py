@@ -1,1 +1,1 @@
-"""The content of a session on one page."""
+"""Report on a session, on one page."""

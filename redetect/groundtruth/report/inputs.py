@@ -1,4 +1,4 @@
-"""The report's inputs from a session; files missing or unreadable are noted, not raised."""
+"""The report's inputs from a session; missing or unreadable files are listed, not raised."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from redetect.storage.bounded import read_content
 
 T = TypeVar("T")
 
-#: Streams in the order of the page, with what they are called there.
+#: Streams in the order of the page, with their labels there.
 STREAMS = {"laser": "laser", "camera": "cameras", "filtered": "filter alone", "fused": "fused"}
-#: Pictures that commands wrote, by where they are in the session.
+#: Pictures written by commands, by their paths in the session.
 PICTURES = ("aligned.png", "validation/errors.png", "validation/scans.png")
 
 _GAP_S = 5.0
@@ -51,20 +51,20 @@ class Inputs:
 
     name: str  # Of the session
     building: FloatArray | None = None  # (S, 4)
-    # By the names in `STREAMS`, as far as they are there
+    # Those available, by the names in `STREAMS`
     streams: dict[str, PlanarPoses] = field(default_factory=dict)
-    # On the ground truth's clock, moved rigidly onto the truth (else what was fused) in each visit
+    # On the ground truth's clock, aligned rigidly with truth (or fused poses) in each visit
     odometry: PlanarPoses | None = None
     truth: PlanarPoses | None = None
     clock: ClockModel | None = None
     # Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`
     documents: dict[str, dict[str, Any]] = field(default_factory=dict)
     pictures: dict[str, bytes] = field(default_factory=dict)  # By the names in `PICTURES` (PNG)
-    # What was measured in the building by tape
+    # Tape measurements in the building
     dimensions: list[Dimension] = field(default_factory=list)
     fiducials: SurveyedFiducials | None = None
     ptpd: PtpdLog | None = None
-    # Times between which the robot was in the covered area
+    # Begin and end of each visit of the robot to the covered area
     visits: list[tuple[float, float]] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)  # Missing files
     problems: list[str] = field(default_factory=list)  # Files that cannot be read
@@ -73,7 +73,7 @@ class Inputs:
 def gather(session: Path, truth: Path | None = None) -> Inputs:
     """Read the files of a session.
 
-    `truth`: true poses; by default ``truth.csv`` in the session, if there.
+    `truth`: true poses; by default ``truth.csv`` in the session, if it exists.
     """
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
@@ -112,7 +112,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
 
 
 def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPoses:
-    """The poses between the beginnings and ends of visits; all, if there is no visit."""
+    """The poses within visits; all if there are no visits."""
     if not visits:
         return poses
     return poses.only(np.any([poses.during(*visit) for visit in visits], axis=0))
@@ -121,7 +121,7 @@ def in_visits(poses: PlanarPoses, visits: list[tuple[float, float]]) -> PlanarPo
 def _read(
     inputs: Inputs, path: Path, reader: Callable[[Path], T], *, optional: bool = False
 ) -> T | None:
-    """The result of a reader for a file, or None and a note; none of a missing one if optional."""
+    """The content of a file, or None and a note; no note if a missing file is optional."""
     place = path.name if path.parent.name != "validation" else f"validation/{path.name}"
     try:
         if path.is_file():
@@ -157,7 +157,7 @@ def _picture(path: Path) -> bytes:
 
 
 def _visits(inputs: Inputs) -> list[tuple[float, float]]:
-    """When ground truth was measured, pauses left out; what was fused goes on through them."""
+    """Intervals with measured ground truth; fused poses also cover the pauses between them."""
     streams = inputs.streams
     measured = [streams[name] for name in ("laser", "camera") if name in streams]
     for stream in (inputs.truth, streams.get("fused")):
@@ -171,7 +171,7 @@ def _visits(inputs: Inputs) -> list[tuple[float, float]]:
 
 
 def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
-    """Odometry that can be compared: on the ground truth's clock, moved onto the truth by visit."""
+    """Odometry for comparison: on the ground truth's clock, aligned with the truth by visit."""
     odometry = _read(inputs, session / "odometry.csv", read_planar_poses)
     onto = inputs.truth if inputs.truth is not None else inputs.streams.get("fused")
     if odometry is None or onto is None:

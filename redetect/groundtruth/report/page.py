@@ -1,4 +1,4 @@
-"""The report as one HTML page: no scripts, nothing loaded, everything from files escaped."""
+"""The report as one HTML page: no scripts, nothing loaded, all content of files escaped."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, score_
 from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of
 
-# Differences remain without colour: dashes.
+# Colours and dashes, which distinguish streams without colour, too.
 _LOOKS: dict[str, tuple[str, tuple[float, ...]]] = {
     "laser": ("#1f5f99", ()),
     "camera": ("#b8560f", (6, 3)),
@@ -48,7 +48,7 @@ def report_page(inputs: Inputs, version: str) -> bytes:
     `version`: of the program, for the page's foot.
     """
     sections = [
-        Section("state", "What there is", _state(inputs)),
+        Section("state", "Contents of the session", _state(inputs)),
         Section("building", "Drawing and fiducials", _building(inputs)),
         Section("scanners", "Fixed scanners", _scanners(inputs)),
         Section("map", "Map and path", _maps(inputs)),
@@ -83,7 +83,7 @@ def _state(inputs: Inputs) -> list[Part]:
     for problem in inputs.problems:
         content.append(Part("problem", f"Cannot be read: {problem}"))
     if inputs.missing:
-        content.append(Part("note", "Not in the session: " + ", ".join(inputs.missing) + "."))
+        content.append(Part("note", "Missing in the session: " + ", ".join(inputs.missing) + "."))
     return content
 
 
@@ -101,7 +101,7 @@ def _building(inputs: Inputs) -> list[Part]:
         content += _dimensions(inputs.dimensions)
     if inputs.fiducials is not None:
         content += _fiducials(inputs.fiducials)
-    return content or [Part("note", "Nothing measured in the building: no dimensions.csv.")]
+    return content or [Part("note", "No measurements in the building: no dimensions.csv.")]
 
 
 def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
@@ -110,12 +110,12 @@ def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
         (d.name, f"{d.drawn_m:.3f}", f"{d.measured_m:.3f}", f"{e:+.1f}")
         for d, e in zip(dimensions[:_MOST_ROWS], off)
     ]
-    head = ("dimension", "drawn / m", "measured / m", "drawn less measured / mm")
+    head = ("dimension", "drawn / m", "measured / m", "drawn minus measured / mm")
     words = (
         f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, worst "
         f"{np.abs(off).max():.1f} mm."
     )
-    caption = "The drawing against dimensions measured in the building"
+    caption = "Dimensions in the drawing and measured in the building"
     return [table(caption, head, rows), Part("text", words)]
 
 
@@ -125,8 +125,8 @@ def _fiducials(found: SurveyedFiducials) -> list[Part]:
          *(f"{1e3 * v:+.1f}" for v in place - drawn))
         for name, place, sigma, drawn in zip(found.names, found.places, found.sigma_m, found.drawn)
     ]  # fmt: skip
-    head = ("fiducial", "x / m", "y / m", "sigma x / mm", "sigma y", "less drawn x / mm", "y")
-    caption = "Fiducials by the distances between them, moved rigidly onto the drawing"
+    head = ("fiducial", "x / m", "y / m", "sigma x / mm", "sigma y", "minus drawn x / mm", "y")
+    caption = "Fiducials from the distances between them, aligned rigidly with the drawing"
     rms = 1e3 * float(np.sqrt(np.mean(found.residuals_m**2)))
     words = f"{len(found.residuals_m)} distances, rms residual {rms:.1f} mm."
     return [table(caption, head, rows), Part("text", words)]
@@ -150,7 +150,7 @@ def _scanners(inputs: Inputs) -> list[Part]:
     except (ValueError, TypeError):
         rows = []
     if rows:
-        caption = "Distance from the final place after each step, moved rigidly onto these (mm)"
+        caption = "Distance from the final position after each step, after rigid alignment (mm)"
         content.append(table(caption, ("step", *names), rows))
     picture = inputs.pictures.get("aligned.png")
     if picture is not None:
@@ -197,7 +197,7 @@ def _maps(inputs: Inputs) -> list[Part]:
     words = "The building" if inputs.building is not None else "No building map in the session"
     words += f" and the paths during the visits ({', '.join(t.label for t in everything)})."
     if inputs.odometry is not None:
-        words += " Odometry is moved onto the truth in each visit."
+        words += " Odometry is aligned with the truth in each visit."
     content = [map_figure(words, everything, inputs.building)]
     for track in tracks:
         if track.poses.covariances is None or not len(track.poses):
@@ -209,7 +209,7 @@ def _maps(inputs: Inputs) -> list[Part]:
 
 def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
-        words = "No truth in the session: give one by --truth to see errors over time."
+        words = "No truth in the session: give it by --truth to see errors over time."
         return [Part("note", words)]
     rows: list[tuple[str, ...]] = []
     place, turn, faults = [], [], []
@@ -237,21 +237,21 @@ def _errors(inputs: Inputs) -> list[Part]:
         "stream", "poses", "mean / mm", "sigma", "rmse", "worst", "mean / deg", "sigma", "worst",
         "NEES / 3", "poses with it",
     )  # fmt: skip
-    caption = "Errors during the visits: of the position (mm) and, signed, of the heading (deg)"
+    caption = "Errors during the visits: position (mm) and signed heading (deg)"
     if inputs.odometry is not None:
-        caption += "; odometry is moved onto the truth in each visit"
+        caption += "; odometry is aligned with the truth in each visit"
     content = [table(caption, head, rows), *faults]
     content.append(
         Part(
             "note",
-            "NEES / 3 is 1 where covariances are right. Errors of neighbouring poses go together, "
-            "so that it scatters more than the number of poses suggests.",
+            "NEES / 3 is 1 if covariances are right. Errors of neighbouring poses are correlated, "
+            "so it scatters more than the number of poses suggests.",
         )
     )
     return [
         *content,
-        series_figure("Position error over time in each visit.", "mm", place, inputs.visits),
-        series_figure("Heading error over time, without sign.", "deg", turn, inputs.visits),
+        series_figure("Position error over time by visit.", "mm", place, inputs.visits),
+        series_figure("Absolute heading error over time by visit.", "deg", turn, inputs.visits),
     ]
 
 
@@ -295,13 +295,13 @@ def _validation(inputs: Inputs) -> list[Part]:
     words, outside = f"NEES / 3 with both covariances: {_number(nees, 1.0, 3)}", False
     band = [v for v in _entry(figures, "normalised_band", list) if is_number(v)]
     if len(band) == 2 and is_number(nees):
-        words += f"; 95 % of right ones lie between {band[0]:.3f} and {band[1]:.3f}"
+        words += f"; 95 % interval of consistent ones {band[0]:.3f} to {band[1]:.3f}"
         outside = not band[0] <= nees <= band[1]
     count = _number(figures.get("poses"), 1.0, 0)
     content.append(Part("problem" if outside else "text", f"{count} reference poses. {words}."))
     for name, words, size in (
         ("errors", "Linear and angular errors at each reference pose.", _VALIDATION_PX),
-        ("scans", "Readings of the scanners on board, by each set of poses.", _SCANS_PX),
+        ("scans", "Readings of the scanners on board, for each set of poses.", _SCANS_PX),
     ):
         picture = inputs.pictures.get(f"validation/{name}.png")
         if picture is not None:
@@ -311,7 +311,7 @@ def _validation(inputs: Inputs) -> list[Part]:
     if refused:
         content.append(
             table(
-                "Poses that are no reference, or without ground truth",
+                "Poses not used as reference, or without ground truth",
                 ("pose", "t / s", "status", "reason"),
                 [
                     (str(r.get("index")), _number(r.get("time_s"), 1.0, 3), str(r.get("status")),
@@ -331,7 +331,7 @@ def _incidence(document: dict[str, Any]) -> list[Part]:
          _number(r.get("sigma_m"), 1e3))
         for r in _entries(document, "incidence")[:_MOST_ROWS]
     ]  # fmt: skip
-    caption = "Ranges on board less the walls' distances, by the angle of incidence"
+    caption = "Ranges on board minus distances of the walls, by angle of incidence"
     head = ("incidence / deg", "readings", "mean / mm", "sigma")
     return [table(caption, head, rows)] if rows else []
 
@@ -357,7 +357,7 @@ def _mounts(document: dict[str, Any]) -> list[Part]:
 
 def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
-        words = "No clock.json: all times are taken to be of one clock."
+        words = "No clock.json: all times are assumed to be of one clock."
         return [Part("note", words)]
     rows = [
         (
@@ -385,7 +385,7 @@ def _clock(inputs: Inputs) -> list[Part]:
     if left_out > 0:
         content.append(Part("note", f"{left_out} more segments are in clock.json."))
     if any(math.isfinite(s.sigma_offset_s) for s in inputs.clock.segments):
-        words = "The robot's clock less the straight line through its segments."
+        words = "The robot's clock minus the straight line through its segments."
         content.append(clock_figure(words, inputs.clock, inputs.ptpd))
     ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
     if isinstance(ptpd, dict):
@@ -400,15 +400,15 @@ def _rejected(inputs: Inputs) -> list[Part]:
     laser = inputs.documents.get("laser.json", {})
     if sets := _entry(laser, "sets", dict):
         counts = ", ".join(f"{_value(number)} {status}" for status, number in sets.items())
-        words = f"Sets of scans: {counts}. Lost includes the pauses between visits."
+        words = f"Sets of scans: {counts}. The lost ones include pauses between visits."
         content.append(Part("text", words))
     suspects = [str(s.get("name")) for s in _entries(laser, "scanners") if s.get("suspect")]
     if suspects:
-        words = "Scanners that do not fit the others: " + ", ".join(suspects) + "."
+        words = "Scanners that disagree with the others: " + ", ".join(suspects) + "."
         content.append(Part("problem", words))
     fused = inputs.documents.get("fused.json")
     if fused is None:
-        content.append(Part("note", "No account of a fusion (fused.json)."))
+        content.append(Part("note", "No results of a fusion (fused.json)."))
         return content
     rejected = _entries(fused, "rejected")
     used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
@@ -422,9 +422,9 @@ def _rejected(inputs: Inputs) -> list[Part]:
              _number(r.get("squared_innovation"), 1.0, 1))
             for r in sorted(worst, key=lambda r: _float(r.get("time_s")))
         ]  # fmt: skip
-        caption = "Poses that fusion rejected"
+        caption = "Poses rejected by the fusion"
         if len(rejected) > _MOST_ROWS:
-            caption += f": the {_MOST_ROWS} farthest of {len(rejected)}"
+            caption += f": the {_MOST_ROWS} worst of {len(rejected)}"
         head = ("t / s", "stream", "squared normalised distance")
         content.append(table(caption, head, entries, text=(1,)))
     return content
@@ -433,7 +433,7 @@ def _rejected(inputs: Inputs) -> list[Part]:
 def _settings(inputs: Inputs, version: str) -> list[Part]:
     content = []
     for name, document in inputs.documents.items():
-        # A file of scanners has the version of its form there.
+        # In a file of scanners, this is the version of the format.
         words = f"{name}: version {_value(document.get('version'))}, "
         content.append(Part("text", words + f"settings {_value(document.get('settings'))}."))
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
@@ -441,12 +441,12 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
 
 
 def _entries(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """The objects of a list in a file that others may have written."""
+    """The objects of a list in an untrusted file."""
     return [entry for entry in _entry(document, key, list) if isinstance(entry, dict)]
 
 
 def _entry(document: dict[str, Any], key: str, kind: type) -> Any:
-    """An entry of a file that others may have written, or an empty one of the kind expected."""
+    """An entry of an untrusted file, or an empty one if it is not of the expected kind."""
     value = document.get(key)
     return value if isinstance(value, kind) else kind()
 

@@ -1,7 +1,7 @@
-"""Figures of the report, and pictures beside results.
+"""Figures of the report, and pictures that accompany results.
 
-The former (SVG) are the map with paths and ellipses, and errors over time; the latter (PNG) a rig,
-the scanners' alignment, errors at reference poses.
+The former (SVG) are the map with paths and ellipses, and errors over time; the latter (PNG) are a
+rig, the scanners' alignment, and errors at reference poses.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MOST_VISITS = 12
 
 
 class Track(NamedTuple):
-    """A stream as it is drawn; dashes (on, off, ... in points) show without colour."""
+    """A stream with its style; dashes (on, off, ... in points) distinguish it without colour."""
 
     label: str
     colour: str
@@ -44,7 +44,7 @@ class Track(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Values above 0 over time."""
+    """Positive values over time."""
 
     label: str
     colour: str
@@ -59,9 +59,9 @@ def map_figure(words: str, tracks: Sequence[Track], building: FloatArray | None)
 
 
 def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Part:
-    """Walls, a path, and 3 sigma ellipses of some of its poses, magnified to be seen."""
+    """Walls, a path, and 3 sigma ellipses of some of its poses, magnified to be visible."""
     outlines, factor = ellipses(track.poses, _scale([track], building), count)
-    size = f"drawn {factor:g} times as large" if factor > 1.0 else "true to scale"
+    size = f"magnified {factor:g} times" if factor > 1.0 else "to scale"
     words = f"{track.label}: path and 3\N{GREEK SMALL LETTER SIGMA} ellipses, {size}."
     return _map(words, [track], building, outlines)
 
@@ -69,10 +69,10 @@ def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Par
 def series_figure(
     words: str, unit: str, series: Sequence[Series], visits: Sequence[tuple[float, float]]
 ) -> Part:
-    """Values on a logarithmic scale over time, each of the longest visits beside the others."""
+    """Values on a logarithmic scale over time, the longest visits side by side."""
     positive = np.concatenate([s.values[s.values > 0.0] for s in series] or [np.zeros(0)])
     if not (len(positive) and visits):
-        return Part("note", f"{words} There is nothing to show.")
+        return Part("note", f"{words} No values to show.")
     longest = sorted(sorted(visits, key=lambda visit: visit[0] - visit[1])[:_MOST_VISITS])
     spans = [max(last - first, 1e-3) for first, last in longest]
     with figure_file((_WIDE_IN, _SERIES_HIGH_IN), "svg") as (figure, content):
@@ -102,7 +102,7 @@ def series_figure(
 
 
 def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[FloatArray, float]:
-    """(count, P, 2) outlines of 3 sigma ellipses evenly apart, and how much they are magnified."""
+    """(count, P, 2) outlines of evenly spaced 3 sigma ellipses, and their magnification."""
     assert poses.covariances is not None
     chosen = np.unique(np.linspace(0, len(poses) - 1, count).astype(np.int64))
     values, vectors = np.linalg.eigh(poses.covariances[chosen][:, :2, :2])
@@ -118,7 +118,7 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
 
 
 def _bounds(tracks: Sequence[Track], building: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Corners of the drawn area: the paths with a margin, or the whole building."""
+    """Corners of the drawn area: the paths with a margin, or else the whole building."""
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places:
         places = [np.array([[0.0, 0.0]]) if building is None else building.reshape(-1, 2)]
@@ -152,7 +152,7 @@ def _map(
 
 
 def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None) -> None:
-    """Walls, and paths that break where nothing was measured."""
+    """Walls, and paths with gaps at times without measurements."""
     if building is not None:
         draw_walls(axes, building)
     for track in tracks:
@@ -164,7 +164,7 @@ def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None
 
 
 def stages_figure(words: str, stages: Sequence[Track], building: FloatArray | None) -> Part:
-    """The stages of one visit, a map each; the last stage's path is beneath the others."""
+    """A map of each stage of one visit; the last stage's path is drawn beneath the others."""
     low, high = _bounds(stages, building)
     rows = math.ceil(len(stages) / 2)
     tall = float((high - low)[1] / (high - low)[0])
@@ -184,7 +184,7 @@ def stages_figure(words: str, stages: Sequence[Track], building: FloatArray | No
 
 
 def clock_figure(words: str, clock: ClockModel, ptpd: PtpdLog | None) -> Part:
-    """Offsets of the robot's clock by each segment alone, and by ptpd, less one straight line."""
+    """Offsets of the robot's clock from each segment, and from ptpd, minus one straight line."""
     known = [s for s in clock.segments if math.isfinite(s.sigma_offset_s)]
     times = np.array([s.reference_s for s in known])
     offsets = np.array([s.offset_s if s.own_offset_s is None else s.own_offset_s for s in known])
@@ -208,7 +208,7 @@ def clock_figure(words: str, clock: ClockModel, ptpd: PtpdLog | None) -> Part:
             label="segments, 95 %",
         )  # fmt: skip
         axes.axhline(0.0, color=_GREY, lw=0.8, label=f"line: drift {1e6 * drift:+.1f} ppm")
-        axes.set(xlabel="time / min", ylabel="offset less the line / ms")
+        axes.set(xlabel="time / min", ylabel="offset minus line / ms")
         axes.legend(fontsize=8)
         axes.grid(alpha=0.25)
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE_IN, 96.0 * _SERIES_HIGH_IN)
@@ -224,7 +224,7 @@ def _frame(axes: Axes, low: FloatArray, high: FloatArray, title: str = "", **wor
 
 
 def draw_walls(axes: Axes, building: FloatArray) -> None:
-    """Draw (S, 4) pieces of wall."""
+    """Draw (S, 4) wall segments."""
     ends = np.concatenate([building.reshape(-1, 2, 2), np.full((len(building), 1, 2), np.nan)], 1)
     axes.plot(*ends.reshape(-1, 2).T, color="0.4", lw=1.0, zorder=1)
 
@@ -235,9 +235,9 @@ _AGREES, _DIFFERS = "#2a78b5", "#d9822b"
 
 
 def draw_rig(estimate: RigEstimate) -> bytes:
-    """Draw a rig from three sides; a PNG's bytes, the same for the same input.
+    """Draw a rig from three sides; returns a PNG's bytes, the same for the same input.
 
-    Pairwise estimates are drawn where they would put a marker, seen from the other one.
+    Pairwise estimates are drawn as the position of one marker relative to the other.
     """
     rig = estimate.rig
     agreeing, differing = _clouds(estimate, rig)
@@ -246,7 +246,7 @@ def draw_rig(estimate: RigEstimate) -> bytes:
         middle = 0.5 * (centre.min(axis=0) + centre.max(axis=0))
         reach = 0.5 * float(np.ptp(centre, axis=0).max()) + float(rig.widths_m.max())
         for axes, (across, up, title) in zip(figure.subplots(1, 3), _PLANES):
-            # Wrong estimates are far away: only those inside the picture are drawn.
+            # Wrong estimates may be far away: only those inside the picture are drawn.
             axes.scatter(
                 differing[:, across], differing[:, up], s=14, marker="x", color=_DIFFERS, lw=0.8,
                 label=f"pairwise, differs ({len(differing)})", zorder=1,
@@ -264,7 +264,7 @@ def draw_rig(estimate: RigEstimate) -> bytes:
 
 
 def _clouds(estimate: RigEstimate, rig: Rig) -> tuple[FloatArray, FloatArray]:
-    """Markers' centres by the pairwise estimates that agree, and by those that do not."""
+    """Markers' centres from the pairwise estimates that agree, and from those that differ."""
     agreeing, differing = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for (a, b), pair in sorted(estimate.pairs.items()):
         poses = rig.robot_from_marker
@@ -301,10 +301,10 @@ def draw_alignment(
     building: FloatArray,
     icp_rms_m: list[FloatArray],
 ) -> bytes:
-    """Draw scanners' points on the map by the measured poses and by those found; a PNG's bytes.
+    """Draw scanners' points on the map for measured and aligned poses; returns a PNG's bytes.
 
-    Beside them `icp_rms_m`, for each scanner the distances from the map (m) step by step of an ICP
-    from its measured pose. The same input gives the same bytes.
+    Beside them, `icp_rms_m`: for each scanner, the distances from the map (m) after each step of an
+    ICP from its measured pose. The same input gives the same bytes.
     """
     with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]
@@ -333,15 +333,15 @@ def draw_alignment(
     return content.getvalue()
 
 
-# Points farther from every wall are of something else.
+# Points farther than this from every wall are of other objects.
 _OF_A_WALL_M = 0.2
 _BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
 def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
-    """Draw errors, at least one, with bounds by their covariances; returns a PNG's bytes.
+    """Draw errors, at least one, with bounds from their covariances; returns a PNG's bytes.
 
-    `score` is that of the errors. The same input gives the same bytes.
+    `score`: of these errors. The same input gives the same bytes.
     """
     with figure_file((13.5, 6.4), "png") as (figure, content):
         linear, angular = figure.subplots(2, 1)
@@ -349,7 +349,7 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
         at = np.arange(len(names))
         x, y, theta = errors.error.T
         linear.bar(at, 1e3 * np.hypot(x, y), color=_BLUE, width=0.6, label="error")
-        # Of two independent directions: the root mean square, so that it compares with errors.
+        # The root mean square distance, which is comparable to errors.
         expected = 1e3 * errors.sigma[:, 0]
         if np.isfinite(expected).any():
             linear.plot(at, expected, "_", color=_ORANGE, ms=11, mew=2, label="expected (rms)")
@@ -393,10 +393,10 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
 
 
 def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
-    """Draw what the scanners on board saw on the map, by each set of poses; a PNG's bytes.
+    """Draw the scans on board on the map, for each set of poses; returns a PNG's bytes.
 
-    The sets are the reference poses by distances alone, those that the scans refined, and the
-    ground truth. The same input gives the same bytes.
+    The sets are the reference poses from distances alone, those refined by scans, and the ground
+    truth. The same input gives the same bytes.
     """
     kept = [i for i, r in enumerate(errors.references) if r.still is not None]
     refined = np.stack([errors.references[i].pose for i in kept])

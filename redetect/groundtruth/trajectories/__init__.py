@@ -1,1 +1,1 @@
-"""Rigid motions in space and in the plane; poses over time: files, other times, alignment."""
+"""Rigid motions in space and in the plane; trajectories: files, interpolation, alignment."""

@@ -1,4 +1,4 @@
-"""Poses over time: their files, poses at other times, and paths moved rigidly onto others.
+"""Poses over time: their files, interpolation, and rigid alignment with other trajectories.
 
 Files are RAWSEEDS' comma-separated streams and TUM trajectories. A RAWSEEDS stream has
 a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth the 3x3 covariance of
@@ -34,13 +34,13 @@ _COVARIANCE_COLUMNS = 13
 class PlanarPoses:
     """Poses of a robot on the floor over time.
 
-    Raises `GroundTruthError` if shapes disagree, a number is not finite or times descend.
+    Raises `GroundTruthError` if shapes disagree, a number is not finite or times decrease.
     """
 
-    times_s: FloatArray  # (N,): seconds, not descending
-    # (N, 3): x, y (m) and theta (rad). Headings may lie past +-pi, as in the real streams.
+    times_s: FloatArray  # (N,): seconds, not decreasing
+    # (N, 3): x, y (m) and theta (rad). Headings may be beyond +-pi, as in the real streams.
     poses: FloatArray
-    # (N, 3, 3): covariances of (x, y, theta); may be singular where a file's rounding made them so.
+    # (N, 3, 3): covariances of (x, y, theta); may be singular due to rounding in files.
     covariances: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class PlanarPoses:
             ("covariances", self.covariances),
         ):
             if values is not None and not np.all(np.isfinite(values)):
-                raise GroundTruthError(f"{name} with a number that is not finite")
+                raise GroundTruthError(f"{name} contain a number that is not finite")
         descending = np.flatnonzero(np.diff(self.times_s) < 0.0)
         if descending.size:
             i = int(descending[0])
@@ -78,15 +78,15 @@ class PlanarPoses:
         return PlanarPoses(self.times_s[chosen], self.poses[chosen], covariances)
 
     def during(self, from_s: float, to_s: float) -> BoolArray:
-        """(N,) which poses are of a span of time, its ends included."""
+        """(N,) mask of the poses in an interval of time, its ends included."""
         return np.asarray((self.times_s >= from_s) & (self.times_s <= to_s))
 
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     """Keep only the last of all poses with the same time.
 
-    Where stamps are coarser than samples, as with buffers that are read from time to time, several
-    poses have the same time. The robot moved between them, but at no computable speed.
+    If time stamps are coarser than samples, as with buffers that are read occasionally, several
+    poses have the same time. The robot moved between them, but its speed cannot be computed.
     """
     last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
     return poses if np.all(last) else poses.only(last)
@@ -95,9 +95,9 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
 def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
-    Rows of 4 or 13 numbers between commas or blanks, all rows alike; blank lines and `#` comments,
-    which the real files do not have, are skipped. Raises `GroundTruthError` if the file cannot be
-    read or a row is malformed; the message names file and line.
+    All rows have 4, or all have 13, numbers separated by commas or blanks; blank lines and `#`
+    comments, which the real files do not have, are skipped. Raises `GroundTruthError` if the file
+    cannot be read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
@@ -113,7 +113,7 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
                 "order"
             )
     if not rows:
-        raise GroundTruthError(f"{path}: no poses in it")
+        raise GroundTruthError(f"{path}: contains no poses")
     table = np.array(rows)
     covariances = table[:, 4:].reshape(-1, 3, 3) if allowed == (_COVARIANCE_COLUMNS,) else None
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
@@ -122,8 +122,8 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
 def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> str:
     """Format poses as a RAWSEEDS stream.
 
-    `covariance_decimals`: the real files have 6, with which variances below (0.7 mm)^2 vanish and
-    matrices become singular; so there are more here unless asked for.
+    `covariance_decimals`: the real files have 6, which rounds variances below (0.7 mm)^2 to zero
+    and makes matrices singular; therefore the default is larger.
     """
     lines = []
     for i in range(len(poses)):
@@ -151,7 +151,7 @@ def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
 
 
 def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[slice]:
-    """The samples (N,) of each segment between pauses that are longer than a limit."""
+    """Slices of the samples (N,) between gaps longer than a limit."""
     cuts = np.flatnonzero(np.diff(times_s) > largest_gap_s) + 1
     ends = [0, *cuts.tolist(), len(times_s)]
     return [slice(a, b) for a, b in pairwise(ends) if b > a]
@@ -160,11 +160,11 @@ def segments_between_gaps(times_s: FloatArray, largest_gap_s: float) -> list[sli
 def interpolate_poses(
     poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float = np.inf
 ) -> tuple[PlanarPoses, BoolArray]:
-    """Poses at other times, linearly between neighbours, headings the short way round.
+    """Interpolate poses and covariances linearly at ascending times (N,), wrapping headings.
 
-    Times (N,) ascend. Between neighbours farther apart than the largest gap there is no pose, but
-    at their own times. Returns the poses at those times that have one, covariances interpolated
-    like them, and which times those are (N,).
+    Between neighbours farther apart than the largest gap there are no poses, except at the
+    neighbours' own times. Returns the interpolated poses, and a mask (N,) of the times that have
+    one.
     """
     if len(poses) == 0:
         raise GroundTruthError("no poses to interpolate between")
@@ -191,19 +191,19 @@ def matched_streams(
     largest_gap_s: float = 0.5,
     interpolate: str = "truth",
 ) -> tuple[PlanarPoses, PlanarPoses, int]:
-    """Both streams at common times, and how many times had to be left out.
+    """Both streams at common times, and the number of times without a match.
 
     Parameters
     ----------
     largest_gap_s : float
-        Nothing is interpolated across longer gaps.
+        Longer gaps are not interpolated.
     interpolate : str
         `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
 
     Raises
     ------
     GroundTruthError
-        If no pose has a truth at its time.
+        If there are no common times.
     """
     if len(poses) == 0 or len(truth) == 0:
         raise GroundTruthError(
@@ -215,7 +215,7 @@ def matched_streams(
     mine, theirs = (kept, at_times) if interpolate == "truth" else (at_times, kept)
     if len(mine) == 0:
         raise GroundTruthError(
-            f"no pose has the truth beside it: poses from {poses.times_s[0]:.3f} to "
+            f"no times in common with the truth: poses from {poses.times_s[0]:.3f} to "
             f"{poses.times_s[-1]:.3f} s, truth from {truth.times_s[0]:.3f} to "
             f"{truth.times_s[-1]:.3f} s, gaps of at most {largest_gap_s:g} s interpolated"
         )
@@ -223,10 +223,10 @@ def matched_streams(
 
 
 def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
-    """(3,) rigid motion x, y (m), theta (rad) that takes poses' positions onto the truth's best.
+    """(3,) rigid motion x, y (m), theta (rad) that best aligns the poses' positions with the truth.
 
-    Both have the same times. Least squares in the plane (Horn 1987), without scale, cannot mirror,
-    as alignments in space can.
+    Both have the same times. Least squares in the plane (Horn 1987), without scale; unlike an
+    alignment in space, it cannot mirror the path.
     """
     if len(poses) < 2:
         raise GroundTruthError(f"{len(poses)} poses: expected 2 or more to align them")
@@ -245,7 +245,7 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
 
 
 def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
-    """(..., 3) poses minus the truth's, headings the short way round."""
+    """(..., 3) poses minus the truth's, headings wrapped."""
     difference = poses - truth
     difference[..., 2] = wrap_angle(difference[..., 2])
     return difference

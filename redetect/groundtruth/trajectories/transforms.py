@@ -1,8 +1,8 @@
-"""Rigid transforms SE(3): 4x4 matrices, their tangents, and how uncertainty moves with them.
+"""Rigid transforms SE(3): 4x4 matrices, their tangents, and the propagation of covariances.
 
 A tangent xi = (v, w) is a translation (m) and a rotation vector (rad), in this order. Poses are
-perturbed on the right, T exp(xi): a covariance (6, 6) of a pose `a_from_b` belongs to such a xi and
-so is expressed in the axes of frame b. All functions work on stacks of any leading shape.
+perturbed on the right, T exp(xi): a covariance (6, 6) of a pose `a_from_b` is that of xi, and
+thus is in the axes of frame b. All functions accept stacks of any leading shape.
 
 References
 ----------
@@ -46,7 +46,7 @@ def inverse(transforms: ArrayLike) -> FloatArray:
 
 
 def apply(transforms: ArrayLike, points: ArrayLike) -> FloatArray:
-    """(..., 3) points taken by (..., 4, 4) transforms (leading shapes are broadcast)."""
+    """(..., 3) points transformed by (..., 4, 4) transforms (leading shapes are broadcast)."""
     t = np.asarray(transforms, dtype=np.float64)
     p = np.asarray(points, dtype=np.float64)
     return np.asarray((t[..., :3, :3] @ p[..., None])[..., 0] + t[..., :3, 3])
@@ -60,7 +60,7 @@ def exp_se3(tangents: ArrayLike) -> FloatArray:
 
 
 def log_se3(transforms: ArrayLike) -> FloatArray:
-    """(..., 6) tangents (v, w) of (..., 4, 4) transforms, the rotation's angle at most pi."""
+    """(..., 6) tangents (v, w) of (..., 4, 4) transforms, with rotation angles of at most pi."""
     t = np.asarray(transforms, dtype=np.float64)
     w = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
     w = w.reshape(*t.shape[:-2], 3)
@@ -69,7 +69,7 @@ def log_se3(transforms: ArrayLike) -> FloatArray:
 
 
 def adjoint(transforms: ArrayLike) -> FloatArray:
-    """(..., 6, 6) matrices Ad with T exp(xi) = exp(Ad xi) T, of (..., 4, 4) transforms T."""
+    """(..., 6, 6) matrices Ad of (..., 4, 4) transforms T, with T exp(xi) = exp(Ad xi) T."""
     t = np.asarray(transforms, dtype=np.float64)
     rotation = t[..., :3, :3]
     matrix = np.zeros((*t.shape[:-2], 6, 6))
@@ -79,7 +79,7 @@ def adjoint(transforms: ArrayLike) -> FloatArray:
 
 
 def right_jacobian(tangent: ArrayLike) -> FloatArray:
-    """(6, 6) matrix J with exp(xi + d) = exp(xi) exp(J d) for small d, of a (6,) tangent xi."""
+    """(6, 6) matrix J of a (6,) tangent xi, with exp(xi + d) = exp(xi) exp(J d) for small d."""
     v, w = cross_matrices(np.reshape(np.asarray(tangent, dtype=np.float64), (2, 3)))
     # The integral of exp(-s ad) over s from 0 to 1, with ad = [[w, v], [0, w]].
     block = np.zeros((12, 12))
@@ -100,7 +100,7 @@ def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
     rotation = np.asarray(world_from_robot, dtype=np.float64)[..., :3, :3]
     jacobian = np.zeros((*rotation.shape[:-2], 3, 6))
     jacobian[..., :2, :3] = rotation[..., :2, :]
-    # The x axis turns by R (w x e_x) = R (0, w_z, -w_y).
+    # The x axis changes by R (w x e_x) = R (0, w_z, -w_y).
     axis, to_y, to_z = rotation[..., 0], rotation[..., 1], rotation[..., 2]
     across = axis[..., 0] ** 2 + axis[..., 1] ** 2
     jacobian[..., 2, 5] = (axis[..., 0] * to_y[..., 1] - axis[..., 1] * to_y[..., 0]) / across
@@ -111,8 +111,8 @@ def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
 def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> FloatArray:
     """(..., 3, 3) covariance of (x, y, theta) (m, m, rad).
 
-    `world_from_robot` (..., 4, 4). `covariance` (..., 6, 6): of the right perturbation (translation
-    m, rotation rad).
+    `world_from_robot`: (..., 4, 4). `covariance`: (..., 6, 6), of the right perturbation
+    (translation m, rotation rad).
     """
     jacobian = planar_jacobian(world_from_robot)
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
@@ -121,7 +121,7 @@ def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> F
 def composed_covariance(
     a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
 ) -> FloatArray:
-    """(..., 6, 6) covariance of a_from_b @ b_from_c, whose errors are independent."""
+    """(..., 6, 6) covariance of a_from_b @ b_from_c with independent errors."""
     return inverse_covariance(inverse(b_from_c), a_covariance) + b_covariance
 
 
@@ -136,8 +136,8 @@ def mean_pose(
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted mean of poses on SE(3) that are close to each other.
 
-    Of (N, 4, 4) poses and (N, 6, 6) covariances of their right perturbations. Returns the mean (4,
-    4), and its covariance (6, 6) if the poses' errors are independent.
+    `poses`: (N, 4, 4); `covariances`: (N, 6, 6), of their right perturbations. Returns the mean
+    (4, 4), and its covariance (6, 6) for independent errors.
     """
     stack = np.asarray(poses, dtype=np.float64)
     mean, information = stack[0], np.linalg.inv(covariances)

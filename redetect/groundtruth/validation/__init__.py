@@ -1,1 +1,1 @@
-"""How good poses are: against a truth, against surveyed reference poses."""
+"""Evaluation of poses against a truth or surveyed reference poses."""

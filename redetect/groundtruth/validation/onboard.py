@@ -1,9 +1,9 @@
-"""What the scanners on board see at the reference poses, against the building's walls.
+"""Fit of the readings on board, at the reference poses, to the building's walls.
 
 The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
 fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls leave a direction undetermined or the results disagree. From all of them follow the errors of
-ranges, and where the scanners are mounted.
+walls do not determine a direction or the results disagree. From all reference poses together, the
+range errors and the mounts of the scanners are estimated.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from redetect.plane import apply, compose, rotation
 
 ScanStatus = Literal["used", "undetermined", "disagrees", "no scans", "not asked"]
 
-# The robot is at rest for this long before and after the distances' time.
+# The robot is assumed at rest for this long before and after the time of the distances.
 _STILL_S = 0.5
-# The first gate of the fit to the walls, how it narrows, to three times as much, and how well the
-# walls must determine each direction (m).
+# Of the fit to the walls (m): its first gate, the standard deviations by which the gate narrows (to
+# three times these), and the largest standard deviation of a direction that is determined.
 _GATE_M = 0.2
 _NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
 _WEAK_SIGMA_M = 0.05
-# Distances and walls disagree if right ones would by as much in less than this share.
+# Distances and walls disagree if the probability of their difference is below this.
 _DISAGREEMENT_PROBABILITY = 1e-4
 
 
@@ -51,7 +51,7 @@ class Onboard:
 
 
 class StillScans(NamedTuple):
-    """What the scanners on board see while the robot is at rest."""
+    """Averaged scans of the scanners on board while the robot is at rest."""
 
     scanners: tuple[Scanner, ...]
     scans: tuple[StillScan, ...]
@@ -68,18 +68,18 @@ class StillScans(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReferencePose:
-    """A reference pose, and how it came about."""
+    """A reference pose, and how it was determined."""
 
     distances: DistancePose
     pose: FloatArray  # (3,): x, y (m), theta (rad)
     covariance: FloatArray  # (3, 3)
-    # `used`; `undetermined`: the walls leave a direction open; `disagrees`: with the distances;
-    # `no scans`: too few readings are on walls; `not asked`.
+    # `used`; `undetermined`: the walls do not determine a direction; `disagrees`: with the
+    # distances; `no scans`: too few readings match walls; `not asked`.
     scans: ScanStatus
     note: str  # Why the scans are not used
-    points: int = 0  # Points of the scans on walls that count
-    rms_m: float = math.nan  # Of their distances from the walls; NaN without.
-    still: StillScans | None = None  # What the scanners on board saw, at rest
+    points: int = 0  # Number of points of the scans that are matched to walls
+    rms_m: float = math.nan  # Of their distances from the walls; NaN without points
+    still: StillScans | None = None  # The averaged scans of the scanners on board
 
     @property
     def index(self) -> int:
@@ -88,13 +88,13 @@ class ReferencePose:
 
     @property
     def time_s(self) -> float:
-        """When it was measured, on the ground truth's clock."""
+        """Time of the measurement, on the ground truth's clock."""
         return self.distances.time_s
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A pose that is no reference, and why."""
+    """A pose that cannot serve as a reference, and why."""
 
     index: int
     time_s: float
@@ -108,23 +108,23 @@ def reference_poses(
     segments: FloatArray | None = None,
     clock: ClockModel | None = None,
 ) -> tuple[list[ReferencePose], list[Refused]]:
-    """Poses from distances, refined by scans where these help.
+    """Poses from distances, refined by scans if possible.
 
     Parameters
     ----------
     distances : sequence of DistancePose
         From `redetect.groundtruth.validation.reference_poses.poses_from_distances`.
     onboard : sequence of Onboard
-        Scanners on board; without any, distances alone count.
+        Scanners on board; without any, only distances are used.
     segments : (S, 4) array, optional
         The building's walls, needed with scanners.
     clock : ClockModel, optional
-        Without it the robot's clock is assumed to be the ground truth's.
+        Without it, the robot's clock is assumed to be that of the ground truth.
 
     Returns
     -------
     refused : list of Refused
-        Those that distances leave ambiguous, undetermined or inconsistent.
+        Poses with ambiguous, undetermined or inconsistent distances.
     """
     references: list[ReferencePose] = []
     refused: list[Refused] = []
@@ -142,12 +142,12 @@ def reference_poses(
 def _unrefined(
     d: DistancePose, scans: ScanStatus, reason: str = "", still: StillScans | None = None
 ) -> ReferencePose:
-    """The pose by distances alone."""
+    """The pose from distances alone."""
     return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
 
 
 def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
-    """Average the readings of the on-board scanners about a time on the robot's clock."""
+    """Average the readings of the scanners on board around a time on the robot's clock."""
     scans = []
     for board in onboard:
         during = np.abs(board.scans.times_s - time_s) <= _STILL_S
@@ -156,7 +156,7 @@ def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
 
 
 def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
-    """Combine what distances and walls (S, 4) (m) say of a pose."""
+    """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
     prior, covariance = distances.pose, distances.covariance
     try:
         found = fit_to_walls(
@@ -165,7 +165,7 @@ def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray
     except GeometryError as error:
         return _unrefined(distances, "no scans", str(error))
     if found.open_directions:
-        reason = "the walls leave a direction open"
+        reason = "the walls do not determine a direction"
         return _unrefined(distances, "undetermined", reason, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
@@ -174,19 +174,19 @@ def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray
     if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
         reason = (
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
-            "from the pose by distances, more than both allow"
+            "from the pose by distances, more than the covariances allow"
         )
         return _unrefined(distances, "disagrees", reason, still)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
-    # Joseph's form stays symmetric and positive.
+    # Joseph's form remains symmetric and positive definite.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
     return ReferencePose(distances, pose, combined, "used", "", found.used, found.rms_m, still)
 
 
-#: Readings farther from the wall that their beam meets are of something else (m).
+#: Readings farther than this from the wall that their beam meets are of other objects (m).
 _OF_A_WALL_M = 0.2
 #: Ends of the bins of incidence (deg).
 INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
@@ -196,7 +196,7 @@ _LEAST_SIGMA_M = 1e-3
 
 
 class RefinedMounts(NamedTuple):
-    """Where M scanners are on the robot."""
+    """Poses of M scanners on the robot."""
 
     poses: FloatArray  # (M, 3): in the robot's frame
     covariance: FloatArray  # (3 M, 3 M)
@@ -205,10 +205,10 @@ class RefinedMounts(NamedTuple):
 def first_walls(
     origin: FloatArray, directions: FloatArray, segments: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances (N,) of the walls that rays from a point meet first, infinite where none, and the
+    """Distances (N,) of the walls that rays from a point meet first, infinite if none, and the
     angles of incidence (N,).
 
-    `directions` (N, 2) are of unit length, `segments` (S, 4).
+    `directions`: (N, 2) unit vectors. `segments`: (S, 4).
     """
     start, along = segments[:, :2] - origin, segments[:, 2:] - segments[:, :2]
     across = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
@@ -225,10 +225,10 @@ def first_walls(
 def range_errors(
     references: Sequence[ReferencePose], segments: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors of the averaged readings at reference poses that scans refined.
+    """Errors of the averaged readings at reference poses that were refined by scans.
 
-    Returns, of N readings that are on walls, the angle between beam and the wall's normal (N,) (0
-    to pi/2), and the reading minus the wall's distance along the beam (N,) (m).
+    Returns, for N readings on walls, the angles between beam and normal of the wall (N,) (0 to
+    pi/2), and the readings minus the walls' distances along the beams (N,) (m).
     """
     angles, errors = [np.zeros(0)], [np.zeros(0)]
     for reference in references:
@@ -246,13 +246,13 @@ def range_errors(
 def refine_mounts(
     references: Sequence[ReferencePose], segments: FloatArray
 ) -> RefinedMounts | None:
-    """Mounts of the scanners on board that lay their readings on the walls at all reference poses.
+    """Mounts of the scanners on board for which readings fit the walls at all reference poses.
 
-    Least squares over the mounts and all poses. What ties the mounts to the robot's frame are the
-    poses by distances alone, with their covariances; how the mounts were measured does not count.
-    None where fewer than three poses have both.
+    Least squares over the mounts and all poses. Only the poses from distances, with their
+    covariances, tie the mounts to the robot's frame; the measured mounts are not a prior.
+    None if fewer than three poses have both distances and scans.
     """
-    # Mounts that are wrong make scans disagree with distances.
+    # With wrong mounts, scans disagree with distances: those are used, too.
     used = [
         r for r in references if r.scans in ("used", "disagrees") and r.distances.status == "ok"
     ]
@@ -298,5 +298,5 @@ def refine_mounts(
 
 
 def _moment(arms: FloatArray, normals: FloatArray) -> FloatArray:
-    """(N,) how far points move along the normals when their arms turn by one radian."""
+    """(N,) derivatives of points along the normals by a rotation of their arms (m/rad)."""
     return np.asarray(arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0])

@@ -1,14 +1,14 @@
 """Reference poses of a robot at rest from distances of points on it to surveyed points.
 
-``fiducials.json`` holds both kinds of points; ``distances.csv`` has the head
-``pose,t,point,fiducial,distance_m`` and a row per distance, measured while the robot stood still.
+``fiducials.json`` lists both kinds of points; ``distances.csv`` has the head
+``pose,t,point,fiducial,distance_m`` and a row per distance, measured while the robot was at rest.
 
-All minima are searched, from starts all round: distances to two points, or to points on a line, fit
-mirrored poses as well. A pose is accepted only if it is determined, no other fits nearly as well,
-and its distances agree within their noise.
+All minima are searched, from starts in all directions, because distances to two points, or to
+points on a line, also fit mirrored poses. A pose is accepted only if it is determined, no other
+fits nearly as well, and its distances agree within their noise.
 
-What was measured in the building by tape is held against the drawing: ``dimensions.csv`` has the
-head ``name,x1_m,y1_m,x2_m,y2_m,measured_m`` and a row for each distance between two points of the
+Tape measurements in the building are compared with the drawing: ``dimensions.csv`` has the head
+``name,x1_m,y1_m,x2_m,y2_m,measured_m`` and a row for each distance between two points of the
 drawing; ``fiducial_distances.csv`` has the head ``a,b,distance_m`` and a row for each distance
 between two fiducials.
 """
@@ -51,8 +51,8 @@ class Distance:
     """A distance from a point on the robot to a fiducial."""
 
     pose: int  # Number of the reference pose
-    time_s: float  # When, on the ground truth's clock
-    point: str  # The two ends
+    time_s: float  # On the ground truth's clock
+    point: str  # The two endpoints
     fiducial: str
     distance_m: float
 
@@ -71,8 +71,8 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
     """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
-    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names a point that
-    is not known.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names an unknown
+    point.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
@@ -100,13 +100,13 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
-# Bearings, and headings, that the search begins from, and minima that are the same (m, rad).
+# Number of bearings, and of headings, to start from; minima closer than this are equal (m, rad).
 _DIRECTIONS, _SAME_M = 12, 1e-4
-# Distances that fit less well than this share of right ones contradict each other.
+# Distances are inconsistent if the probability of their misfit is below this.
 _GROSS_PROBABILITY = 1e-4
-# Another pose within this squared normalised misfit of the best makes it ambiguous.
+# The best pose is ambiguous if the squared normalised misfit of another is less than this above.
 _AMBIGUITY_CHI2 = 20.0
-# A pose known less well than this is undetermined.
+# A pose with larger standard deviations is undetermined.
 _LARGEST_SIGMA_M, _LARGEST_SIGMA_DEG = 0.1, 5.0
 
 
@@ -116,11 +116,11 @@ class DistancePose:
 
     index: int  # The pose's number in the file
     time_s: float  # Median of its distances' times
-    # `ok`; `ambiguous`: several poses fit; `undetermined`: a direction is open; `inconsistent`: no
-    # pose fits.
+    # `ok`; `ambiguous`: several poses fit; `undetermined`: a direction is not determined;
+    # `inconsistent`: no pose fits.
     status: Status
-    reason: str  # What is wrong, if anything
-    pose: FloatArray  # (3,): x, y (m), theta (rad) that fit best; NaN without three distances
+    reason: str  # Why it is not ok; empty if it is
+    pose: FloatArray  # (3,): best x, y (m), theta (rad); NaN with fewer than three distances
     covariance: FloatArray  # (3, 3): from the distances' standard deviation
     residuals_m: FloatArray  # (K,): measured distances minus those of the pose
     chi2: float  # Squared normalised residuals, with K - 3 degrees of freedom
@@ -132,7 +132,7 @@ class DistancePose:
 
 
 def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[DistancePose]:
-    """Work out every pose for which distances were measured, in order of the poses' times."""
+    """Compute every pose for which distances were measured, in order of time."""
     by_pose: dict[int, list[Distance]] = {}
     for distance in distances:
         by_pose.setdefault(distance.pose, []).append(distance)
@@ -143,8 +143,8 @@ def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[
 class Measured(NamedTuple):
     """The K distances of one pose."""
 
-    fiducials: FloatArray  # (K, 2): ends in the world (m)
-    levers: FloatArray  # (K, 2): ends on the robot, in its frame (m)
+    fiducials: FloatArray  # (K, 2): endpoints in the world (m)
+    levers: FloatArray  # (K, 2): endpoints on the robot, in its frame (m)
     distances_m: FloatArray  # (K,)
     sigma_m: float
 
@@ -152,7 +152,7 @@ class Measured(NamedTuple):
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    Levenberg-Marquardt from many starts: all round, in all headings.
+    By Levenberg-Marquardt from many starts, in all directions and headings.
     """
 
     def residuals(pose: FloatArray) -> FloatArray:
@@ -171,8 +171,8 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
 
 
 def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """Measured minus expected distances (..., K) in metres of poses (..., 3), and their derivatives
-    by these (..., K, 3).
+    """Measured minus expected distances (..., K) (m) of poses (..., 3), and their derivatives by
+    the poses (..., K, 3).
     """
     arm = measured.levers @ np.swapaxes(rotation(pose[..., 2]), -1, -2)
     apart = pose[..., None, :2] + arm - measured.fiducials
@@ -203,7 +203,7 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
         status: Status = "inconsistent"
         worst = int(np.argmax(np.abs(residuals)))
         reason = (
-            "the distances contradict each other: farthest off, by "
+            "the distances are inconsistent: the largest residual, "
             f"{1e3 * residuals[worst]:+.0f} mm, is that of {rows[worst].point} from "
             f"{rows[worst].fiducial}"
         )
@@ -215,14 +215,14 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
 
 
 def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
-    """Whether a pose is known, of (C, 3) that fit, the best first, with its covariance (3, 3)."""
+    """Status of the first of the poses (C, 3) that fit, with its covariance (3, 3)."""
     sigma = np.sqrt(np.diagonal(covariance))
     place, turn = float(np.hypot(sigma[0], sigma[1])), math.degrees(sigma[2])
     # NaN and infinity fail these comparisons too.
     if not (place < _LARGEST_SIGMA_M and turn < _LARGEST_SIGMA_DEG):
         return "undetermined", (
-            f"the distances leave it open: sigma {place:.3g} m, {turn:.3g} deg: expected at most "
-            f"{_LARGEST_SIGMA_M:g} m and {_LARGEST_SIGMA_DEG:g} deg"
+            f"too uncertain by its distances: sigma {place:.3g} m, {turn:.3g} deg: expected at "
+            f"most {_LARGEST_SIGMA_M:g} m and {_LARGEST_SIGMA_DEG:g} deg"
         )
     if len(candidates) > 1:
         others = ", ".join(
@@ -233,7 +233,7 @@ def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status,
 
 
 def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
-    """(3, 3); infinite where the distances leave a direction open."""
+    """(3, 3); infinite if the distances do not determine a direction."""
     information = jacobian.T @ jacobian / sigma_m**2
     values, vectors = np.linalg.eigh(information)
     if not values[0] > 1e-10 * values[2]:
@@ -242,7 +242,7 @@ def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
 
 
 def _starts(measured: Measured) -> FloatArray:
-    """(S, 3) poses in all headings, all round the fiducial of the first distance."""
+    """(S, 3) poses with all headings, all around the fiducial of the first distance."""
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
     point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
@@ -250,7 +250,7 @@ def _starts(measured: Measured) -> FloatArray:
 
 
 def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
-    """Indices of poses, the best first, without those closer (m, rad) to a better one."""
+    """Indices of poses, the best first, without those closer than `closer` to a better one."""
     kept: list[int] = []
     for i in np.argsort(cost, kind="stable").tolist():
         apart = np.abs(poses[kept] - poses[i])
@@ -265,7 +265,7 @@ FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
 
 
 class Dimension(NamedTuple):
-    """A distance that the drawing has and that was measured."""
+    """A distance in the drawing that was also measured."""
 
     name: str
     drawn_m: float
@@ -277,13 +277,13 @@ FiducialDistance = tuple[str, str, float]
 
 
 class SurveyedFiducials(NamedTuple):
-    """Where F fiducials are by the distances between them."""
+    """Positions of F fiducials from the distances between them."""
 
     names: tuple[str, ...]
-    places: FloatArray  # (F, 2): moved rigidly onto those of the drawing (m)
-    drawn: FloatArray  # (F, 2): in the drawing (m)
-    sigma_m: FloatArray  # (F, 2): standard deviations of the places, by those of the distances
-    residuals_m: FloatArray  # (K,): measured distances minus those between the places
+    places: FloatArray  # (F, 2): positions, aligned rigidly with those of the drawing (m)
+    drawn: FloatArray  # (F, 2): positions in the drawing (m)
+    sigma_m: FloatArray  # (F, 2): standard deviations of `places`, from those of the distances
+    residuals_m: FloatArray  # (K,): measured distances minus those between `places`
 
 
 def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
@@ -295,7 +295,7 @@ def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
 
 
 def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> list[FiducialDistance]:
-    """Read a ``fiducial_distances.csv``, which may name the survey's fiducials only."""
+    """Read a ``fiducial_distances.csv``, which may name only the survey's fiducials."""
     found = []
     for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):
         a, b = (known_name(path, line, name, survey.fiducials) for name in names)
@@ -304,11 +304,11 @@ def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> lis
 
 
 def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> SurveyedFiducials:
-    """Work the places of fiducials out from the distances between them, by least squares.
+    """Estimate the positions of fiducials from the distances between them, by least squares.
 
-    Distances leave a rigid motion open: the places are moved onto those of the drawing, and the
-    deviations are those of a free network (of least trace). Raises `GroundTruthError` if the
-    distances leave more than that open.
+    Distances do not determine a rigid motion: the positions are aligned with the drawing, and the
+    standard deviations are those of a free network (of least trace). Raises `GroundTruthError` if
+    the distances leave more than that undetermined.
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])
@@ -322,7 +322,7 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
     found = least_squares(residuals, drawn.ravel(), xtol=1e-12, ftol=1e-12)
     if np.linalg.matrix_rank(found.jac, tol=1e-6) < 2 * len(names) - 3:
         raise GroundTruthError(
-            f"{len(measured)} distances leave the places of {len(names)} fiducials open"
+            f"{len(measured)} distances do not determine the positions of {len(names)} fiducials"
         )
     places = found.x.reshape(-1, 2)
     motion = fitted(places, drawn)

@@ -1,4 +1,4 @@
-"""Compares poses with the truth or reference poses: errors, and whether covariances are right.
+"""Comparison of poses with the truth or reference poses: errors, and consistency of covariances.
 
 A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of freedom.
 """
@@ -26,25 +26,25 @@ from redetect.groundtruth.validation.onboard import ReferencePose, Refused
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.plane import between
 
-#: Covariances that files round to six decimals are singular below this.
+#: Covariances rounded to six decimals in files are singular below this.
 LEAST_CORRELATION = 1e-9
-#: The pose nearest in time to a reference pose is at most as far from it (s).
+#: Largest time between a reference pose and the nearest pose (s).
 _FARTHEST_S = 0.5
 
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Figures of the errors of poses, absolute or relative ones; sigmas are with N - 1."""
+    """Statistics of absolute or relative errors of poses; sigmas are computed with N - 1."""
 
     position_mean_m: float  # Of the distances from the truth
     position_sigma_m: float
     position_median_m: float
     position_rmse_m: float
     position_max_m: float
-    angle_mean_rad: float  # Of the signed differences of heading
+    angle_mean_rad: float  # Of the signed differences in heading
     angle_sigma_rad: float
     angle_rmse_rad: float
-    angle_abs_mean_rad: float  # Of the differences without sign
+    angle_abs_mean_rad: float  # Of the absolute differences
     angle_max_rad: float
 
 
@@ -68,23 +68,23 @@ def _figures(error: FloatArray) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class PoseScore(ErrorFigures):
-    """How far poses are from the truth."""
+    """Errors of poses against the truth."""
 
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
-    normalised: int  # Poses whose covariance could be inverted
+    normalised: int  # Poses with an invertible covariance
     # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
     # right. NaN without covariances.
     normalised_error: float
 
     def lines(self) -> list[str]:
         """The figures to print."""
-        nees = "none: no covariance that can be inverted"
+        nees = "none: no invertible covariance"
         if self.normalised:
             low, high = normalised_band(self.normalised)
             nees = (
-                f"{self.normalised_error:.3f} over {self.normalised} poses; 95 % of right, "
-                f"independent ones between {low:.3f} and {high:.3f}"
+                f"{self.normalised_error:.3f} over {self.normalised} poses; 95 % interval of "
+                f"consistent, independent ones {low:.3f} to {high:.3f}"
             )
         return [
             f"position error     mean {1e3 * self.position_mean_m:.2f} mm, sigma "
@@ -99,7 +99,7 @@ class PoseScore(ErrorFigures):
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
     """Errors of poses whose truth is known at the same times.
 
-    If the truth has covariances, they count in the normalised error. `unmatched` is handed through.
+    If the truth has covariances, the normalised error includes them. `unmatched` is passed on.
     """
     normalised = normalised_errors(poses, truth)
     normalised = normalised[np.isfinite(normalised)]
@@ -113,7 +113,7 @@ def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> P
 
 
 def normalised_errors(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
-    """(N,) normalised errors of poses; NaN where a covariance cannot be inverted."""
+    """(N,) normalised errors of poses; NaN if a covariance is not invertible."""
     found = np.full(len(poses), np.nan)
     if poses.covariances is not None:
         both = poses.covariances
@@ -127,13 +127,13 @@ def normalised_errors(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
 
 
 def normalised_band(count: int) -> tuple[float, float]:
-    """Band of 95 % of the means of `count` independent normalised errors, if consistent."""
+    """95 % interval of the mean of `count` independent normalised errors, if consistent."""
     low, high = (float(v) / (3 * count) for v in chdtri(3 * count, (0.975, 0.025)))
     return low, high
 
 
 def sigma_of(values: FloatArray) -> float:
-    """Standard deviation with N - 1; 0 of a single value."""
+    """Standard deviation with N - 1; 0 for a single value."""
     return float(values.std(ddof=1)) if len(values) > 1 else 0.0
 
 
@@ -151,18 +151,18 @@ class RelativeScore(ErrorFigures):
     """Relative errors: of the translations and rotations truth^-1 * estimate."""
 
     pairs: int  # Pairs of times compared with the truth
-    unmatched: int  # Pairs that one side has no pose for, or that are too far apart
+    unmatched: int  # Pairs without poses on one side, or too far apart
 
 
 def read_relations(path: str | os.PathLike[str]) -> Relations:
-    """Read a file of relations: rows t_i, t_j, x, y, z, roll, pitch, yaw between blanks or commas.
+    """Read relations: rows t_i, t_j, x, y, z, roll, pitch, yaw separated by blanks or commas.
 
-    Of these x, y and yaw count: poses are on a floor. Raises `GroundTruthError` if the file cannot
-    be read or a row is malformed; the message names file and line.
+    Only x, y and yaw are used, as poses are on a floor. Raises `GroundTruthError` if the file
+    cannot be read or a row is malformed; the message names file and line.
     """
     rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
     if not rows:
-        raise GroundTruthError(f"{path}: no relations in it")
+        raise GroundTruthError(f"{path}: contains no relations")
     table = np.array([row.numbers for row in rows])
     return Relations(table[:, 0].copy(), table[:, 1].copy(), table[:, [2, 3, 7]])
 
@@ -170,10 +170,10 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
 def score_relations(
     poses: PlanarPoses, relations: Relations, largest_gap_s: float = np.inf
 ) -> RelativeScore:
-    """Hold poses against known relations; the poses are interpolated at the relations' times.
+    """Compare poses, interpolated at the relations' times, with known relations.
 
-    But not across gaps longer than `largest_gap_s`. Raises `GroundTruthError` if no relation has
-    poses at both its times.
+    Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
+    has poses at both its times.
     """
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
@@ -186,7 +186,7 @@ def score_relations(
 def score_steps(
     poses: PlanarPoses, truth: PlanarPoses, step: int, longest_s: float = np.inf
 ) -> RelativeScore:
-    """Relative errors over steps of a truth, from every pose.
+    """Relative errors over steps of a truth, starting at every pose.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def score_steps(
     step : int
         From each pose to the one `step` poses later.
     longest_s : float
-        Steps that take longer, as across a gap, do not count (s).
+        Longer steps, such as across a gap, are not used (s).
 
     Raises
     ------
@@ -210,7 +210,7 @@ def score_steps(
 
 
 def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0) -> RelativeScore:
-    """Figures of the errors truth^-1 * estimate of (N, 3) relative poses."""
+    """Statistics of the errors truth^-1 * estimate of (N, 3) relative poses."""
     if not len(truth):
         raise GroundTruthError("no two times with poses to compare relative to each other")
     error = between(truth, estimates)
@@ -220,7 +220,7 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
 def _at(
     poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
 ) -> tuple[FloatArray, BoolArray]:
-    """(N, 3) poses at times in any order, and which of them there are; zeros elsewhere."""
+    """(N, 3) poses at times in any order, zeros if unknown, and a mask of the known ones."""
     order = np.argsort(times_s, kind="stable")
     interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
     result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
@@ -231,7 +231,7 @@ def _at(
 
 @dataclass(frozen=True)
 class Published:
-    """Figures that RAWSEEDS printed for a ground truth (deliverable D2.1, part 2)."""
+    """Figures that RAWSEEDS published for a ground truth (deliverable D2.1, part 2)."""
 
     name: str
     position_mean_m: float
@@ -248,22 +248,22 @@ PUBLISHED = (
 
 
 class ReferenceErrors(NamedTuple):
-    """How far a ground truth is from E reference poses."""
+    """Errors of a ground truth at E reference poses."""
 
-    references: list[ReferencePose]  # Those at whose time there is ground truth
-    poses: PlanarPoses  # The ground truth there, the pose nearest in time
+    references: list[ReferencePose]  # Those with ground truth at their time
+    poses: PlanarPoses  # The ground truth's poses nearest in time
     reference_poses: PlanarPoses  # The references as a stream
 
     @property
     def error(self) -> FloatArray:
-        """(E, 3) ground truth minus reference: x, y (m), theta (rad), the short way round."""
+        """(E, 3) ground truth minus reference: x, y (m), wrapped theta (rad)."""
         return pose_differences(self.poses.poses, self.reference_poses.poses)
 
     @property
     def sigma(self) -> FloatArray:
-        """(E, 2) standard deviations of position (m) and heading (rad) by both covariances.
+        """(E, 2) standard deviations of position (m) and heading (rad), from both covariances.
 
-        Of the position, the root of the trace; NaN if the ground truth has none, or a singular one.
+        For the position, the root of the trace; NaN if the ground truth has no invertible one.
         """
         found = np.full((len(self.poses), 2), np.nan)
         if self.poses.covariances is not None and self.reference_poses.covariances is not None:
@@ -293,14 +293,14 @@ def reference_errors(
     references : sequence of ReferencePose
         In order of time.
     poses : PlanarPoses
-        The ground truth. The pose nearest in time is used, as the robot is at rest: the covariance
-        of an interpolated pose would depend on the unknown correlation of their errors; but not
-        one more than half a second away.
+        The ground truth. As the robot is at rest, the pose nearest in time is used, if it is at
+        most half a second away: the covariance of an interpolated pose would depend on the unknown
+        correlation of its neighbours' errors.
 
     Returns
     -------
     without : list of Refused
-        References at whose time there is no ground truth.
+        References without ground truth at their time.
     """
     times = np.array([r.time_s for r in references])
     nearest = np.argmin(np.abs(times[:, None] - poses.times_s), axis=1)

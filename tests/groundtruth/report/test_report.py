@@ -280,7 +280,7 @@ def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
     write_planar_poses(session / "truth.csv", late, overwrite=True)
     page = Page(report_page(gather(session), "1"))
     assert "laser: no covariances, no ellipses" in page.text
-    assert "no pose has the truth beside it" in page.text
+    assert "no times in common with the truth" in page.text
     assert_harmless(page)
 
 
@@ -293,7 +293,7 @@ def test_streams_of_other_times_and_many_visits_are_survived(session: Path) -> N
     assert inputs.odometry is None
     page = Page(report_page(inputs, "1"))
     assert "fused: 0 poses and" in page.text
-    assert "fused, pauses included: no pose has the truth beside it" in page.text
+    assert "fused, pauses included: no times in common with the truth" in page.text
     assert_harmless(page)
     times = np.repeat(np.arange(400.0) * 60.0, 3) + np.tile([0.0, 0.1, 0.2], 400)
     many = PlanarPoses(times, np.zeros((1200, 3)), np.zeros((1200, 3, 3)))
@@ -304,7 +304,7 @@ def test_streams_of_other_times_and_many_visits_are_survived(session: Path) -> N
     assert len(inputs.visits) == 400
     series = Series("a", "red", (), times, np.ones(1200))
     assert "visit " in drawn(series_figure("s", "mm", [series], inputs.visits))
-    assert "nothing to show" in series_figure("s", "mm", [], inputs.visits).words
+    assert "No values to show" in series_figure("s", "mm", [], inputs.visits).words
     assert "400 visits" in Page(report_page(inputs, "1")).text
 
 
@@ -341,7 +341,7 @@ def test_ellipses_are_three_sigma() -> None:
     apart = (outlines[0] - small.poses[0, :2]) @ turn
     assert np.abs(apart[:, 0]).max() == pytest.approx(0.009 * factor, rel=0.01)
     part = ellipse_figure(Track("a", "red", (), small), None, 2)
-    assert "times as large" in part.words
+    assert "magnified" in part.words
 
 
 @pytest.mark.parametrize(("nees", "marked"), [(1.05, False), (2.5, True)])

@@ -75,5 +75,5 @@ def test_deviations_are_those_of_the_errors() -> None:
 
 
 def test_too_few_distances_are_refused() -> None:
-    with pytest.raises(GroundTruthError, match="leave the places of 5 fiducials open"):
+    with pytest.raises(GroundTruthError, match="not determine the positions of 5 fiducials"):
         survey_fiducials(SURVEY, measured()[:5])

@@ -160,7 +160,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
     for text, message in (
         ("1 2 0 0 0 0 0\n", ":1: 7 words: expected t_i"),
         ("0 1 0 0 0 0 0 0\n1 2 0 x 0 0 0 0\n", ":2: 'x'"),
-        ("# nothing\n", "no relations in it"),
+        ("# nothing\n", "contains no relations"),
     ):
         path.write_text(text)
         with pytest.raises(GroundTruthError, match=message):

@@ -169,7 +169,7 @@ def test_points_in_a_line_leave_the_mirror_image_and_it_is_said() -> None:
     ("keep", "message"),
     [
         (lambda row: row.fiducial == "SW" and row.point != "back", "2 distances"),
-        (lambda row: row.fiducial == "SW", "leave it open"),
+        (lambda row: row.fiducial == "SW", "too uncertain"),
     ],
 )
 def test_too_little_for_a_pose_is_said(keep: object, message: str) -> None:
@@ -245,7 +245,7 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     points = still_scans(onboard(truth, ROOM, rng), 5.0)
     refined = refine_pose(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
     assert refined.scans == "disagrees"
-    assert "more than both allow" in refined.note
+    assert "more than the covariances allow" in refined.note
     np.testing.assert_array_equal(refined.pose, prior.pose)
     # No readings at all about the time.
     nothing = refine_pose(prior, still_scans(onboard(truth, ROOM, rng), 99.0), ROOM)
