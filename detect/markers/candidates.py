@@ -1,11 +1,11 @@
-"""Phases 1 and 2: where the image is dark among brighter surroundings, and what may be a marker.
+"""Phases 1 and 2: dark regions in brighter surroundings, and those that may be markers.
 
-The grayscale closing I2 of the image I1 with a disc fills everything dark that the disc does not
-fit into; where I1 is much darker than I2 is a candidate for (a part of) a marker. Of these regions
-inexpensive measures select, the cheapest first: area, number of holes, solidity, share of the
-holes. RAWSEEDS deliverable D2.1 part 2. The disc is an octagon here, which two squares and some
-crosses make up at a cost that grows little with its size, and large markers are searched in reduced
-images.
+The grayscale closing I2 of the image I1 with a disc fills all dark regions that the disc does not
+fit into; pixels where I1 is much darker than I2 are candidates for (a part of) a marker. These
+regions are filtered by inexpensive measures, the cheapest first: area, number of holes, solidity,
+area ratio of the holes. RAWSEEDS deliverable D2.1 part 2. The disc is replaced by an octagon,
+composed of squares and crosses at a cost that grows slowly with its size, and large markers are
+searched in reduced images.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from detect.markers.dictionaries import MarkerDictionary
 from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage
 
-#: A disc of radius r as an octagon: half the side of its square, in r; its crosses do the rest.
+#: A disc of radius r as an octagon: half the side of its square, in r; crosses complete it.
 _SQUARE_SHARE = math.sqrt(2.0) - 1.0
-#: Radius of the disc in the reduced images, their pixels: markers of up to twice this, and mostly
-#: more, in each level. Where a width is given, the image is reduced until the disc is no larger.
+#: Radius of the disc in the reduced images, in their pixels: each level finds markers of up to
+#: twice this, usually more. If a width is given, the image is reduced until the disc is no larger.
 _LEVEL_RADIUS_PX = 12
-#: Levels smaller than this hold no marker.
+#: Smaller levels are not searched.
 _LEAST_LEVEL_PX = 16
 #: Thresholds below this are applied to a smoothed image.
 _SMOOTH_BELOW = 0.2
-#: With more noise than this it is smoothed more, grey levels.
+#: With more noise than this (grey levels) it is smoothed more.
 _MUCH_NOISE = 2.5
 
-#: Causes of rejection, as they are counted.
+#: Reasons for rejection, as reported.
 AT_THE_BORDER = "at the image's border"
 AREA = "area"
 HOLES = "number of holes"
@@ -44,12 +44,11 @@ WHITE_SHARE = "share of holes"
 
 #: A marker seen at a slant of 70 degrees has a third of its area.
 _LEAST_FORESHORTENING = 0.3
-#: A marker's dark part is no less than this part of it, or it is no dark square.
+#: Least ratio of a marker's dark area to its whole area.
 _LEAST_DARK = 0.3
 #: Narrowest bounding box, pixels of the layer.
 _LEAST_SIDE_PX = 4
-#: If the next level searches larger markers, a region this wide (in radii of the disc) is left to
-#: that level.
+#: Wider regions (in radii of the disc) are left to the next level, if there is one.
 _WIDEST_RADII = 12.0
 
 
@@ -65,7 +64,7 @@ class Layer(NamedTuple):
 class Region(NamedTuple):
     """A dark region that may be a marker."""
 
-    scale: int  # pixels of the image per pixel of the layer that it was found in
+    scale: int  # pixels of the image per pixel of the layer where it was found
     hull: FloatArray  # (N, 2) convex hull of its pixels' centres, pixels of the image
 
 
@@ -81,10 +80,10 @@ def closing(grey: GreyImage, radius: int) -> GreyImage:
 def candidate_regions(
     image: GreyImage, noise: float, dictionary: MarkerDictionary, settings: MarkerSettings
 ) -> tuple[list[Region], Counter[str]]:
-    """Regions of an image that may be markers, and how many others there are by cause.
+    """Regions of an image that may be markers, and counts of rejected regions by reason.
 
-    From fine to coarse layers and high to low thresholds; the smallest specks are not counted. The
-    share of white in a dictionary's markers decides how much of a region may be holes.
+    In order of fine to coarse layers and high to low thresholds; the smallest specks are not
+    counted. The limits of a region's holes depend on the white area of the dictionary's markers.
     """
     layers = _layers(image, settings)
     white = float(dictionary.patterns.sum(axis=(1, 2)).mean()) * dictionary.cell**2
@@ -116,7 +115,7 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
             levels.append((scale, _LEVEL_RADIUS_PX))
     layers = []
     for scale, radius in levels:
-        # Means over whole squares of pixels; rows and columns left over are dropped.
+        # Means over squares of pixels; remaining rows and columns are dropped.
         height, width = image.shape[0] // scale, image.shape[1] // scale
         grey = np.asarray(image[: height * scale, : width * scale])
         if scale > 1:
@@ -126,7 +125,7 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
 
 
 def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[GreyImage]:
-    """Where a layer is dark, for each threshold; low ones of the image itself are smoothed."""
+    """Masks of dark pixels for each threshold; for low ones, the full image is smoothed first."""
     gate = settings.dark_noise * noise / layer.scale
     plain = smooth = layer.grey, layer.closed
     if layer.scale == 1 and min(settings.thresholds) < _SMOOTH_BELOW:
@@ -145,7 +144,7 @@ def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: floa
     The darkness of I1 under its closing I2 is 1 - I1/I2.
     """
     levels = np.arange(256.0)
-    # I1 < limit(I2), for whole grey levels; the limit itself is not dark.
+    # I1 < limit(I2), for integer grey levels; the limit itself is not dark.
     limit = np.minimum(levels * (1.0 - threshold), levels - gate)
     table = np.clip(np.ceil(limit), 0, 255).astype(np.uint8)
     dark = cv2.compare(grey, cv2.LUT(closed, table), cv2.CMP_LT)
@@ -155,9 +154,9 @@ def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: floa
 def _marker_regions(
     dark: GreyImage, scale: int, widest: float, white: float, settings: MarkerSettings
 ) -> Iterator[Region | str]:
-    """Dark regions of a layer that may be markers, and for the others why not.
+    """Dark regions of a layer that may be markers, and the reasons for rejecting the others.
 
-    `white` is the expected share of white, `widest` the largest side of a region.
+    `white` is the expected share of white area, `widest` the largest side of a region.
     """
     least_px, most_px = _area_limits(settings, scale)
     least_white = settings.least_white * white
@@ -170,7 +169,7 @@ def _marker_regions(
         left, top, wide, high = cv2.boundingRect(outline)
         if min(wide, high) < _LEAST_SIDE_PX:
             continue
-        # Pick's theorem: pixels inside the outline, those on it included; and inside of a hole's.
+        # Pick's theorem: pixels inside the outline and on it; for holes, inside only.
         area = cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
         if area < _LEAST_DARK * least_px:
             continue
@@ -206,14 +205,14 @@ def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:
         expected = (settings.width_px / scale) ** 2
         return expected / settings.area_factor, expected * settings.area_factor
     least = settings.least_width_px**2
-    # Markers that are small in a reduced image are found in the finer ones.
+    # Markers that are small in a reduced image are found in finer ones.
     return (least if scale == 1 else max(least, 100.0) * _LEAST_FORESHORTENING), math.inf
 
 
 def pixel_area(polygon: NDArray[np.int32]) -> float:
-    """Pixels inside a polygon (N, 2) through pixel centres, those on it included: Pick's theorem.
+    """Number of pixels inside and on a polygon (N, 2) through pixel centres, by Pick's theorem.
 
-    Sides between the grid's directions count as the digital lines that they represent.
+    Oblique sides are counted as the digital lines that they represent.
     """
     steps = np.abs(polygon - polygon[np.arange(len(polygon)) - 1]).max(axis=1)
     return float(cv2.contourArea(polygon) + 0.5 * steps.sum() + 1.0)

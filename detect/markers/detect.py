@@ -2,11 +2,11 @@
 
 `detect_markers` processes one image from top to bottom: the three phases of RAWSEEDS deliverable
 D2.1 part 2 (candidates, filtering, refinement and identification), the last by a fit of the whole
-marker, which makes the corners more exact and rejects false markers.
+marker, which makes the corners more accurate and rejects false markers.
 
 The homography of the refined corners gives the centres of the cells, whose grey values are compared
-with all patterns in all four rotations, and the likeliest are fitted. The nearest one is chosen if
-it is near enough and the second nearest is clearly farther away.
+with all patterns in all four rotations; the best matches are fitted. The nearest one is accepted if
+it is near enough and the second nearest clearly farther.
 """
 
 from __future__ import annotations
@@ -41,51 +41,51 @@ from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage, IntArray
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 
-#: Fates of candidates, beside the causes of rejection.
+#: Fates of candidates, beside the reasons for rejection.
 ACCEPTED = "accepted"
-SAME_MARKER = "a marker already found"
+SAME_MARKER = "duplicate of a marker"
 
-#: How many rough quadrangles of the same are tried.
+#: Number of similar rough quadrangles that are tried.
 _TRIES = 3
-#: How far edges may be from the rough ones: pixels of the layer, of the image, and in widths.
+#: Largest distance of edges from the rough ones: pixels of the layer, of the image, and in widths.
 _CAPTURE_LAYER_PX, _CAPTURE_PX, _CAPTURE_WIDTHS = 1.5, 0.7, 0.02
-#: Edges of cells that are blurred by more than this are not fitted.
+#: Markers whose cells are blurred by more than this (in cells) are not fitted.
 _HOPELESS_BLUR_CELLS = 0.75
-#: A first look may explain less than the full fit has to, by this much.
+#: The first, coarse fit may explain less variance than the full fit must, by this much.
 _FIRST_LOOK_SLACK = 0.1
-#: Where the edges of a marker and its fit disagree by more than this (mean normalised squared
-#: difference; the edges' systematic error included), the marker is not flat, or bent by an
-#: uncalibrated lens. Its edges are then where they are seen, in this number of parts.
+#: If the edges of a marker and its fit disagree by more than this (mean normalised squared
+#: difference, including the edges' systematic error), the marker is not flat, or distorted by an
+#: uncalibrated lens. The measured edges are then used, in this number of parts.
 _MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX, _PARTS = 6.0, 0.02, 8
-#: Smaller markers are flat. What is white within the border, or round the quiet zone, shines into
-#: edges that are softer than this part of the border: these are not used.
+#: Smaller markers are assumed flat. Edges with a blur above this share of the border are not used:
+#: they are biased by the brightness of the cells inside, or beyond the quiet zone.
 _LEAST_BENT_PX, _SHARP_BLURS = 40.0, 0.14
-#: Steps from or to grey levels beyond these are clipped, and seem to be where they are not.
+#: Steps from or to grey levels beyond these are clipped, which shifts the edges.
 _UNCLIPPED = (3.0, 250.0)
-#: Systematic error without optical blur, and the blur's variance (px^2) at which it is gone.
+#: Systematic error without optical blur, and the blur's variance (px^2) at which it vanishes.
 _STAIRCASE_PX, _STAIRCASE_VARIANCE = 0.035, 0.1
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A region that came as far as having corners, and what became of it."""
+    """A region with four corners, and its fate."""
 
     outline: FloatArray  # (4, 2) its rough corners, pixels of the image
-    fate: str  # "accepted" or why not
+    fate: str  # "accepted", or the reason for rejection
 
 
 @dataclass(frozen=True)
 class MarkerDetections:
-    """The N markers found in one image, by ID and place, and the rejected candidates."""
+    """The N markers found in one image, sorted by ID and position, and the rejected candidates."""
 
     dictionary: str
     ids: IntArray  # (N,)
     #: (N, 4, 2) top left, top right, bottom right, bottom left as printed; pixels of the image.
     corners: FloatArray
     covariance: FloatArray  # (N, 4, 2, 2) of each corner, pixels squared
-    quality: FloatArray  # (N,) 1 less the mean difference between cells' whiteness and pattern
-    candidates: tuple[Candidate, ...]  # all regions that came as far as having corners
-    rejected: Counter[str]  # how many regions and candidates were not taken, by cause
+    quality: FloatArray  # (N,) 1 minus the mean difference between cells' whiteness and pattern
+    candidates: tuple[Candidate, ...]  # all regions with four corners
+    rejected: Counter[str]  # number of rejected regions and candidates, by reason
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -102,7 +102,7 @@ class MarkerDetections:
 
 
 class _Marker(NamedTuple):
-    """A marker found."""
+    """A detected marker."""
 
     id: int
     corners: FloatArray  # (4, 2) in the printed order, straight pixels
@@ -123,15 +123,15 @@ def detect_markers(
     image : (H, W) uint8
     settings : MarkerSettings
     camera : Camera, optional
-        The calibration, whose distortion bends the markers' edges; without one they are taken to be
-        straight in the image.
+        The calibration, whose distortion bends the markers' edges; without one they are assumed to
+        be straight in the image.
 
     Raises
     ------
     DetectError
-        If there is no such dictionary, or it lacks an ID that is expected.
+        If there is no such dictionary, or it lacks an expected ID.
     FrameError
-        If the image has not the camera's size.
+        If the image's size differs from the camera's.
     """
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)
@@ -141,7 +141,7 @@ def detect_markers(
         picture.grey, picture.noise, templates.dictionary, settings
     )
 
-    # Phase 3: their corners, the edges in the image itself, and which marker it is.
+    # Phase 3: their corners, their edges in the full image, and their identity.
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
     tried = np.empty((0, 4, 2))
@@ -168,7 +168,7 @@ def detect_markers(
             markers.append(found)
         candidates.append(Candidate(outline, found if isinstance(found, str) else ACCEPTED))
 
-    # Back to the image as it is.
+    # Back to the distorted image.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
     outlines = [picture.bend(marker.corners) for marker in markers]
     spreads = [_image_covariance(m, at, picture, settings) for m, at in zip(markers, outlines)]
@@ -184,7 +184,7 @@ def detect_markers(
 
 
 def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
-    """Rough corners of a region by its straight hull, or the cause of there being none."""
+    """Rough corners of a region from its straight hull, or the reason for rejection."""
     corners = rough_corners(hull)
     if corners is None or not is_convex(corners):
         return NOT_FOUR_CORNERS
@@ -200,7 +200,7 @@ def _marker_at(
     templates: Templates,
     settings: MarkerSettings,
 ) -> _Marker | str:
-    """The marker in a rough quadrangle (4, 2), or the cause of there being none."""
+    """The marker in a rough quadrangle (4, 2), or the reason for rejection."""
     refined = refine_quadrangle(picture, rough, templates.border, capture_px, settings)
     if isinstance(refined, str):
         return refined
@@ -208,7 +208,7 @@ def _marker_at(
     if cells is None:
         return OUTSIDE
 
-    # The whole marker, fitted to the likely patterns.
+    # Fit the whole marker with each likely pattern.
     side = math.sqrt(signed_area(refined.corners))
     blur_cells = refined.blur_px / (templates.dictionary.cell * side)
     if blur_cells > _HOPELESS_BLUR_CELLS:
@@ -248,7 +248,7 @@ def _marker_at(
 
 
 def _contradicts(edges: RefinedQuadrangle, fit: PatternFit) -> bool:
-    """Whether edges that are wholly seen and not clipped are not those of the fit."""
+    """Whether completely visible edges without clipping contradict the fit."""
     clipped = edges.dark.min() <= _UNCLIPPED[0] or edges.light.max() >= _UNCLIPPED[1]
     if clipped or edges.support < 0.5:
         return False
@@ -262,9 +262,8 @@ def _image_covariance(
     marker: _Marker, pixels: FloatArray, picture: Picture, settings: MarkerSettings
 ) -> FloatArray:
     """(4, 2, 2) covariances of a marker's corners at their pixels in the image."""
-    # A pixel's own square is taken for a Gaussian of its variance, 1/12 px^2; where there is little
-    # other blur, edges are staircases, and one along rows or columns up to 0.06 px beside where it
-    # seems to be.
+    # A pixel's square is modelled as a Gaussian of its variance, 1/12 px^2; with little other blur,
+    # edges are staircases, and one along rows or columns is biased by up to 0.06 px.
     optics = max(0.0, marker.blur_px**2 - 1.0 / 12.0)
     staircase_px = _STAIRCASE_PX * max(0.0, 1.0 - optics / _STAIRCASE_VARIANCE)
     jacobian = picture.pixel_jacobians(pixels)
@@ -272,41 +271,41 @@ def _image_covariance(
     return np.asarray(covariance + (settings.systematic_px**2 + staircase_px**2) * np.eye(2))
 
 
-#: Causes of rejection, as they are counted.
+#: Reasons for rejection, as reported.
 OUTSIDE = "partly outside the image"
-NO_PATTERN = "like no pattern"
-AMBIGUOUS = "like two patterns"
+NO_PATTERN = "no matching pattern"
+AMBIGUOUS = "two matching patterns"
 NOT_FITTED = "fit of the marker failed"
 UNEXPLAINED = "grey values unexplained"
 WRONG_CELLS = "wrong cells"
 TOO_SMALL = "cells too small for the blur"
-NO_MARKER = "like a pattern that is no marker"
+NO_MARKER = "similar to common non-markers"
 
-#: Samples of a cell are this far apart, in cells.
+#: Distance between samples of a cell, in cells.
 _SPREAD_CELLS = 0.25
-#: Patterns whose correlation is this near the best one's are tried, too, at most `_MOST_TRIED`.
+#: Patterns with a correlation this close to the best are tried, too, up to `_MOST_TRIED` in all.
 _CLOSE_CORRELATION = 0.06
 _MOST_TRIED = 3
-#: Where cells are blurred by less than this (in cells), only a quarter as near.
+#: If cells are blurred by less than this (in cells), it must be four times as close.
 _CLEAR_BLUR_CELLS = 0.3
 _LEAST_CORRELATION = 0.6
-#: Natural logarithm of how much less likely the second best pattern must be.
+#: Least log-odds of the best pattern against the second best.
 _LEAST_LOG_ODDS = 15.0
 #: Least standard deviation of the whiteness of cells.
 _LEAST_CELL_SIGMA = 0.08
-#: Cells that are blurred by more than this (in cells) are not used for a decision. The first number
-#: of each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
+#: Markers whose cells are blurred by more than this (in cells) are rejected. The first number of
+#: each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
 #: others (see `Templates.weakness`).
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
-#: From the first blur (in cells) to the second what is demanded of a fit grows: many patterns can
-#: be bent to blurred cells, but none fits them to the noise unless it is the right one.
+#: The requirements on a fit increase from the first blur (in cells) to the second: many patterns
+#: fit blurred cells roughly, but only the right one fits them to within the noise.
 _STRICT_FROM, _STRICT_AT = 0.3, 0.6
-#: What a fit may leave over beyond the noise (in contrasts), and least mean agreement of the cells,
-#: for clear cells; and for blurred ones.
+#: Largest misfit beyond the noise (in contrasts), and least mean agreement of the cells: for clear
+#: cells, and for blurred ones.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
 _BLURRED_MISFIT = (0.06, 0.03)
 _BLURRED_AGREEMENT = (0.92, 0.95)
-#: Patterns that other objects show as well must have at most this misfit.
+#: The same for patterns that also occur on other objects, and their largest error of a cell.
 _PLAIN_LARGEST_MISFIT = 0.04
 _PLAIN_LEAST_AGREEMENT = 0.95
 _PLAIN_LARGEST_CELL_ERROR = 0.25
@@ -328,7 +327,7 @@ def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -
 
 
 def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) -> list[int]:
-    """Templates that grey values (G, G) may show under a blur in cells, the best first."""
+    """Templates that match grey values (G, G) under a blur in cells, the best first."""
     flat = cells.ravel() - cells.mean()
     length = float(np.linalg.norm(flat))
     if length <= 0.0:
@@ -343,7 +342,7 @@ def likely_patterns(cells: FloatArray, templates: Templates, blur_cells: float) 
 def verified_quality(
     fit: PatternFit, template: int, templates: Templates, settings: MarkerSettings
 ) -> float | str:
-    """The quality of a fitted template, or the cause of its rejection by its cells."""
+    """The quality of a fitted template, or the reason for rejection by its cells."""
     weakness = templates.weakness
     if fit.blur_cells > _between(weakness, *_LARGEST_BLUR_CELLS):
         return TOO_SMALL
@@ -374,7 +373,7 @@ def verified_quality(
 
 
 def _between(share: float, first: float, second: float) -> float:
-    """From the first number to the second as the share goes from 0 to 1."""
+    """Interpolate from the first number to the second, clamped, as the share goes from 0 to 1."""
     return float(np.interp(share, (0.0, 1.0), (first, second)))
 
 
@@ -390,10 +389,10 @@ def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, f
 
 
 def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[float, float]:
-    """Log-odds of a template against the likeliest other one and the likeliest decoy.
+    """Log-odds of a template against the most likely other one and the most likely decoy.
 
-    Given the cells' precision, as if each cell were seen apart from its neighbours; where blur
-    mixes them they are known less well than that.
+    Cells are treated as independent, with their stated precision, reduced for the mixing of
+    neighbouring cells by blur.
     """
     mixing = 1.0 + 4.0 * float(np.exp(-0.25 / fit.blur_cells**2))
     sigma = np.hypot(mixing * fit.cell_sigma, _LEAST_CELL_SIGMA)

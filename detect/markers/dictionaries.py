@@ -1,16 +1,16 @@
-"""Dictionaries of square markers: the patterns of each set, where their cells are, and templates.
+"""Dictionaries of square markers: the patterns of each set, the layout of cells, and templates.
 
 - ``rawseeds``: RAWSEEDS deliverable D2.1 part 2. A black square of 24 units with a matrix of 6x6
-  cells of 2 units, moved half a cell up and to the right, so that it lies on the right six columns
-  and the upper six rows of the 7x7 grid in the square's middle. The cells are ARToolKitPlus'
-  simple code.
+  cells of 2 units, shifted half a cell up and to the right, so that it occupies the right six
+  columns and the upper six rows of the 7x7 grid in the square's middle. The cells are
+  ARToolKitPlus' simple code.
 - ``artoolkitplus12``, ``artoolkitplus8``: that code in the middle of a square of 12x12 cells
   (border of three) and of 8x8 cells (border of one).
-- OpenCV's ArUco and AprilTag sets under their names in OpenCV without ``DICT_``, in small letters:
+- OpenCV's ArUco and AprilTag sets by their names in OpenCV without ``DICT_``, in lower case:
   ``4x4_50`` to ``7x7_1000``, ``aruco_original``, ``aruco_mip_36h12``, ``apriltag_16h5`` to
   ``apriltag_36h11``; border of one cell.
 
-Templates are the patterns made ready for comparison: turned four ways, blurred, and as geometry.
+Templates are the patterns prepared for comparison: in four rotations, blurred, and as geometry.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from detect.errors import DetectError
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: ARToolKitPlus' simple code: a number of 9 bits is written four times, each time scrambled.
+#: ARToolKitPlus' simple code: a number of 9 bits is stored four times, each time scrambled.
 _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
 _SIMPLE_MASKS = (0x027, 0x14E, 0x109, 0x0DB)
 _OPENCV_PREFIX = "DICT_"
 
-#: A random pattern is one of the dictionary's with a probability of 2 to the power of minus this:
-#: in strong dictionaries, and in weak ones.
+#: A random pattern is in the dictionary with probability 2 to the power of minus this: for strong
+#: dictionaries, and for weak ones.
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
@@ -46,14 +46,14 @@ class MarkerDictionary:
     name: str
     ids: IntArray  # (N,)
     patterns: BoolArray  # (N, G, G) cells, True for white; row 0 is the marker's top
-    centres: FloatArray  # (G,) where columns and rows have their centres, in widths of the marker
+    centres: FloatArray  # (G,) centres of columns and rows, in widths of the marker
     cell: float  # width of a cell, in widths of the marker
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def only(self, ids: tuple[int, ...]) -> MarkerDictionary:
-        """The same dictionary with the given markers alone; a DetectError if it lacks one."""
+        """The same dictionary with only the given markers; a DetectError if it lacks one."""
         wanted = np.unique(np.array(ids, dtype=np.int64))
         missing = np.setdiff1d(wanted, self.ids)
         if len(missing):
@@ -78,7 +78,7 @@ def marker_dictionary(name: str) -> MarkerDictionary:
             f"{name!r:.60}: no such dictionary of markers: expected one of "
             f"{', '.join(dictionary_names())}"
         )
-    # Widths of a marker in cells, and cells before the sampled grid.
+    # Width of a marker in cells, and the number of cells before the sampled grid.
     if name == "rawseeds":
         patterns, cells, first = np.pad(simple_patterns(), ((0, 0), (0, 1), (1, 0))), 12, 2.5
     elif name == "artoolkitplus12":
@@ -111,15 +111,15 @@ def _opencv_constants() -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Templates of the expected markers' cells, for each marker turned by 0, 90, 180, 270 deg."""
+    """Templates of the expected markers' cells, each marker rotated by 0, 90, 180, 270 deg."""
 
     dictionary: MarkerDictionary
-    cells: Float32Array  # (T, G * G) 1 for white; all markers, then all turned once ...
-    blurred: tuple[Float32Array, ...]  # for each blur, less their mean, of length 1
-    weakness: float  # how likely a pattern occurs by chance, from 0 (hardly ever) to 1
+    cells: Float32Array  # (T, G * G) 1 for white; all markers, then all rotated once ...
+    blurred: tuple[Float32Array, ...]  # for each blur, with mean 0 and norm 1
+    weakness: float  # likelihood of patterns by chance, from 0 (hardly ever) to 1
     decoys: Float32Array  # (D, G * G) content of other frames: nothing, a bar, or a half
-    plain: BoolArray  # (T,) which of the templates are similar to these
-    lines: FloatArray  # (L,) where cells end, and the square, in its widths from 0 to 1
+    plain: BoolArray  # (T,) mask of templates that are similar to decoys
+    lines: FloatArray  # (L,) boundaries of cells and of the square, in its widths from 0 to 1
     grid: slice  # rows, and columns, of the grid among the cells between the lines
     border: float  # least thickness of the black border in widths of the marker
 
@@ -136,14 +136,14 @@ class Templates:
         return result
 
     def nearest_blur(self, blur_cells: float) -> Float32Array:
-        """The blurred templates of the blur next to the given one."""
+        """The blurred templates whose blur is nearest to the given one."""
         ratio = np.log(np.array(_BLURS_CELLS) / max(blur_cells, 1e-3))
         return self.blurred[int(np.argmin(np.abs(ratio)))]
 
 
 @functools.lru_cache(maxsize=16)
 def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
-    """Templates of a dictionary's markers: of those expected, or of all if none is named.
+    """Templates of a dictionary's markers: of the given IDs, or of all if there are none.
 
     Raises DetectError if there is no such dictionary or marker.
     """
@@ -158,7 +158,7 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
     inner = edges[(edges > 1e-9) & (edges < 1.0 - 1e-9)]
     lines = np.concatenate([[0.0], inner, [1.0]])
     first = 0 if begin < 1e-9 else 1
-    # Outermost ring of the grid that is white in some marker.
+    # Outermost ring of the grid with a white cell in some marker.
     varied = np.asarray(dictionary.patterns.any(axis=0))
     used = np.asarray(varied.any(axis=0) | varied.any(axis=1))
     ring = int(np.argmax(used | used[::-1]))
@@ -178,7 +178,7 @@ def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
 
 
 def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float32Array:
-    """Grey values in the middle of blurred cells, less their mean and of length 1."""
+    """Grey values at the centres of blurred cells, with mean 0 and norm 1."""
     cdf = [NormalDist(0.0, blur_cells).cdf(end - 0.5) for end in range(-2, 4)]
     shares = (np.diff(cdf) / (cdf[-1] - cdf[0])).astype(np.float32)
     padded = np.pad(patterns, ((0, 0), (2, 2), (2, 2)), constant_values=around)
@@ -192,9 +192,9 @@ def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float3
 
 
 def _decoys(varied: BoolArray, patterns: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Patterns of frames, bars, panes, and which of the markers' are within two cells of them.
+    """Patterns of frames, bars and panes, and a mask of the markers less than two cells from one.
 
-    Decoys that are as near a marker's pattern are left out: it could never be found.
+    Decoys that near a marker's pattern are omitted, since it could never be found.
     """
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     j, i = np.indices((len(rows), len(columns)))

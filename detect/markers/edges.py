@@ -1,8 +1,8 @@
 """The edges of a rough quadrangle: phase 3, first part.
 
-Grey values are sampled in rows across each edge, and each part of the edge has the median of its
-rows. The edge is the line through the steps of all parts; the edges meet in the corners. Two parts
-are enough to begin the fit of the whole marker with. Everything happens at straight positions (see
+Grey values are sampled in rows across each edge, and the median of the rows is taken in each part
+of the edge. The edge is the line through the steps of all parts; the edges meet in the corners. Two
+parts are enough to start the fit of the whole marker. All positions are straight ones (see
 `detect.markers.geometry`).
 """
 
@@ -18,38 +18,38 @@ from detect.markers.geometry import Picture, is_convex
 from detect.settings import MarkerSettings
 from redetect.array_types import ByteArray, FloatArray
 
-#: Causes of rejection, as they are counted.
+#: Reasons for rejection, as reported.
 NO_EDGE = "edge not found"
 NO_WHITE = "edges without contrast"
 
-#: Rows across each part of an edge, an odd number, and samples of each row.
+#: Number of rows across each part of an edge (odd), and of samples in each row.
 _ROWS, _SAMPLES = 9, 25
 _ACROSS = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
-#: Samples before each place at which a row may be split, and times those after it.
+#: Number of samples before each possible split of a row, and its product with that after it.
 _COUNT = np.arange(1.0, _SAMPLES)[:, None]
 _PAIRS = _COUNT * _COUNT[::-1]
-#: Slopes up to this share of a row's steepest are light's.
+#: Slopes up to this share of a row's steepest are due to uneven light.
 _GENTLE_SLOPE = 0.05
-#: Of u, v to v, -u; corners after, opposite and before each.
+#: Signs of the rotation of u, v to v, -u; indices of the next, opposite and previous corners.
 _QUARTER_TURN = np.array([1.0, -1.0])
 _NEXT, _OPPOSITE, _LAST = np.array([[1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2]])
-#: In the second pass, edges are searched within this many blurs and pixels, and at least so far.
+#: In the second pass, edges are searched within this many blurs plus pixels, at least the last.
 _REACH_BLURS, _REACH_PX, _LEAST_REACH_PX = 2.5, 0.8, 2.2
-#: Corners that move farther than this (in capture ranges) left their quadrangle.
+#: Corners that move farther than this (in capture ranges) have left their quadrangle.
 _LARGEST_MOVE = 2.5
 #: Standard deviations of an edge's blur, pixels.
 _LEAST_BLUR_PX, _LARGEST_BLUR_PX = 0.3, 6.0
 
 
 class RefinedQuadrangle(NamedTuple):
-    """A quadrangle whose edges were found; edge k goes from corner k to corner k + 1."""
+    """A quadrangle with measured edges; edge k goes from corner k to corner k + 1."""
 
     corners: FloatArray  # (4, 2) straight pixels, clockwise as seen in the image
-    covariance: FloatArray  # (4, 2, 2) of each corner, pixels squared; zero by two parts
+    covariance: FloatArray  # (4, 2, 2) of each corner, pixels squared; zero with two parts
     dark: FloatArray  # (4,) grey level inside each edge
     light: FloatArray  # (4,) grey level outside
-    blur_px: float  # standard deviation, the pixel's own included
-    support: float  # least contrast of any part of an edge, in those of the whole edges
+    blur_px: float  # standard deviation, including that of the pixel itself
+    support: float  # least contrast of any part of an edge, relative to that of the whole edge
 
 
 def refine_quadrangle(
@@ -62,9 +62,9 @@ def refine_quadrangle(
 ) -> RefinedQuadrangle | str:
     """Find the edges of a quadrangle (4, 2), clockwise at straight pixels, in the image.
 
-    `border` widths of the marker is the black border's thickness, and edges are within `capture_px`
-    of the rough ones. From three parts of an edge on, how far their steps are from one line gives
-    the covariance. Returns the cause of rejection if there are no edges.
+    `border` is the black border's thickness in widths of the marker; edges are searched within
+    `capture_px` of the rough ones. With three or more parts per edge, the covariance is computed
+    from the residuals of the steps. Returns the reason for rejection if there are no edges.
     """
     found = _edges_near(picture, rough, border, capture_px, settings, parts)
     if not isinstance(found, str):
@@ -83,11 +83,11 @@ def _edges_near(
     settings: MarkerSettings,
     parts: int,
 ) -> RefinedQuadrangle | str:
-    """The edges within reach of a quadrangle's, or the cause of rejection."""
+    """The edges within reach of a quadrangle's, or the reason for rejection."""
     side = corners[_NEXT] - corners
     length = np.hypot(side[:, 0], side[:, 1])
     outwards = side[:, ::-1] * _QUARTER_TURN / length[:, None]
-    # The border is in proportion to the height over the edge.
+    # The border's thickness is proportional to the height above the edge.
     height = corners - 0.5 * (corners[_OPPOSITE] + corners[_LAST])
     thickness = border * (height * outwards).sum(axis=1)
     outside = np.minimum(reach, np.maximum(1.2, thickness))
@@ -113,7 +113,7 @@ def _edges_near(
     slope = (rows[:, 2:] - rows[:, :-2]).max(axis=1) / (2.0 * apart_px)
     blur_px = np.sort(((light - dark) / slope).ravel())[2 * parts] / math.sqrt(2.0 * math.pi)
 
-    # The line through the steps in the middles of all parts: normal @ place = distance.
+    # The line through the steps in the middle of all parts: normal @ place = distance.
     off = apart_px * place - inside
     middle = np.mean(off, axis=0)
     lever = ((np.arange(parts) + 0.5) / parts - 0.5)[:, None] * used * length
@@ -131,7 +131,7 @@ def _edges_near(
     if parts > 2:
         variance = np.mean((off - middle - turn * lever) ** 2) * parts / (parts - 2)
         at_end = variance * (1.0 / parts + (0.5 * length) ** 2 / squares)
-        # A line that moves takes the corner along the other line.
+        # If a line moves, the corner moves along the other line.
         for spread, moved in ((at_end[_LAST], (by, -bx)), (at_end, (-ay, ax))):
             to = np.array(moved) / (ax * by - ay * bx)
             covariance += (spread * to * to[:, None]).T
@@ -146,9 +146,9 @@ def _edges_near(
 
 
 def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray | None:
-    """(R, S, 4) grey values from some straight places (R, 4, 2) to others; None outside the image.
+    """(R, S, 4) grey values between straight positions (R, 4, 2); None if outside the image.
 
-    They are so near to each other that the lens bends nothing between them.
+    They are so close to each other that distortion between them is negligible.
     """
     ends = picture.bend(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
     height, width = picture.grey.shape
@@ -162,11 +162,11 @@ def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray
 
 
 def _steps(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places of steps in rows (P, S, 4), in samples, and the grey levels on both sides, all (P, 4).
+    """Positions of steps in rows (P, S, 4), in samples, and grey levels on both sides, all (P, 4).
 
-    A row is split where two means explain it best (Otsu's criterion); the means of the outer half
-    of either part are the levels. The step is at the centroid of the slopes, each less a share of
-    the steepest; NaN where the row never rises.
+    A row is split where two means explain it best (Otsu's criterion); the levels are the means of
+    the outer halves of both parts. The step is at the centroid of the slopes, each reduced by a
+    share of the steepest; NaN if the row never rises.
     """
     total = np.cumsum(rows, axis=1)
     before, after = total[:, :-1], total[:, -1:] - total[:, :-1]

@@ -1,12 +1,12 @@
 """Straight pixels, quadrangles of them, and homographies of squares.
 
-Edges of markers are straight in a pinhole image only. Everything that is fitted to edges is
-therefore fitted at *straight* positions, ``(scale x + offset)`` of the undistorted normalised
-coordinates, and what comes out is bent back. Without a camera both are the same.
+Edges of markers are straight only in a pinhole image. All fits to edges therefore use *straight*
+positions, ``(scale x + offset)`` of the undistorted normalised coordinates, and their results are
+distorted again. Without a camera both are the same.
 
 The rough corners of a region are those of the quadrangle of largest area in its hull (algorithm B
-of RAWSEEDS deliverable D2.1 part 2), which the report looks for by coordinate ascent, and which is
-found here among all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
+of RAWSEEDS deliverable D2.1 part 2); the report searches it by coordinate ascent, this module
+exhaustively over all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
 (0, 1).
 """
 
@@ -24,13 +24,13 @@ from detect.grey_values import estimate_noise
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Rows of the image that its noise is estimated from.
+#: Number of rows from which the image's noise is estimated.
 _NOISE_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image, its noise's standard deviation, and the camera that it was taken by, if known."""
+    """An image, the standard deviation of its noise, and its camera, if known."""
 
     grey: GreyImage  # (H, W)
     noise: float
@@ -42,7 +42,7 @@ class Picture:
         return pixels if self.camera is None else _straightened(self.camera, pixels)
 
     def bend(self, straight: FloatArray) -> FloatArray:
-        """(N, 2) pixels of (N, 2) straight positions; NaN where there is none."""
+        """(N, 2) pixels of (N, 2) straight positions; NaN if there is none."""
         c = self.camera
         if c is None:
             return straight
@@ -57,10 +57,10 @@ class Picture:
 
 
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
-    """An image (H, W) with its noise and the lens that it was taken through.
+    """An image (H, W) with its noise and the distortion of its lens.
 
-    Raises FrameError if the image has not the camera's size, or the camera sees nothing at some of
-    its pixels.
+    Raises FrameError if the image's size differs from the camera's, or the calibration has no
+    direction for some of its pixels.
     """
     if camera is not None and image.shape != (camera.height, camera.width):
         raise FrameError(
@@ -79,7 +79,7 @@ def _straight_positions(camera: Camera | None, width: int, height: int) -> Float
     pixels = np.stack([u, v], axis=-1)
     straight = pixels if camera is None else _straightened(camera, pixels)
     if not np.all(np.isfinite(straight)):
-        raise FrameError("the calibration leaves pixels of the image without a direction")
+        raise FrameError("the calibration has no direction for some pixels of the image")
     return np.asarray(straight, np.float32)
 
 
@@ -88,20 +88,20 @@ def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
     return np.asarray(np.add(camera.undistort(pixels) * scale, offset))
 
 
-#: Causes of rejection, as they are counted.
+#: Reasons for rejection, as reported.
 NOT_FOUR_CORNERS = "not four corners"
 NO_QUADRANGLE = "no quadrangle"
 
-#: Quadrangles whose corners are all this near (pixels, and in widths) are one and the same.
+#: Quadrangles whose corners are all this near (pixels, and in widths) are duplicates.
 _SAME_PX, _SAME_WIDTHS = 1.0, 0.08
 _NEXT = np.array([1, 2, 3, 0])
 _SQUARE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 
 
 def rough_corners(hull: FloatArray) -> FloatArray | None:
-    """Four corners (4, 2) of a region by its convex hull (N, 2); None if that has fewer.
+    """Four corners (4, 2) of a region from its convex hull (N, 2); None if that has fewer.
 
-    From the top left clockwise as seen in the image, up to a rotation.
+    Clockwise as seen in the image; the first is arbitrary.
     """
     if len(hull) < 4:
         return None
@@ -111,9 +111,9 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
 
 @kernel()
 def largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
-    """Indices of the largest quadrangle among points (N, 2), in turn.
+    """Indices of the largest quadrangle among points (N, 2), in order.
 
-    Over each diagonal the highest triangles on both sides.
+    For each diagonal, the highest triangles on both sides are combined.
     """
     n = len(points)
     largest, best = -1.0, (0, 0, 0, 0)
@@ -150,9 +150,9 @@ def is_convex(corners: FloatArray) -> bool:
 
 
 def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
-    """Whether the middle of a clockwise convex quadrangle (4, 2), or of one of others, is in both.
+    """Whether a quadrangle (4, 2) contains the centre of one of `others` (N, 4, 2), or vice versa.
 
-    Others (N, 4, 2) are clockwise and convex, too.
+    All are clockwise and convex.
     """
 
     def inside(corners: FloatArray, point: FloatArray) -> BoolArray:
@@ -164,7 +164,7 @@ def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
 
 
 def count_same(first: FloatArray, others: FloatArray) -> int:
-    """How many of (N, 4, 2) quadrangles have the same corners as one, in any order."""
+    """Number of quadrangles (N, 4, 2) with the same corners as the first, in any order."""
     apart = np.abs(first[:, None] - others[:, None]).max(axis=-1)
     farthest = apart.min(axis=2).max(axis=1)
     largest = _SAME_PX + _SAME_WIDTHS * np.sqrt(np.abs(_areas(others)))
@@ -178,7 +178,7 @@ def square_homography(corners: FloatArray) -> FloatArray:
 
 
 def corners_of(homography: FloatArray) -> FloatArray:
-    """(4, 2) where a homography (3, 3) takes the corners of the unit square."""
+    """(4, 2) corners of the unit square, mapped by a homography (3, 3)."""
     projected = _SQUARE @ homography.T
     return np.asarray(projected[:, :2] / projected[:, 2:])
 

@@ -1,9 +1,9 @@
-"""Phase 3, last part: the whole marker fitted to the grey values.
+"""Phase 3, last part: fit of the whole marker to the grey values.
 
 The four edges of a small marker give little information, but its cells have edges, too. Given a
 candidate pattern, the whole marker is fitted at once, by robust least squares: corners, light, blur
-(the model of `detect.markers.pattern_model`, its grey values clipped at 0 and 255). Each cell by
-itself then confirms or refutes the pattern.
+(the model of `detect.markers.pattern_model`, its grey values clipped at 0 and 255). Each cell
+separately then confirms or contradicts the pattern.
 """
 
 from __future__ import annotations
@@ -38,43 +38,43 @@ from detect.markers.pattern_model import (
 )
 from redetect.array_types import FloatArray, IntArray
 
-#: Width of the seam round the marker that is fitted: blurs and pixels, at most a cell's size.
+#: Width of the margin around the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
-#: How far a corner may move from where the edges meet, pixels or cells, the greater; in one step,
-#: part of that.
+#: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
+#: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 
-#: Standard deviations of the light's slope and bend over half a marker, in contrasts, and of the
-#: tone curve's bend; its largest.
+#: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
+#: and of the tone curve's curvature; the largest of the latter.
 _SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _LARGEST_TONE = 0.3, 0.15, 0.15, 0.6
-#: Variance of the blur along any direction, px^2: what a pixel does, and what is still an image.
+#: Limits of the variance of the blur along any direction, px^2; the lower is about a pixel's own.
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 0.07, 60.0
 _CLOSE_ENOUGH_PX = 2e-3
-#: Residuals beyond this many standard deviations lose weight.
+#: Residuals beyond this many standard deviations are down-weighted.
 _OUTLIER = 3.0
 #: Grey values are rounded: noise is never below this, grey levels.
 _LEAST_NOISE = 0.3
-#: Pixels that are needed beyond one for each parameter.
+#: Least number of pixels in excess of the number of parameters.
 _SPARE_PIXELS = 12
 
 
-#: About how many pixels a fit uses at most, and how many steps it takes: a first look is enough to
-#: see whether it may be that marker.
+#: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
+#: decide whether it may be that marker.
 _FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
 
 
 class PatternFit(NamedTuple):
     """A marker fitted to the grey values."""
 
-    corners: FloatArray  # (4, 2) straight pixels, in the order of the corners given
+    corners: FloatArray  # (4, 2) straight pixels, in the order of the given corners
     covariance: FloatArray  # (4, 2, 2) of each corner, pixels squared
-    cells: FloatArray  # (G * G,) whiteness of each cell of the grid by the grey values themselves
+    cells: FloatArray  # (G * G,) measured whiteness of each cell of the grid
     cell_sigma: FloatArray  # (G * G,) its standard deviation due to noise
     border: FloatArray  # (B,) whiteness of the square's other cells
-    misfit: float  # standard deviation of what is left over beyond the noise, in contrasts
-    explained: float  # share of the grey values' variance, noise aside
+    misfit: float  # standard deviation of residuals in excess of the noise, in contrasts
+    explained: float  # share of the grey values' variance that is explained, noise aside
     blur_px: float  # mean standard deviation of the blur
-    blur_cells: float  # along the marker's axes, the greater, in cells
+    blur_cells: float  # the larger one along the marker's axes, in cells
 
 
 def fit_marker(
@@ -85,7 +85,7 @@ def fit_marker(
     *,
     first_look: bool = False,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern by the Gauss-Newton method, beginning with its edges.
+    """Fit a marker of a known pattern by the Gauss-Newton method, starting from its edges.
 
     None if there is no such marker nearby.
     """
@@ -148,8 +148,8 @@ def _solved(
 ) -> tuple[FloatArray, Linearised, FloatArray] | None:
     """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
-    Weak prior knowledge: light changes little over a marker, the blur is round and about what was
-    guessed, the tone curve nearly straight.
+    Weak priors: light changes little over a marker, the blur is nearly isotropic and close to its
+    initial estimate, the tone curve is nearly straight.
     """
     corners = start.corners
     blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)
@@ -187,7 +187,7 @@ def _solved(
 
 
 def robust_sigma(residual: FloatArray, least: float) -> float:
-    """Standard deviation of residuals (N,) by the median of their magnitudes, at least `least`."""
+    """Standard deviation of residuals (N,) from their median magnitude, at least `least`."""
     return max(least, float(np.median(np.abs(residual))) / 0.6745)
 
 
@@ -204,14 +204,14 @@ def _homography_of(p: FloatArray) -> FloatArray:
 
 
 def _confined(blur: FloatArray, largest: float) -> FloatArray:
-    """A covariance uu, uv, vv with its variances along all directions within limits."""
+    """A covariance uu, uv, vv with its variances clamped in all directions."""
     values, vectors = np.linalg.eigh(blur[[0, 1, 1, 2]].reshape(2, 2))
     confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
     return np.asarray(confined.flat[[0, 1, 3]])
 
 
 def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
-    """Standard deviation of the blur in the marker's middle, along its axes, in its widths."""
+    """Larger standard deviation of the blur along the axes at the marker's centre, in widths."""
     w = homography[2] @ [0.5, 0.5, 1.0]
     middle = homography[:2] @ [0.5, 0.5, 1.0] / w
     widths_per_px = np.linalg.inv((homography[:2, :2] - np.outer(middle, homography[2, :2])) / w)
@@ -222,9 +222,9 @@ def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
 def _inflation(pixel: IntArray, left: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
-    A pixel's residual that is correlated with its neighbours' by rho along a row (geometrically
-    falling off) counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only
-    significant correlation is considered.
+    A residual with correlation rho to its neighbours in a row (decaying geometrically) counts as
+    (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only significant
+    correlation is considered.
     """
     weighted = left.residual * np.sqrt(left.weight)
     energy = float(np.mean(weighted**2))
@@ -251,9 +251,9 @@ def _samples(
     near: float,
     most: int,
 ) -> Samples | None:
-    """Pixels of a marker and of a seam of `reach` pixels round it; None if it leaves the image.
+    """Pixels of a marker and of a margin of `reach` pixels around it; None if it leaves the image.
 
-    Of too many, those within `near` pixels of the cells' ends (`lines`) go on as far as possible.
+    If there are too many, those within `near` pixels of cells' boundaries (`lines`) are preferred.
     """
     along = np.linspace(0.0, 1.0, 5)[:, None, None]
     outline = (1.0 - along) * corners + along * np.roll(corners, -1, axis=0)
@@ -264,7 +264,7 @@ def _samples(
         return None
     pad = 1.5 * reach + 2.0
     begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
-    # Every n-th pixel is used, and far from the cells' ends every 10 n-th, as if at random.
+    # Every n-th pixel is used, and far from boundaries every 10 n-th, chosen by a hash.
     area = abs(signed_area(corners))
     side = math.sqrt(area)
     expected = area + reach * 4.0 * side

@@ -2,9 +2,9 @@
 
 A pattern of black and white cells on the marker's plane is seen through a homography, blurred by a
 Gaussian of any shape (optics, motion and the pixel itself) and lit unevenly. The blurred pattern is
-exact where the homography is affine over the width of the blur: each cell is a product of two
-differences of normal distributions along the marker's axes, and where the blur is correlated along
-them the cells' corners contribute what the bivariate normal distribution has more than the product.
+exact if the homography is affine over the width of the blur: each cell is a product of two
+differences of normal distributions along the marker's axes; if the blur is correlated along them,
+the cells' corners contribute the excess of the bivariate normal distribution over the product.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from redetect.compiled import kernel
 
 #: The parameters of a model: homography from the unit square to straight positions, whose last
 #: entry is 1; white and black, grey levels (factors of 1, x, y, x^2, xy, y^2 in sizes of the
-#: marker); covariance uu, uv, vv of the blur, pixels squared; bend of the tone curve.
+#: marker); covariance uu, uv, vv of the blur, pixels squared; curvature of the tone curve.
 PARAMETERS = 24
 HOMOGRAPHY, WHITE, BLACK = slice(0, 8), slice(8, 14), slice(14, 20)
 BLUR, TONE = slice(20, 23), 23
 
-#: Clipped pixels do not count if the model is this near the limit, grey levels, or beyond.
+#: Clipped pixels are ignored if the model is this near the limit (grey levels) or beyond.
 _CLIP_ZONE = 6.0
 #: Standard deviations beyond which the normal distribution is 0 or 1.
 _REACH = 3.6
-#: Twice the negative exponent beyond which a cell's corner adds nothing: exp(-6) and less.
+#: Twice the negative exponent beyond which a cell's corner is negligible: below exp(-6).
 _FAR_FROM_CORNER = 12.0
 _LEAST_CORRELATION, _LARGEST_CORRELATION = 0.02, 0.96
 _ROOT_HALF, _ROOT_2PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
-#: Gauss and Legendre's quadrature over (0, 1).
+#: Gauss-Legendre quadrature over (0, 1).
 NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
 _WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
 
@@ -41,7 +41,7 @@ _WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
 class Pattern(NamedTuple):
     """A pattern of black and white cells on the marker's unit square."""
 
-    lines: FloatArray  # (L,) where cells end along both axes, widths of the marker, from 0 to 1
+    lines: FloatArray  # (L,) boundaries of cells along both axes, widths of the marker, 0 to 1
     black: FloatArray  # (L - 1, L - 1) 1 where the pattern is black
     corner: FloatArray  # (L, L) mixed differences of the pattern: weights of the cells' corners
 
@@ -50,13 +50,13 @@ class Samples(NamedTuple):
     """Pixels to which a marker is fitted, row by row."""
 
     pixel: IntArray  # (N, 2) u, v
-    straight: FloatArray  # (N, 2) without distortion, from the marker's middle, pixels
+    straight: FloatArray  # (N, 2) without distortion, relative to the marker's centre, pixels
     grey: FloatArray  # (N,)
     light: FloatArray  # (6, N) 1, x, y, x^2, xy, y^2 in sizes of the marker
 
 
 class Places(NamedTuple):
-    """Places of N pixels on the marker, in its widths, and the blur there."""
+    """Positions of N pixels on the marker, in its widths, and the blur there."""
 
     x: FloatArray  # (N,)
     y: FloatArray
@@ -68,7 +68,7 @@ class Places(NamedTuple):
 class Linearised(NamedTuple):
     """A model at N pixels."""
 
-    residual: FloatArray  # (N,) 0 where clipped grey values say no more than the model
+    residual: FloatArray  # (N,) 0 if a clipped grey value is consistent with the model
     weight: FloatArray  # (N,) of robust least squares
     jacobian: FloatArray  # (PARAMETERS, N)
     at: Places
@@ -76,7 +76,7 @@ class Linearised(NamedTuple):
 
 
 def pattern_of(lines: FloatArray, black: FloatArray) -> Pattern:
-    """A pattern with the weights of its corners."""
+    """A pattern with the weights of its cells' corners."""
     return Pattern(lines, black, np.diff(np.diff(np.pad(black, 1), axis=0), axis=1))
 
 
@@ -84,7 +84,7 @@ def pattern_of(lines: FloatArray, black: FloatArray) -> Pattern:
 def _cell_profile(
     x: float, sigma: float, lines: FloatArray, z: FloatArray, cdf: FloatArray, pdf: FloatArray
 ) -> tuple[int, int]:
-    """Normal distribution at the cells' ends; returns the cells from, to that have a share."""
+    """Normal distribution at the cells' boundaries; returns the range of cells that contribute."""
     n = len(lines)
     first, last = 0, n - 1
     for k in range(n):
@@ -103,10 +103,10 @@ def _cell_profile(
 
 @kernel(inline="always")
 def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: float) -> float:
-    """Bivariate normal distribution at (h, k) less the product of its margins.
+    """Bivariate normal distribution at (h, k) minus the product of its marginals.
 
-    Drezner and Wesolowsky, "On the computation of the bivariate normal integral", 1990. `sines`
-    are those of the nodes' shares of `angle`, the arc sine of the correlation.
+    Drezner and Wesolowsky, "On the computation of the bivariate normal integral", 1990. `sines`:
+    sines of the nodes times `angle`, the arc sine of the correlation.
     """
     total = 0.0
     for i in range(3):
@@ -117,7 +117,7 @@ def corner_excess(h: float, k: float, sines: tuple[float, float, float], angle: 
 
 @kernel()
 def blurred_blackness(at: Places, pattern: Pattern) -> FloatArray:
-    """(6, N) the blurred pattern at N places, 1 for black, and its derivatives by these."""
+    """(6, N) the blurred pattern at N positions, 1 for black, and its derivatives by `at`."""
     count, n = len(at.x), len(pattern.lines)
     result = np.empty((6, count))
     zx, cx, px, zy, cy, py = (
@@ -155,7 +155,7 @@ def blurred_blackness(at: Places, pattern: Pattern) -> FloatArray:
                     if sign == 0.0 or far or px[i] == 0.0 or py[j] == 0.0:
                         continue
                     value += sign * corner_excess(h, k, sines, angle)
-                    # Of the bivariate distribution less the product of its margins.
+                    # Of the bivariate distribution minus the product of its marginals.
                     beside_h, beside_k = (h - r * k) / root, (k - r * h) / root
                     by_h = sign * px[i] * (0.5 * (1.0 + math.erf(beside_k * _ROOT_HALF)) - cy[j])
                     by_k = sign * py[j] * (0.5 * (1.0 + math.erf(beside_h * _ROOT_HALF)) - cx[i])
@@ -172,7 +172,7 @@ def blurred_blackness(at: Places, pattern: Pattern) -> FloatArray:
 def linearise(
     samples: Samples, pattern: Pattern, p: FloatArray, inverse: FloatArray, outlier: float
 ) -> Linearised:
-    """The model of parameters p at all pixels; residuals beyond `outlier` lose weight.
+    """The model with parameters p at all pixels; residuals beyond `outlier` are down-weighted.
 
     `inverse` (3, 3) is that of the homography.
     """
@@ -199,11 +199,11 @@ def linearise(
     with np.errstate(divide="ignore"):
         weight = np.where(np.abs(residual) > outlier, (outlier / residual) ** 2, 1.0)
 
-    # d(value)/d(blackness), and from there on by the chain rule.
+    # d(value)/d(blackness), and then the chain rule.
     slope = -contrast * (1.0 + p[TONE] * (1.0 - 2.0 * light))
     gu = slope * (by_x * x_u + by_y * y_u)
     gv = slope * (by_x * x_v + by_y * y_v)
-    # sigma_x^2, sigma_y^2 and their covariance are linear in the blur's.
+    # sigma_x^2, sigma_y^2 and their covariance are linear in those of the blur.
     fx = slope * (by_sx - by_rho * rho / sx) / (2.0 * sx)
     fy = slope * (by_sy - by_rho * rho / sy) / (2.0 * sy)
     fxy = slope * by_rho / (sx * sy)
@@ -220,17 +220,17 @@ def linearise(
         fx * x_v**2 + fy * y_v**2 + fxy * x_v * y_v,
     )
     jacobian[TONE] = contrast * light * black
-    # A clipped grey value says no more than that the light was at least (at most) that.
+    # A clipped grey value is only a lower (upper) bound of the light.
     clipped = (grey > 254.5) & (seen > 255.0 - _CLIP_ZONE) | (grey < 0.5) & (seen < _CLIP_ZONE)
     residual[clipped], weight[clipped], jacobian[:, clipped] = 0.0, 1.0, 0.0
     return Linearised(residual, weight, jacobian, at, contrast)
 
 
 def cell_sums(pattern: Pattern, left: Linearised) -> tuple[FloatArray, FloatArray]:
-    """For each cell (L - 1, L - 1) the sums, over all pixels, of the grey levels that a change from
-    black to white would add, times residuals and squared.
+    """Sums over all pixels, for each cell (L - 1, L - 1), of the grey levels that a change from
+    black to white would add, times residuals, and squared.
 
-    These do not spare outliers: a cell that is not what it should be must show.
+    Outliers are included, so that a wrong cell is noticed.
     """
     across, down = (
         np.diff(ndtr(np.clip((pattern.lines - place[:, None]) / sigma[:, None], -_REACH, _REACH)))
