@@ -31,7 +31,7 @@ from redetect.storage import demand_place, write_whole
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-# The table of each kind of file, even if it has no rows.
+# The table that each kind of file always has, even without rows.
 _TABLES: dict[str, TableName] = {
     ".circles": "circles",
     ".lines": "lines",
@@ -48,7 +48,7 @@ def perform(command: Export) -> int:
     if file.is_dir():
         kinds = _TABLES.keys() - {".txt"}
         found = sorted(path.name for path in file.iterdir() if path.suffix in kinds)
-        such = f", such as {', '.join(found)} in it" if found else ""
+        such = f", such as {', '.join(found)}" if found else ""
         raise DetectError(
             f"{file}: is a folder: expected a .circles, .lines, .markers or .tilt file{such}"
         )
@@ -63,12 +63,12 @@ def perform(command: Export) -> int:
         required_pyarrow()
     tables = read_tables(file, _times(command), rate_hz)
     if not tables:
-        raise DetectError(f"{file}: no rows in it: expected STEP, LANDMARK or TILT rows")
+        raise DetectError(f"{file}: contains no rows: expected STEP, LANDMARK or TILT rows")
     output = command.output or file.with_name(f"{file.name}.{to}")
     places = {next(iter(tables)): output} if to == "mcap" else _table_files(output, [*tables])
     for path in places.values():
         if path.exists() and path.samefile(file):
-            raise DetectError(f"{path}: is the file to export: expected another output")
+            raise DetectError(f"{path}: is the file to export: expected a different output")
         demand_place(path, overwrite=command.force)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
@@ -84,7 +84,7 @@ def perform(command: Export) -> int:
 
 
 def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
-    """The file of each table: the first one except steps goes to `output`, others beside it."""
+    """The file of each table: the first one except steps is `output`, others are beside it."""
     first, *others = sorted(tables, key=lambda table: table == "steps")
     beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
     return {first: output, **beside}
@@ -109,7 +109,7 @@ Row = tuple[Value, ...]
 def read_tables(
     path: Path, times: Mapping[str, float] | None, rate_hz: float | None
 ) -> dict[TableName, list[Row]]:
-    """The tables of a landmark or tilt file, first the one that its name implies, even if empty.
+    """The tables of a landmark or tilt file; the first is implied by its name, and may be empty.
 
     The times of frames are from `times`, by prefix, or from the frame rate, if known.
     """
@@ -159,7 +159,7 @@ def required_pyarrow() -> Any:
 
 
 def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], source: str) -> None:
-    """Write a table like `write_csv`; `source` goes into the file's description."""
+    """Write a table like `write_csv`; `source` is stored in the file's description."""
     pa = required_pyarrow()
     types: dict[str, Any] = {
         "text": pa.string(),
@@ -214,14 +214,14 @@ def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], sour
 
 
 def _message(store: Typestore, kind: str, **fields: Any) -> Any:
-    """A message of a store's type; missing fields are zero or empty."""
+    """A message of a type in the store; missing fields are zero or empty."""
     _, descriptions = store.fielddefs[kind]
     empty = {name: _empty(store, of) for name, (_, of) in descriptions if name not in fields}
     return store.types[kind](**empty, **fields)
 
 
 def _empty(store: Typestore, kind: Any) -> Any:
-    """The default value of a field, by its kind: message, number or text, or array."""
+    """The default value of a field of some kind: message, number or text, or array."""
     if isinstance(kind, str):
         return _message(store, kind)
     element, _ = kind
@@ -234,8 +234,8 @@ def _nanoseconds(image: Value, time_s: Value, source: str) -> int:
     """The time of a message about an image."""
     if not isinstance(time_s, float):
         raise DetectError(
-            f"{source}: no time for {image}: messages need one: give a file of rows "
-            "'prefix seconds' by --times, or --rate-hz"
+            f"{source}: no time for {image}: messages need one: give --times (a file of "
+            "rows 'prefix seconds') or --rate-hz"
         )
     time_ns = round(time_s * 1e9)
     if not 0 <= time_ns < 2**31 * 10**9:

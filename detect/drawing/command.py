@@ -28,9 +28,9 @@ from redetect.storage import demand_place, write_bytes
 
 
 def perform(options: Draw) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     if options.output is None and options.video is None:
-        raise DetectError("nowhere to draw to: expected a folder (-o) or a file (--video)")
+        raise DetectError("no output: expected a folder (-o) or a file (--video)")
     if not (isfinite(options.fps) and options.fps > 0.0):
         raise DetectError(f"fps is {options.fps:g}: expected above 0")
     demand_recording(options.run)
@@ -40,7 +40,7 @@ def perform(options: Draw) -> int:
     if not isinstance(run, Run) and set(rows.detected) != {"markers"}:
         raise DetectError(
             f"{options.run}: no calibration: expected a .cam file in it, or one named by --camera; "
-            "only markers can be drawn without"
+            "without one, only markers can be drawn"
         )
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
@@ -62,10 +62,10 @@ def draw_run(
     run: ImageRun, rows: RunRows, folder: Path | None, plan: FramePlan | None = None,
     *, video: Video | None = None, overwrite: bool,
 ) -> tuple[int, list[str]]:  # fmt: skip
-    """Draw rows into the images of a run: PNG files in a folder, and what a video takes.
+    """Draw rows into the images of a run, to PNG files in a folder, and to a video.
 
-    With the plan of their detection, verticals are drawn as tracks, and markers with what is none.
-    Returns how many pictures there are, and why some frames have none.
+    With the plan of their detection, verticals are drawn as tracks, and markers with the rejected
+    candidates. Returns the number of pictures, and the reasons why frames have none.
     """
     drawn, failures = 0, list[str]()
     sight = rows.sight(run.camera) if isinstance(run, Run) else None
@@ -96,9 +96,9 @@ def draw_run(
 
 @contextmanager
 def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
-    """A video that appears once it is complete; yields what takes its pictures.
+    """A video file, written once it is complete; yields a function that adds a picture.
 
-    Raises DetectError if OpenCV cannot write such videos, or pictures are not all of one size.
+    Raises DetectError if OpenCV cannot write such videos, or pictures differ in size.
     """
     writer = cv2.VideoWriter()
     size: tuple[int, int] | None = None
@@ -108,7 +108,7 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
 
         def add(picture: ByteArray) -> None:
             nonlocal size
-            # The coder wants even numbers of rows and columns.
+            # The encoder needs even numbers of rows and columns.
             height, width = picture.shape[:2]
             even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if size is None:
@@ -118,7 +118,7 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
                         f"{path}: this OpenCV cannot write MP4 videos: expected -o and a folder"
                     )
             if (even.shape[1], even.shape[0]) != size:
-                raise DetectError(f"{path}: pictures of several sizes: expected one for a video")
+                raise DetectError(f"{path}: pictures differ in size: expected one size for a video")
             writer.write(even)
 
         try:
@@ -126,5 +126,5 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
         finally:
             writer.release()
         if size is None:
-            raise DetectError(f"{path}: no picture: expected one at least for a video")
+            raise DetectError(f"{path}: no pictures: expected at least one for a video")
         write_bytes(path, raw.read_bytes(), overwrite=overwrite)

@@ -1,9 +1,9 @@
-"""Rows of one frame drawn into its image: discs, verticals, markers, tilt, and their residuals.
+"""Drawing of a frame's rows into its image: discs, verticals, markers, tilt, and their residuals.
 
-Outlines of discs go through the tilt of the frame, where the rows are corrected for it, and through
-the lens; verticals through the lens, with a bar of one standard deviation to each side where they
-cross the horizon (the report's figures 5, 6 and 8). Where there are reference rows, those that are
-missing are drawn as well, and rows that fit none have another colour.
+Outlines of discs are projected through the lens, and through the frame's tilt if rows are corrected
+for it; verticals through the lens, with error bars of one standard deviation at the horizon (the
+report's figures 5, 6 and 8). With reference rows, the missed ones are drawn as well, and unmatched
+rows have a different colour.
 """
 
 from __future__ import annotations
@@ -55,11 +55,10 @@ def draw_rows(
     settings: CircleSettings,
     title: str = "",
 ) -> ByteArray:
-    """Draw rows of a frame into its image (H, W), and words below it.
+    """Draw rows of a frame into its image (H, W), with a caption below it.
 
-    Without a calibrated camera only markers are drawn. The settings have the radii of the discs'
-    outlines. The picture (H + h, W, 3) is in OpenCV's
-    order blue, green, red.
+    Without a calibrated camera only markers are drawn. The settings contain the radii of the discs'
+    outlines. The channels of the picture (H + h, W, 3) are in OpenCV's order, blue, green, red.
     """
     canvas = canvas_of(image, None if sight is None else sight.camera)
     words = [title] if title else []
@@ -86,7 +85,7 @@ def draw_rows(
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
-    """Lines as they are seen through the lens: (N, P, 2) pixels from top to bottom.
+    """Distorted curves of lines: (N, P, 2) pixels from top to bottom.
 
     `ends` (N, 4) are xtop, ytop, xbottom, ybottom in undistorted normalised coordinates.
     """
@@ -95,11 +94,11 @@ def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
 
 
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Bars of one standard deviation of the bearing to each side of where lines cross the horizon.
+    """Error bars of one standard deviation of the bearing, at the lines' crossings of the horizon.
 
-    The horizon is that of the level robot; a line that ends before it is made longer. Of (N, 4)
-    `ends` as for `line_curves` and (N,) standard deviations, returns (N, 2, 2) pixels; NaN for
-    lines that do not cross the horizon before the camera.
+    The horizon is that of the level robot; lines that end before it are extended. `ends`: (N, 4),
+    as for `line_curves`; `sigma_rad`: (N,). Returns (N, 2, 2) pixels; NaN for lines that do not
+    cross the horizon in front of the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))
@@ -107,7 +106,7 @@ def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> Float
         share = top[:, 2] / (top[:, 2] - bottom[:, 2])
         x, y, _ = (top + share[:, None] * (bottom - top)).T
         bars = []
-        # Bearings grow to the left, from -Y towards X: turned about Z.
+        # Bearings increase to the left, from -Y towards X: a rotation about Z.
         for angle in (sigma_rad, -sigma_rad):
             sine, cosine = np.sin(angle), np.cos(angle)
             turned = np.column_stack([cosine * x - sine * y, sine * x + cosine * y, 0.0 * x])
@@ -182,7 +181,7 @@ def _outline_disc(
     text: str,
     edge_colour: Colour,
 ) -> None:
-    """Draw a detected disc's edge and its two outlines, and a word above."""
+    """Draw a detected disc's edge and its two outlines, with a label above."""
     centre_xy = np.array([row.px, row.py])
     for radius, colour in (
         (settings.inner_radius_m, _OUTLINE_COLOUR),
@@ -198,16 +197,16 @@ def _outline_disc(
 Colour = tuple[int, int, int]
 
 _SUBPIXEL_BITS = 4
-# OpenCV's fixed-point coordinates have 32 bits; curves that go far outside are not drawn.
+# OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Up to this many columns strokes are one pixel wide; wider pictures (of phones) get wider strokes.
+# Up to this width, strokes are one pixel wide; wider pictures (of phones) get wider strokes.
 _COLUMNS = 1500
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
     """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
 
-    Pixels that see nothing through the lens of the calibrated camera are dark and red.
+    Pixels without a direction in the camera's calibration are dark red.
     """
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if camera is not None and camera.seen_share < 1.0:
@@ -218,7 +217,7 @@ def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
 
 
 def png_of(picture: ByteArray) -> bytes:
-    """A picture, blue, green, red, as a PNG file."""
+    """A picture (blue, green, red) as a PNG file."""
     return cv2.imencode(".png", picture)[1].tobytes()
 
 
@@ -228,14 +227,14 @@ def _unseen(camera: Camera) -> BoolArray:
 
 
 def enlargement(canvas: ByteArray) -> int:
-    """How many times as wide strokes and words are, to be seen when the picture is shown whole."""
+    """Factor on strokes and text, so that they are visible when the whole picture is shown."""
     return max(1, round(int(canvas.shape[1]) / _COLUMNS))
 
 
 def draw_curve(
     canvas: ByteArray, points: FloatArray, colour: Colour, *, closed: bool = False
 ) -> None:
-    """Draw a curve through (N, 2) points u, v; nothing is drawn if one is not finite."""
+    """Draw a curve through (N, 2) points u, v, unless one is not finite."""
     if np.all(np.abs(points) < _FARTHEST_PX):
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         width = enlargement(canvas)
@@ -257,9 +256,9 @@ def draw_text(
     size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:
-    """Write in ASCII from u, v, the left end of the base line, if these are finite.
+    """Draw ASCII text with the left end of its base line at u, v, unless these are not finite.
 
-    `shift` moves the words, by more in wide pictures.
+    `shift` moves the text, by more in wide pictures.
     """
     place = np.asarray(at, dtype=np.float64)
     if np.isfinite(place).all():
@@ -274,7 +273,7 @@ def draw_text(
 def with_legend(
     canvas: ByteArray, words: Sequence[tuple[str, Colour]], column_px: int, size: float
 ) -> ByteArray:
-    """The picture, and below it words in columns of some width."""
+    """The picture with text below it, in columns of a given width."""
     times = enlargement(canvas)
     width = int(canvas.shape[1])
     per_row = max(1, width // (column_px * times))
@@ -290,7 +289,7 @@ _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def _colours(names: Sequence[str]) -> dict[str, Colour]:
-    """Colours that stay apart, always the same; that of the first is of what was found."""
+    """Distinct colours, always the same; the first is for accepted ones."""
     hues = np.linspace(128, 298, len(names)) % 256  # from cyan to yellow: no green
     colours = cv2.applyColorMap(hues.astype(np.uint8)[:, None], cv2.COLORMAP_HSV)[:, 0]
     pale = (75 + 0.7 * colours[1:]).astype(int).tolist()
@@ -313,7 +312,7 @@ def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -
 
 
 def draw_candidates(picture: ByteArray, found: MarkerDetections) -> ByteArray:
-    """The picture with candidates that are no markers, and below it why any were rejected."""
+    """The picture with rejected candidates for markers, and the reasons for rejection below it."""
     for candidate in found.candidates:
         if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
             draw_curve(picture, candidate.outline, _CANDIDATE_COLOUR, closed=True)
@@ -329,7 +328,7 @@ def draw_disc_candidates(
     candidates: Sequence[Candidate],
     at: tuple[float, float] | None = None,
 ) -> ByteArray:
-    """Draw candidates for discs by what became of them, numbered as they come, with a legend."""
+    """Draw candidates for discs, coloured by their fates and numbered in order, with a legend."""
     canvas = canvas_of(image, camera)
     for number, candidate in enumerate(candidates, start=1):
         colour = _STAGE_COLOURS[candidate.stage]

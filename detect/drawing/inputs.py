@@ -1,4 +1,4 @@
-"""Rows of a run from files, and the heads of these files."""
+"""Rows of a run from files, and the heads of those files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from detect.sources.interface import ImageRun
 from redetect.landmarks import Frame, FrameTilt, read_tilts
 
 KINDS = ("circles", "lines", "markers", "tilt")
-# The head is what precedes the first row; real ones are much shorter.
+# The head is the part before the first row; real ones are much shorter.
 _LONGEST_BYTES = 1 << 16
 
 
@@ -30,16 +30,16 @@ _LONGEST_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class FileHead:
-    """The head of a file of rows, as far as it is understood.
+    """The known parts of the head of a file of rows.
 
-    Settings are the defaults where it does not give them; a DetectError is raised if one has a
-    value that none can have.
+    Settings that it does not contain have their defaults; a DetectError is raised if one has an
+    impossible value.
     """
 
-    comments: tuple[str, ...] = ()  # its lines without the signs of comment
-    settings: tuple[tuple[str, str], ...] = ()  # names and values, as they are written
+    comments: tuple[str, ...] = ()  # its lines without comment signs
+    settings: tuple[tuple[str, str], ...] = ()  # names and values, as written
     level: bool = False  # positions are corrected for the frames' tilts, or true level ones
-    name: str = ""  # what messages call the file
+    name: str = ""  # of the file, for messages
 
     @property
     def circle_settings(self) -> CircleSettings:
@@ -82,7 +82,7 @@ def read_head(path: Path) -> FileHead:
 
 @dataclass(frozen=True)
 class SeenRows:
-    """What files have of one image: None where there is no file, or it does not have the image."""
+    """Rows of one image: None for kinds without a file, or whose file lacks the image."""
 
     circles: Frame | None = None
     lines: Frame | None = None
@@ -94,7 +94,7 @@ class SeenRows:
 
 
 class RunRows:
-    """The files of a run's rows, detected and reference by kind; in memory: offsets of frames."""
+    """Files of a run's detected and reference rows by kind; only their indices are in memory."""
 
     def __init__(
         self, detected: Mapping[str, Path], reference: Mapping[str, Path] = MappingProxyType({})
@@ -112,7 +112,7 @@ class RunRows:
 
     @cached_property
     def circle_settings(self) -> CircleSettings:
-        """The settings that discs were detected with."""
+        """The settings with which discs were detected."""
         return self.heads.get("circles", FileHead()).circle_settings
 
     def of(self, prefix: str) -> SeenRows:
@@ -121,7 +121,7 @@ class RunRows:
         return SeenRows(**frames, tilt=self._tilts.get(prefix))
 
     def sight(self, camera: Camera) -> Sight:
-        """How discs come back into the images of a camera."""
+        """The projection of discs into the images of a camera."""
         level = "circles" in self.reference and read_head(self.reference["circles"]).level
         return Sight(camera, self.circle_settings.radius_m, level)
 
@@ -129,7 +129,7 @@ class RunRows:
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     """Find the files of a run's rows, and index them.
 
-    Raises DetectError if there is none, or reference rows that are named are not there, and
+    Raises DetectError if there are none, or given reference rows do not exist, and
     redetect.landmarks.LandmarkFileError if one is malformed.
     """
     usual = {
@@ -154,5 +154,5 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
 
 
 def picture_name(prefix: str) -> str:
-    """Name of an image's picture without its ending: nothing that leads out of a folder."""
+    """Name of an image's picture without its ending, which cannot lead out of a folder."""
     return image_name(prefix) or "frame"
