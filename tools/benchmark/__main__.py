@@ -81,26 +81,26 @@ class Benchmark(Study):
         run = open_run(self.run)
         detectors = f.whole_detectors(run.camera)
         print(f"- {this_machine()}\n- settings: {self}\n")
-        print("Median processor time per image, in times that decoding the same image takes "
+        print("Median processor time per image, relative to decoding the same image "
               "(quartiles; milliseconds):\n")  # fmt: skip
         self._print_table(self._kinds(run))
-        print("\nOver the size of the image, Mpixel:\n")
+        print("\nBy size of the image, Mpixel:\n")
         self._print_table(self._sizes(run))
         seeds = range(self.seed, self.seed + _GROWTH_PICTURES)
         places = disc_places(run.camera, max(self.landmarks, default=0), self.seed)
-        print("\nOver the discs in the image:\n")
+        print("\nBy number of discs in the image:\n")
         self._print_table(
             (str(n), [jpeg_picture(floor_with_discs(run.camera, places[:n], s)) for s in seeds],
              detectors)
             for n in self.landmarks
         )  # fmt: skip
-        print("\nOver the vertical edges in the image:\n")
+        print("\nBy number of vertical edges in the image:\n")
         self._print_table(
             (str(n), [jpeg_picture(wall_with_edges(run.camera, n, s)) for s in seeds], detectors)
             for n in self.landmarks
         )
-        print("\nWhole runs, files in, files out, by the clock on the wall; one core that only "
-              "decodes the same files, or reads and decodes them, for comparison:\n")  # fmt: skip
+        print("\nWhole runs, from files to files, by wall clock; for comparison, one core that only "
+              "decodes the same files, or reads and decodes them:\n")  # fmt: skip
         head = ("command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
                 "times one job", "decoding alone", "with reading")  # fmt: skip
         table = Table(dict.fromkeys(head, "<"), keys=3)
