@@ -99,8 +99,8 @@ class Benchmark(Study):
             (str(n), [jpeg_picture(wall_with_edges(run.camera, n, s)) for s in seeds], detectors)
             for n in self.landmarks
         )
-        print("\nWhole runs, from files to files, by wall clock; for comparison, one core that only "
-              "decodes the same files, or reads and decodes them:\n")  # fmt: skip
+        print("\nWhole runs, from files to files, by wall clock; for comparison, one core that "
+              "only decodes the same files, or reads and decodes them:\n")  # fmt: skip
         head = ("command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
                 "times one job", "decoding alone", "with reading")  # fmt: skip
         table = Table(dict.fromkeys(head, "<"), keys=3)
