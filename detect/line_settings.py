@@ -43,9 +43,9 @@ class LineSettings:
     threshold: ShareAbove0 = 0.12  #: Least response of a point, 0 to 1; an ideal step has 2/pi.
     #: Number of rows to ignore at the upper and lower border.
     border_rows: Annotated[int, whole(0)] = 2
-    #: Tracks start on the horizon and on rows up to this far from it,
+    #: Tracks start on the horizon and on rows up to this far from it.
     start_band_rows: Annotated[int, whole(0)] = 20
-    start_spacing_rows: Annotated[int, whole(1)] = 4  #: on every n-th of them.
+    start_spacing_rows: Annotated[int, whole(1)] = 4  #: Only every n-th of these rows is used.
     gap_rows: Annotated[int, whole(0)] = 6  #: Largest gap that a track bridges, rows.
     #: Whether tracks predict straight lines; else they follow any curve.
     guided: bool = True
@@ -62,17 +62,17 @@ class LineSettings:
         (0.8, 1.5),
         (1.8, 0.1),
     )
-    fine_scale_px: Positive = 0.8  #: Fine width at which an edge's contrast is measured, and
-    #: the coarse one: the ratio of the contrasts is the edge's sharpness.
+    fine_scale_px: Positive = 0.8  #: Fine width at which an edge's contrast is measured.
+    #: Coarse width; the ratio of the contrasts at both is the edge's sharpness.
     coarse_scale_px: Positive = 1.6
     least_rows: Annotated[int, whole(5)] = 14  #: Least number of points of a line.
     least_length_px: NotNegative = 24.0  #: The same as a length.
     #: Least evidence: responses summed over the length in pixel widths, times squared sharpness.
     least_evidence: NotNegative = 7.0
     #: Least sharpness of edges fainter than the image's median, relative to the lower quartile of
-    #: the sharpness: fainter and softer edges are shadows and glare,
+    #: the sharpness: fainter and softer edges are shadows and glare.
     least_sharpness: NotNegative = 0.87
-    soft_evidence: NotNegative = 40.0  #: unless they have this evidence.
+    soft_evidence: NotNegative = 40.0  #: Such edges are kept if they have at least this evidence.
     #: Largest distance of a line's end from the horizon (or from the anchor that replaces it if the
     #: horizon is not visible: `lut.verticals`).
     largest_horizon_gap_px: LimitOr0 = 11.0
@@ -86,9 +86,10 @@ class LineSettings:
     #: Variance of a line's lean due to noise, relative to that of noise which is independent from
     #: row to row: the surroundings of an edge and its blur are correlated over many rows.
     lean_noise: NotNegative = 3.0
-    largest_lean_deg: LimitOr0 = 0.7  #: Largest lean of a line from the vertical: this angle,
-    largest_lean_sigmas: LimitOr0 = 8.0  #: this many standard deviations due to noise,
-    largest_lean_px: LimitOr0 = 1.5  #: and this many pixels over its length, added in quadrature.
+    #: Largest lean of a line from the vertical; the next two are added in quadrature.
+    largest_lean_deg: LimitOr0 = 0.7
+    largest_lean_sigmas: LimitOr0 = 8.0  #: The same in standard deviations due to noise.
+    largest_lean_px: LimitOr0 = 1.5  #: The same in pixels over the line's length.
     largest_tilt_deg: Positive = 8.0  #: Largest absolute pitch and roll.
     #: Prior standard deviation of the tilt; decides only between tilts with equal support.
     tilt_prior_deg: Positive = 2.0
@@ -110,14 +111,14 @@ class LineSettings:
     #: all have equal weight, and ends and inclination are means, too, as in the data set's own
     #: rows.
     joined: Joining = "evidence"
-    #: Lines closer than this to another one are lighting effects beside an edge, and are dropped,
+    #: Fainter lines closer than this to another one are lighting effects of its edge: dropped.
     shoulder_px: NotNegative = 5.0
-    shoulder_share: NotNegative = 0.5  #: if they have at most this share of its contrast.
+    shoulder_share: NotNegative = 0.5  #: Fainter: at most this share of the other's contrast.
     #: Standard deviation of an edge about the building's line that causes it.
     sigma_px: Positive = 0.9
-    #: Images with a median sharpness of edges below this are processed again,
+    #: Images with a median sharpness of edges below this are processed again with a wider filter.
     blurred_sharpness: Share = 0.62
-    #: with a filter wider by the one of these factors that suits the blur (see
+    #: Factors on the filter's widths, of which one is chosen by the blur (see
     #: `detect.verticals.blur`); none: never.
     blurred_widths: Annotated[tuple[float, ...], _WIDTH] = (1.5, 2.0, 3.0, 4.0, 6.0)
     #: Bearings compensated for the tilt, or with the sign of the data set's own rows.

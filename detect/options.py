@@ -211,8 +211,8 @@ class CompareOptions:
     #: Match discs on the floor within this distance, metres. By default they are matched in the
     #: image if there is a calibration, and within 0.1 m otherwise.
     gate_m: Annotated[MaybeFloat, ABOVE_0] = None
-    tolerance_deg: Positive = 0.5  #: Largest difference of bearings of the same line,
-    sigmas: NotNegative = 2.0  #: or this many standard deviations of the detected one.
+    tolerance_deg: Positive = 0.5  #: Largest difference of bearings of the same line, degrees.
+    sigmas: NotNegative = 2.0  #: The same in standard deviations; the larger of both applies.
     #: Count only reference rows that have an ID. Detected rows that match a reference row without
     #: one are set aside, neither right nor wrong.
     only_identified: bool = False

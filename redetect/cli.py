@@ -68,7 +68,7 @@ def _help() -> str:
 
 
 _HEAD = (
-    "Landmarks with covariances from a calibrated camera's images, and what is done with them.\n\n"
+    "Landmarks with covariances from a calibrated camera's images, and their uses.\n\n"
     "Example: redetect detect all images/e"
 )
 

@@ -92,8 +92,8 @@ class Audit(RunFlags):
     apply: Literal["mend", "drop"] = "mend"
     pictures: MaybePath = None  # Folder for pictures of what the rows show.
     images: MaybePath = None  # Folder of the run's images; by default that of the rows.
-    # The landmark file to write; by default audited.circles in the run folder. The list goes
-    # into a .csv beside.
+    # The landmark file to write; by default audited.circles in the run folder. The rows
+    # are listed in a .csv beside it.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
 
 
@@ -197,7 +197,7 @@ class Export(RunFlags):
 
 @dataclass(frozen=True)
 class Import:
-    """Read other tools' and data sets' files into this project's.
+    """Convert files of other tools and data sets to this project's formats.
 
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles
     """
