@@ -1,1 +1,1 @@
-"""What `import redetect` offers: typed results round the functions of the other packages."""
+"""The API of `import redetect`: typed results around the functions of the other packages."""

@@ -1,4 +1,4 @@
-"""Discs, verticals and tilt in one image, and why discs were found in it, or not."""
+"""Discs, verticals and tilt in one image, and why discs are found in it or not."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Discs(Table):
     Attributes
     ----------
     u, v : (N,) float64
-        Where the image shows the fitted centre, pixels; (0, 0) is the centre of the top left one.
+        Fitted centre in the image, pixels; (0, 0) is the centre of the top left one.
     xy : (N, 2) float64
         Position on the floor, metres, levelled if the tilt is known.
     covariance : (N, 2, 2) float64
@@ -49,7 +49,7 @@ class Discs(Table):
     quality : (N,) float64
         Otsu's quality of the grey values inside and outside the edge, 0 to 1.
     evidence : (N,) float64
-        Log-odds that it is a disc; NaN where nothing was fitted.
+        Log-odds that it is a disc; NaN if nothing was fitted.
     """
 
     u: FloatArray
@@ -82,7 +82,7 @@ class Verticals(Table):
     Attributes
     ----------
     bearing_rad : (N,) float64
-        0 forward, positive to the left, in either axes.
+        0 forward, positive to the left, whatever the axes.
     sigma_rad : (N,) float64
         Standard deviations of the bearings.
     inclination_rad : (N,) float64
@@ -115,17 +115,17 @@ class Verticals(Table):
 
 @dataclass(frozen=True, eq=False)
 class Tilt:
-    """How the robot tilts, by the verticals.
+    """The robot's tilt, from the verticals.
 
     Attributes
     ----------
     pitch_rad, roll_rad : float
-        Rotation that turns measured directions level: about the robot's axis to the left (pitch)
-        and about the other one (roll): X and Y of the data set's axes, Y and X of REP 103's.
+        Rotation that levels measured directions: about the robot's axis to the left (pitch) and
+        about the other one (roll), that is X and Y of the data set's axes, Y and X of REP 103's.
     covariance : (2, 2) float64
         Of (pitch, roll), square radians.
     lines : int
-        Verticals that agree with it.
+        Number of verticals that agree with it.
     """
 
     pitch_rad: float
@@ -136,14 +136,14 @@ class Tilt:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Detection(Table):
-    """What was found in one image.
+    """Detections in one image.
 
     Attributes
     ----------
     discs : Discs
     verticals : Verticals
     tilt : Tilt or None
-        None where too few verticals determine it: then the discs' covariances contain that of an
+        None if too few verticals determine it; the discs' covariances then include that of an
         unknown tilt (`CircleSettings.tilt_sigma_deg`).
     axes : {"dataset", "robotics"}
         Of floor positions and tilt: X left and Y backward, or REP 103's X forward and Y left.
@@ -153,9 +153,9 @@ class Detection(Table):
     camera : Camera
     settings : CircleSettings
     frame : redetect.landmarks.Frame
-        The same as rows of files, in the data set's axes: for `redetect.landmarks.write_frames`.
+        The same as rows of files, in the data set's axes, for `redetect.landmarks.write_frames`.
     frame_tilt : redetect.landmarks.FrameTilt or None
-        The tilt likewise, as the row of a `.tilt` file.
+        The tilt as the row of a `.tilt` file.
     """
 
     discs: Discs
@@ -170,7 +170,7 @@ class Detection(Table):
     frame_tilt: FrameTilt | None
 
     def columns(self) -> dict[str, Any]:
-        """Discs, then verticals, one row each; what a kind does not have is NaN."""
+        """Discs, then verticals, one row each; columns of the other kind are NaN."""
         parts: dict[str, Discs | Verticals] = {"disc": self.discs, "vertical": self.verticals}
         columns: dict[str, Any] = {
             "kind": [kind for kind, part in parts.items() for _ in range(len(part))]
@@ -194,7 +194,7 @@ class Detection(Table):
         return json.dumps(content, indent=1, allow_nan=False)
 
     def picture(self) -> NDArray[np.uint8]:
-        """(H + h, W, 3) the image with what was found, in OpenCV's order blue, green, red."""
+        """(H + h, W, 3) the image with the detections, in OpenCV's order blue, green, red."""
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
         sight = Sight(self.camera, self.settings.radius_m)
         return draw_rows(self.image, sight, rows, self.settings, self.name)
@@ -228,7 +228,7 @@ def detect(
     settings: CircleSettings | None = None,
     line_settings: LineSettings | None = None,
 ) -> Detection:
-    """Find discs, verticals and tilt in one image.
+    """Detect discs, verticals and tilt in one image.
 
     Parameters
     ----------
@@ -239,15 +239,15 @@ def detect(
     radius_m : float, optional
         Radius of the discs, metres; by default that of the settings.
     polarity : {"any", "light", "dark"}, optional
-        Which discs to find; by default as the settings say.
+        Which discs to detect; by default that of the settings.
     level : bool
-        Correct the discs' positions by the tilt that the verticals show.
+        Correct the discs' positions for the tilt from the verticals.
     axes : {"dataset", "robotics"}
-        Of the result: X left and Y backward, or REP 103's X forward and Y left.
+        Axes of the result: X left and Y backward, or REP 103's X forward and Y left.
     settings : CircleSettings, optional
-        Of the detector of discs.
+        Settings of the disc detector.
     line_settings : LineSettings, optional
-        Of the detector of verticals.
+        Settings of the detector of verticals.
 
     Returns
     -------
@@ -256,7 +256,7 @@ def detect(
     Raises
     ------
     detect.errors.FrameError
-        If the image cannot be read, is no grey image of 8 bits, or not of the camera's size.
+        If the image cannot be read, is not an 8-bit grey image, or not of the camera's size.
     detect.errors.DetectError
         If a setting is out of its range.
     camera.CameraError
@@ -274,7 +274,7 @@ class RecordedFrame:
     Attributes
     ----------
     frame : detect.sources.interface.RunFrame
-        Its odometry step, and where its image comes from.
+        Its odometry step and the source of its image.
     camera : Camera
     """
 
@@ -288,12 +288,12 @@ class RecordedFrame:
 
     @property
     def time_s(self) -> float | None:
-        """When it was taken, if that is known."""
+        """Time of the image, if known."""
         return self.frame.time_s
 
     @property
     def step(self) -> Step:
-        """The robot's movement since the frame before."""
+        """The robot's motion since the previous frame."""
         return self.frame.step
 
     @cached_property
@@ -311,7 +311,7 @@ class RecordedFrame:
         settings: CircleSettings | None = None,
         line_settings: LineSettings | None = None,
     ) -> Detection:
-        """Find discs, verticals and tilt: see `detect`."""
+        """Detect discs, verticals and tilt: see `detect`."""
         chosen = settings_of(settings, radius_m, polarity)
         plan = FramePlan(
             self.camera,
@@ -328,7 +328,7 @@ class RecordedFrame:
 def settings_of(
     settings: CircleSettings | None, radius_m: float | None, polarity: Polarity | None
 ) -> CircleSettings:
-    """Settings with what was named apart from them."""
+    """Settings with the radius and polarity that are given separately."""
     settings = settings or CircleSettings()
     return replace(
         settings,
@@ -338,12 +338,12 @@ def settings_of(
 
 
 def camera_of(camera: CameraLike) -> Camera:
-    """A camera, or that of a file."""
+    """The given camera, or the one in the given file."""
     return camera if isinstance(camera, Camera) else read_camera(camera)
 
 
 def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
-    """A picture as HTML, its content in it."""
+    """A picture as HTML with embedded content."""
     content = base64.b64encode(png_of(picture)).decode()
     return f'<img alt="{html.escape(name)}" src="data:image/png;base64,{content}"/>'
 
@@ -354,7 +354,7 @@ def frame_of_image(image: ImageLike) -> RunFrame:
         if image.ndim != 2 or image.dtype != np.uint8:
             raise FrameError(
                 f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 "
-                "of shape (H, W); files of colours or 16 bits can be named by their path"
+                "of shape (H, W); give colour or 16-bit images as files"
             )
         return RunFrame(still("image"), None, content=np.ascontiguousarray(image))
     path = Path(image)
@@ -403,7 +403,7 @@ def _detection(
 def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     if tilt is None:
         return None
-    # About X forward instead of Y backward, the rotation of the same sense is the negative one.
+    # About X forward instead of Y backward, the same rotation has the opposite sign.
     sign = 1.0 if axes == "dataset" else -1.0
     covariance = np.array([[tilt.cpp, sign * tilt.cpr], [sign * tilt.cpr, tilt.crr]])
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
@@ -416,16 +416,16 @@ def _records(table: Table) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Explanation(DiscExplanation, Table):
-    """Candidates of an image with the stage and the number that dropped them, and what to try.
+    """Candidates of an image with the stage and the number that rejected them, and suggestions.
 
     Attributes
     ----------
     candidates : tuple of detect.discs.unfound.Candidate
-        Those that were found first, then by falling votes.
+        Accepted ones first, then in order of decreasing votes.
     place : str
-        Of the pixel that was pointed at; empty without one.
+        Description of the given pixel; empty without one.
     suggestions : tuple of str
-        Flags or settings to try, and what they would find.
+        Flags or settings to try, with their results.
     """
 
     image: NDArray[np.uint8]
@@ -474,12 +474,12 @@ def explain(
     *,
     settings: CircleSettings | None = None,
 ) -> Explanation:
-    """Explain what became of the candidates for discs in an image.
+    """Explain why candidates for discs in an image are accepted or rejected.
 
     Parameters
     ----------
     image, camera, radius_m, polarity, settings
-        As of `redetect.interface.detection.detect`.
+        As for `redetect.interface.detection.detect`.
     at : (float, float), optional
         Pixel (u, v) of something that should have been found.
 
@@ -490,7 +490,7 @@ def explain(
     Raises
     ------
     detect.errors.FrameError
-        If the image cannot be read, is no grey image of 8 bits, or not of the camera's size.
+        If the image cannot be read, is not an 8-bit grey image, or not of the camera's size.
     camera.CameraError
         If the calibration cannot be read.
     """

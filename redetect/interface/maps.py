@@ -1,4 +1,4 @@
-"""Maps by least squares, and localisation in them."""
+"""Least-squares maps, and localisation in them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Poses(Table):
         self.path = path
 
     def columns(self) -> dict[str, Any]:
-        """One row per pose; covariances where the path has them."""
+        """One row per pose, with covariances if the path has them."""
         columns: dict[str, Any] = {
             "prefix": list(self.path.prefixes),
             "x_m": self.path.poses[:, 0],
@@ -59,16 +59,16 @@ class Poses(Table):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunMap(Table):
-    """A map of a run by least squares; its frame is the robot's at the start, X left, Y backward.
+    """Least-squares map of a run; its frame is the robot's at the start, X left, Y backward.
 
     Attributes
     ----------
     discs, lines : redetect.landmarks.map_file.Landmarks
-        Identifiers, places (m) and covariances (m^2).
+        Identifiers, positions (m) and covariances (m^2).
     path : redetect.landmarks.map_file.Path2D
         Poses with covariances: the start, and one after each step.
     result : redetect.slam.mapping.run_map.MappedRun
-        How it came about: residuals, what was left out, the camera's mounting.
+        Details: residuals, ignored rows, the camera's mounting.
     """
 
     discs: Landmarks
@@ -105,7 +105,7 @@ class RunMap(Table):
         Parameters
         ----------
         folder : path
-            Made if need be.
+            Created if necessary.
         overwrite : bool
             Whether existing files may be replaced; else `redetect.storage.OutputExistsError`.
         """
@@ -115,7 +115,7 @@ class RunMap(Table):
         write_path(place / PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:
-        """(2 M, 2 M) covariance of all places, discs first (m^2)."""
+        """(2 M, 2 M) covariance of all positions, discs first (m^2)."""
         return self.result.landmarks_jointly().joint_covariance
 
     def _repr_png_(self) -> bytes:
@@ -131,7 +131,7 @@ class Localization(Poses):
     path : redetect.landmarks.map_file.Path2D
         Poses with covariances: the start, and one after each step.
     result : redetect.slam.filters.frames.FilterRun
-        What became of the rows.
+        Details, such as the use of the rows.
     landmarks : redetect.landmarks.map_file.LandmarkMap
         The map.
     """
@@ -141,7 +141,7 @@ class Localization(Poses):
     landmarks: LandmarkMap
 
     def distance(self, reference: Path2D) -> Mapping[str, float]:
-        """How far the path is from another one of the same run in the same map, m and rad."""
+        """Distance from another path of the same run in the same map, m and rad."""
         return path_distance(self.path, reference.poses)
 
     def _repr_png_(self) -> bytes:

@@ -1,4 +1,4 @@
-"""Runs: the frames of a recording, and how detected rows compare with reference rows."""
+"""Runs: the frames of a recording, and comparison of detected with reference rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PathLike = str | os.PathLike[str]
 
 
 class Recording:
-    """The frames of a run, in their order; iterating again starts over.
+    """The frames of a run, in order; each iteration starts again.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Recording:
 
     @property
     def expected(self) -> int | None:
-        """Approximate number of frames, if it is known."""
+        """Approximate number of frames, if known."""
         return self._run.frames.expected
 
     def __repr__(self) -> str:
@@ -67,7 +67,7 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
     Raises
     ------
     detect.errors.DetectError
-        If there is no such thing, it cannot be read, or there is no calibration.
+        If the source does not exist or cannot be read, or there is no calibration.
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read.
     """
@@ -102,12 +102,12 @@ def compare(
     camera : Camera, or path, optional
         Calibration; by default the one in the run folder.
     options : CompareOptions, optional
-        Which rows are the same landmark, and which count.
+        How rows are matched, and which rows count.
 
     Returns
     -------
     DiscComparison or LineComparison
-        Its `sentences()` say in words what came out.
+        Its `sentences()` summarise the result in words.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def compare(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     detect.errors.CompareError
-        If an image has two frames, or a covariance that is needed is not positive definite.
+        If an image has two frames, or a required covariance is not positive definite.
     """
     options = options or CompareOptions()
     in_file = None if reference is None else Path(reference)

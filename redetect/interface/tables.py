@@ -16,19 +16,19 @@ from redetect.storage.messages import OneLineError
 
 FrameLibrary = Literal["pandas", "polars"]
 
-#: Rows of a table that a notebook shows.
+#: Number of rows that a notebook shows.
 _MOST_SHOWN = 20
 
 
 class ResultError(OneLineError, ValueError):
-    """A result that cannot be given in the form that was asked for."""
+    """A result that cannot be converted to the requested form."""
 
 
 class Table:
-    """Something with columns; every result of the library is one."""
+    """A result with columns; base class of all results."""
 
     def columns(self) -> dict[str, Sequence[Any]]:
-        """Columns of equal length by their names, which end with their units."""
+        """Columns of equal length by name; names end with the unit."""
         raise NotImplementedError
 
     def to_dataframe(self, library: FrameLibrary | None = None) -> Any:
@@ -54,7 +54,7 @@ class Table:
         )
 
     def to_json(self) -> str:
-        """The columns as a JSON object of lists; what is not finite is null."""
+        """The columns as a JSON object of lists; numbers that are not finite are null."""
         return json.dumps(plain(self.columns()), indent=1, allow_nan=False)
 
     def __repr__(self) -> str:
@@ -67,7 +67,7 @@ class Table:
 
 
 def plain(value: Any) -> Any:
-    """Arrays, tuples and mappings as lists and dicts of numbers that JSON has."""
+    """Convert arrays, tuples and mappings to lists and dicts with JSON's types."""
     if isinstance(value, Mapping):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, np.ndarray | np.generic):

@@ -1,6 +1,6 @@
-"""Landmark records as arrays and back; which row of one set is which row of another.
+"""Landmark records as arrays and back; matching of the rows of two sets.
 
-Pairs are gated, one to one, optimal.
+Matching is gated, one to one, and optimal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class CircleArrays:
     xy: FloatArray  #: (N, 2) centres in the robot frame (m)
     quality: FloatArray  #: (N,) confidence, 0 to 1
     covariance: FloatArray  #: (N, 2, 2) of `xy` (m^2)
-    ids: IntArray  #: (N,) each row's first identifier that is known; -1 where none is
+    ids: IntArray  #: (N,) each row's first known identifier; -1 if there is none
 
 
 def circle_arrays(circles: Sequence[CircleLandmark]) -> CircleArrays:
@@ -52,7 +52,7 @@ def circle_landmarks(
     covariance : (N, 2, 2) array_like
         Of `xy` (m^2).
     ids : (N,) array_like of int, optional
-        Identifiers, -1 where unknown; by default the rows have none.
+        Identifiers, -1 if unknown; by default the rows have none.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def circle_landmarks(
 
 
 def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArray:
-    """Which covariance matrices are positive definite, that is, can be inverted and used.
+    """Which covariance matrices are positive definite, and thus invertible and usable.
 
     Covariances are read from files unchecked; callers that need valid ones check them here.
 
@@ -81,8 +81,8 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
     covariance : (..., n, n) array_like
         Symmetric matrices.
     least : float
-        What the smallest eigenvalue of the correlations must be above: where it is not, two
-        quantities are one.
+        The smallest eigenvalue of the correlation matrix must be above this; otherwise quantities
+        are linearly dependent.
 
     Returns
     -------
@@ -105,20 +105,20 @@ IndexArray = NDArray[np.intp]
 class Association:
     """Pairs of rows of two sets; no row is in two pairs."""
 
-    #: (M,) the pairs: row `first[k]` of the first set belongs to row `second[k]` of the second.
-    #: `first` ascends.
+    #: (M,) the pairs: row `first[k]` of the first set matches row `second[k]` of the second.
+    #: `first` is in ascending order.
     first: IndexArray
     second: IndexArray
-    #: The rows of each set that are in no pair, ascending
+    #: The unmatched rows of each set, in ascending order
     first_alone: IndexArray
     second_alone: IndexArray
 
 
 def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
-    """Pair the rows of two sets: as many pairs as possible, and of those the least total cost.
+    """Pair the rows of two sets: as many pairs as possible, with the least total cost.
 
-    A linear assignment problem. Deterministic; where several solutions have the same number of
-    pairs and the same cost, which one comes out may depend on the order of the rows.
+    This is a linear assignment problem. The result is deterministic; if several solutions have the
+    same number of pairs and the same cost, it may depend on the order of the rows.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
         raise ValueError(f"costs {cost.shape}, allowed {gate.shape}: expected both (N, M)")
     if not (np.isfinite(cost[gate]) & (cost[gate] >= 0)).all():
         raise ValueError("a cost is negative or not finite where a pair is allowed")
-    # One forbidden pair costs more than all allowed ones together: no more are taken than must.
+    # One forbidden pair costs more than all allowed ones together: as few as possible are used.
     scale = cost[gate].max(initial=0.0) or 1.0
     forbidden = 1.0 + min(cost.shape)
     weights = np.full(cost.shape, forbidden)
@@ -158,7 +158,7 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
 
 
 def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -> Association:
-    """Pair positions that lie within `gate_m` of each other, with least squared distances.
+    """Pair positions within `gate_m` of each other, with least squared distances.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
 
 
 def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
-    """Bring angles into [-pi, pi) (rad)."""
+    """Wrap angles to [-pi, pi) (rad)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
 

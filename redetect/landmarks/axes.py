@@ -1,13 +1,13 @@
 """Axes of the data set's robot, and those of other tools.
 
-The data set's robot has X left and Y backward; other tools expect X forward and Y left. One
-rotation about Z by a quarter turn, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, leads
-from the first to the second. It is applied to the robot's frame and to the map's alike: a pose or
-step T becomes Rz T Rz^-1, that is, its position is rotated and its angle stays. Covariances become
-Rz C Rz^T; rotating the means alone would leave ellipses across instead of along. Bearings count
-from forward, positive to the left, in both.
+The data set's robot has X left and Y backward; other tools expect X forward and Y left. A rotation
+about Z by 90 degrees, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, converts the first
+to the second. It is applied to both the robot's frame and the map's: a pose or step T becomes
+Rz T Rz^-1, that is, its position is rotated and its angle is unchanged. Covariances become
+Rz C Rz^T; if only the means were rotated, ellipses would have the wrong orientation. Bearings are
+0 forward, positive to the left, in both.
 
-All is done by exchanging numbers and signs: nothing is rounded, and there and back gives the same
+Only numbers and signs are exchanged: nothing is rounded, and the conversion back gives the same
 bits.
 """
 
@@ -22,22 +22,22 @@ from redetect.array_types import FloatArray, IntArray
 
 Axes = Literal["robotics", "dataset"]
 
-#: What each kind of axes means.
+#: Meaning of the axes.
 MEANING: dict[str, str] = {
     "robotics": "X forward, Y left",
     "dataset": "X left, Y backward",
 }
 
-# Which of the old coordinates becomes the new first, second, third, and with which sign; on the way
-# back it is the sign of the first two that differs.
+# Indices and signs of the old coordinates that become the new first, second and third; for the
+# conversion back, the signs of the first two differ.
 _ORDER = np.array([1, 0, 2])
 _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
 def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = False) -> FloatArray:
-    """Vectors, poses or steps in the data set's axes, brought into others, or `back`.
+    """Convert vectors, poses or steps from the data set's axes to others, or `back`.
 
-    Takes (..., 2) or (..., 3): x, y and, of poses and steps, the angle; returns the same shape.
+    Takes (..., 2) or (..., 3): x, y and, for poses and steps, the angle; returns the same shape.
     """
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
@@ -54,7 +54,7 @@ def to_dataset(values: ArrayLike) -> FloatArray:
 def covariance_from_dataset(
     covariance: ArrayLike, axes: Axes = "robotics", *, back: bool = False
 ) -> FloatArray:
-    """Covariances (or information matrices) (..., d, d) of what `from_dataset` turns, turned."""
+    """Convert covariances (or information matrices) (..., d, d) like `from_dataset`."""
     old = np.array(covariance, dtype=np.float64)
     if axes == "dataset":
         return old

@@ -1,6 +1,6 @@
-"""The rows of all files as tables: named columns with units. One schema, whatever they go into.
+"""The rows of all files as tables: named columns with units, one schema for all output formats.
 
-Every table begins with the frame that a row belongs to. Coordinates are those of the files: robot
+Every table begins with the frame of a row. Coordinates are those of the files: robot
 frame X left, Y backward, on the floor; pixels from the centre of the top left one.
 """
 
@@ -123,7 +123,7 @@ TABLES: dict[TableName, tuple[Column, ...]] = {
 
 
 def table_of(record: Step | Landmark | FrameTilt) -> TableName:
-    """The table that a record is a row of."""
+    """The table to which a record belongs."""
     return _TABLE_BY_TYPE[type(record)]
 
 

@@ -2,7 +2,7 @@
 
 A file is read row by row on demand, so that its size does not matter. Line ends may be LF or CRLF.
 ``#`` at the start of a word begins a comment. A trailing backslash continues a row, but not a
-comment: that would swallow the row after it. Files are written in the data set's own layout.
+comment, as the next row would be lost. Files are written in the data set's own layout.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
-# Narrower than `float`, which also takes nan, infinity and 1_000.
+# Stricter than `float`, which also accepts nan, infinity and 1_000.
 _NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
 _NUMBER = re.compile(_NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
@@ -64,7 +64,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
     ------
     Row
         Each row with its text and its record: None for comments, blank lines and the settings of a
-        detector, as the data set's files have them at their head.
+        detector at the head of the data set's files.
 
     Raises LandmarkFileError if the file cannot be opened, a row is malformed, or a landmark
     precedes the first STEP; the message names the file, the line and what was expected.
@@ -84,13 +84,13 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
 def read_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
     """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
 
-    Parameters, errors and laziness are those of `read_rows`: landmarks are checked and left out.
+    Parameters, errors and laziness are those of `read_rows`; landmarks are checked and skipped.
     """
     return (row.record for row in read_rows(path) if isinstance(row.record, Step))
 
 
 def frames_of_rows(rows: Iterable[Row]) -> Iterator[Frame]:
-    """Gather rows to frames; comments are left out, but ``# levelled``."""
+    """Group rows into frames; comments are skipped except ``# levelled``."""
     step: Step | None = None
     landmarks: list[Landmark] = []
     levelled_by: tuple[float, float] | None = None
@@ -123,16 +123,16 @@ def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
 
 
 def parse_record(text: str) -> Record | None:
-    """Make a record of one row's text; None for a comment, a blank line or detector settings.
+    """Parse the text of one row; None for a comment, a blank line or detector settings.
 
-    Raises LandmarkError if the row is malformed; the message says what was expected.
+    Raises LandmarkError if the row is malformed; the message states what was expected.
     """
     return _record(_words(text.encode("utf-8", "surrogateescape")))
 
 
 @contextmanager
 def opened(path: str | os.PathLike[str], kind: str) -> Iterator[BinaryIO]:
-    """Open a file of a kind for reading; an error of the system becomes a `LandmarkFileError`."""
+    """Open a file of some kind for reading; system errors become `LandmarkFileError`."""
     try:
         with Path(path).open("rb") as stream:
             yield stream
@@ -184,7 +184,7 @@ def _record(words: list[bytes]) -> Record | None:
     if keyword == b"STEP":
         _demand_count(words, 1 + len(STEP_NUMBERS), "prefix", *STEP_NUMBERS)
         return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
-    # LANDMARK is what the comments at the head of the data set's files of circles call the row.
+    # LANDMARK is the row's name in the comments at the head of the data set's files of circles.
     if keyword in (b"LANDMARK_C", b"LANDMARK"):
         px, py, quality, cxx, cxy, cyy = _numbers_before_ids(words, CIRCLE_NUMBERS)
         return CircleLandmark(px, py, quality, cxx, cxy, cyy, _ids(words[7:]))
@@ -226,7 +226,7 @@ def _numbers_before_ids(words: list[bytes], names: tuple[str, ...]) -> list[floa
 
 
 def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
-    """The numbers at the beginning of some words, as many as names."""
+    """The numbers at the beginning of a row's words, one for each name."""
     for word, name in zip(words, names):
         if not _NUMBER.fullmatch(word):
             raise LandmarkError(f"{name} is {excerpt(decode(word))}: expected a finite number")
@@ -267,13 +267,13 @@ def format_record(record: Record) -> str:
 
 
 def format_levelling(levelled_by: tuple[float, float]) -> str:
-    """The comment behind a STEP that says by which pitch and roll (rad) its discs were levelled."""
+    """The comment after a STEP with the pitch and roll (rad) by which its discs were levelled."""
     pitch, roll = levelled_by
     return f"# levelled {pitch:.9f} {roll:.9f}"
 
 
 def format_head(head: str) -> bytes:
-    """A text as the comments at the head of a file: a ``#`` before each of its lines."""
+    """A text as comments at the head of a file, with a ``#`` before each line."""
     lines = head.split("\n") if head else []
     return b"".join(_encode(f"# {line}".rstrip() + "\n") for line in lines)
 
@@ -293,10 +293,10 @@ def write_frames(
     head: str = "",
     overwrite: bool = False,
 ) -> None:
-    """Write frames to a landmark file, whole or not at all, with a text as comments above them.
+    """Write frames to a landmark file, whole or not at all, with a text as comments at its head.
 
-    They are written as they come: they need not be in memory at once. An existing file is a
-    `redetect.storage.OutputExistsError` unless it may be overwritten.
+    Frames are written as they are iterated, so they need not all be in memory. If the file exists
+    and `overwrite` is false, raises `redetect.storage.OutputExistsError`.
     """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(format_head(head))
@@ -307,10 +307,10 @@ def write_frames(
 def write_rows(
     path: str | os.PathLike[str], rows: Iterable[Row], *, overwrite: bool = False
 ) -> None:
-    """Write rows to a landmark file, whole or not at all; unchanged ones byte by byte.
+    """Write rows to a landmark file, whole or not at all; unchanged ones are byte-identical.
 
-    Rows that have their text are copied; the others are laid out by `format_record` and end like
-    the row before them. The path may be that of the file that the rows are being read from.
+    Rows with their text are copied; others are formatted by `format_record`, with the line end of
+    the previous row. The path may be that of the file from which the rows are read.
     """
     line_end = b"\n"
     text = line_end

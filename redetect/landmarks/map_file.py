@@ -1,4 +1,4 @@
-"""Landmark maps and paths on disk: comma-separated, with a head that says where they come from.
+"""Files of landmark maps and paths: comma-separated, with a head that states their origin.
 
 The joint covariance of a map's landmarks is in a file beside it.
 """
@@ -25,13 +25,13 @@ FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
 
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
-#: Of a map of discs whose places are exact.
+#: Columns of a map of discs with exact positions.
 SHORT_MAP_COLUMNS = ("id", "x_m", "y_m", "rows")
 PATH_COLUMNS = (
     *("prefix", "x_m", "y_m", "theta_rad"),
     *(f"c{row}{column}" for row in ("x", "y", "theta") for column in ("x", "y", "theta")),
 )
-#: Of a path without covariances.
+#: Columns of a path without covariances.
 SHORT_PATH_COLUMNS = PATH_COLUMNS[:4]
 _LARGEST_FILE_BYTES = 1 << 28
 # Both files of a map are written in full precision; sums may be in another order.
@@ -44,9 +44,9 @@ class Landmarks:
     """Landmarks of one kind in the map."""
 
     ids: IntArray  #: (M,) identifiers, each once
-    xy: FloatArray  #: (M, 2) places in the map (m)
+    xy: FloatArray  #: (M, 2) positions in the map (m)
     covariance: FloatArray  #: (M, 2, 2) of `xy` (m^2)
-    rows: IntArray  #: (M,) number of rows that each was estimated from
+    rows: IntArray  #: (M,) number of rows from which each was estimated
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -58,7 +58,7 @@ class LandmarkMap:
 
     discs: Landmarks
     lines: Landmarks
-    #: (2 M, 2 M) of all places, discs first (m^2); None: each landmark's own is all that is known
+    #: (2 M, 2 M) of all positions, discs first (m^2); None if only each landmark's own is known
     joint_covariance: FloatArray | None = None
 
 
@@ -66,18 +66,18 @@ class LandmarkMap:
 class Path2D:
     """The poses of a run: the start, and one after each step."""
 
-    prefixes: tuple[str, ...]  #: Name of each pose; of the start ``start``
+    prefixes: tuple[str, ...]  #: Name of each pose; ``start`` for the start
     poses: FloatArray  #: (N, 3) x, y (m), theta (rad)
     covariance: FloatArray | None = None  #: (N, 3, 3) of the poses
 
     def part(self, first: int, end: int) -> Path2D:
-        """The poses from one on, up to another."""
+        """The poses from index `first` up to, but not including, `end`."""
         spread = None if self.covariance is None else self.covariance[first:end]
         return Path2D(self.prefixes[first:end], self.poses[first:end], spread)
 
 
 def no_landmarks() -> Landmarks:
-    """A map of nothing."""
+    """An empty map."""
     return _landmarks({})
 
 
@@ -115,10 +115,10 @@ def write_map(
 
 
 def read_map(path: FilePath) -> LandmarkMap:
-    """Read a map that `write_map` wrote, or one made by hand with the same columns.
+    """Read a map written by `write_map`, or one made by hand with the same columns.
 
-    The columns may also be `SHORT_MAP_COLUMNS`: discs without covariances, which are 0. The joint
-    covariance is left where it is (`with_joint_covariance`).
+    The columns may also be `SHORT_MAP_COLUMNS`: discs with covariances of 0. The joint
+    covariance is not read (see `with_joint_covariance`).
 
     Raises LandmarkFileError if the file cannot be read, a row is malformed, a landmark is listed
     twice or a covariance is negative; names file and line.
@@ -135,7 +135,7 @@ def read_map(path: FilePath) -> LandmarkMap:
         values = _finite(path, line, MAP_COLUMNS[2:7], words[2:7])
         rows = _number(path, line, "rows", words[7], int)
         if number in found[kind]:
-            raise LandmarkFileError(path, line, f"{kind} {number} is in the map already")
+            raise LandmarkFileError(path, line, f"{kind} {number} is already in the map")
         _, _, cxx, cxy, cyy = values
         if cxx < 0.0 or cyy < 0.0 or cxy * cxy > 1.000001 * cxx * cyy:
             raise LandmarkFileError(path, line, f"{kind} {number}: covariance is negative")
@@ -144,19 +144,19 @@ def read_map(path: FilePath) -> LandmarkMap:
 
 
 def covariance_file(map_file: Path) -> Path:
-    """Where the joint covariance of a map is: ``map_covariance.npy`` beside ``map.csv``.
+    """Path of the joint covariance of a map: ``map_covariance.npy`` beside ``map.csv``.
 
-    A map's own file holds the covariance of each landmark by itself. Landmarks of a map made by
-    driving share most of their error with their neighbours (the drift from the start), which only
+    A map's own file contains only the covariance of each landmark. In a map made by driving,
+    landmarks share most of their error with their neighbours (the drift from the start), which only
     the joint covariance describes.
     """
     return map_file.with_name(f"{map_file.stem}_covariance.npy")
 
 
 def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> LandmarkMap:
-    """A map with the joint covariance that is beside its file; as it is if there is none.
+    """A map with the joint covariance beside its file; unchanged if there is none.
 
-    Raises LandmarkFileError if that is malformed, or not of this map.
+    Raises LandmarkFileError if that is malformed, or of another map.
     """
     path = covariance_file(map_file)
     if not path.is_file():
@@ -194,7 +194,7 @@ def write_path(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a path: columns as `PATH_COLUMNS`, the covariance row by row where there is one."""
+    """Write a path with columns `PATH_COLUMNS`, the covariance row by row if there is one."""
     columns, table = SHORT_PATH_COLUMNS, poses.poses
     if poses.covariance is not None:
         columns = PATH_COLUMNS
@@ -204,7 +204,7 @@ def write_path(
 
 
 def read_path(path: FilePath) -> Path2D:
-    """Read a path that `write_path` wrote; errors are those of `read_map`."""
+    """Read a path written by `write_path`; errors are those of `read_map`."""
     prefixes, numbers = [], []
     what = "a path, path.csv, of `slam map`"
     for line, words in _read(path, what, PATH_COLUMNS, SHORT_PATH_COLUMNS):
@@ -236,7 +236,7 @@ def write_table(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write rows between commas under comments and the columns' names; floats in full precision."""
+    """Write comma-separated rows after comments and a line of names; floats in full precision."""
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])
@@ -247,7 +247,7 @@ def write_table(
 def _read(
     path: FilePath, what: str, columns: Sequence[str], fewer: Sequence[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Rows of a file with their line numbers, under a head of either set of columns."""
+    """Rows of a file with their line numbers, after a head with either set of columns."""
     try:
         text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
     except OSError as error:

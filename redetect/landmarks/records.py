@@ -1,8 +1,8 @@
 """The rows of landmark files as values.
 
 Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
-metres and radians. The field names are the format's own. A record that could not be read back from
-a file raises `LandmarkError`: numbers that are not finite, identifiers of more than 64 bits, names
+metres and radians. The field names are those of the format. Values that could not be read back from
+a file raise `LandmarkError`: numbers that are not finite, identifiers of more than 64 bits, names
 that are not one word.
 """
 
@@ -28,7 +28,7 @@ class LandmarkFileError(LandmarkError):
     ----------
     file : path
     line : int or None
-        The wrong line, counted from 1; None if the error concerns the whole file.
+        The line, counted from 1; None if the error concerns the whole file.
     problem : str
         What was found and what was expected.
     """
@@ -59,12 +59,12 @@ _WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A movement of the robot and the image taken after it."""
+    """A motion of the robot and the image taken after it."""
 
     #: The image's name, usually without extension. Bytes of the file that are not UTF-8 are kept as
     #: surrogates, as in Python's file names.
     prefix: str
-    #: Pose after the movement in the robot frame before it (m, m, rad)
+    #: Pose after the motion in the robot frame before it (m, m, rad)
     dx: float
     dy: float
     dphi: float
@@ -93,7 +93,7 @@ class CircleLandmark:
     cxx: float
     cxy: float
     cyy: float
-    #: The disc's identifiers: usually one, -1 where it is unknown, empty where the row has none
+    #: The disc's identifiers: usually one, -1 if it is unknown, empty if the row has none
     ids: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -135,7 +135,7 @@ class LineLandmark:
 class MarkerCorner:
     """A corner of a square marker in an image."""
 
-    #: Where it is seen, lens distortion included (px; the top left pixel's centre is 0, 0)
+    #: Its distorted position in the image (px; the top left pixel's centre is 0, 0)
     u: float
     v: float
     #: Covariance of (u, v) (px^2)
@@ -152,10 +152,10 @@ class MarkerCorner:
 class MarkerLandmark:
     """A square marker as seen in one image."""
 
-    dictionary: str  #: Which set of markers it is from; an identifier means nothing without it
+    dictionary: str  #: The set of markers that defines the identifier
     id: int  #: The marker's number in that set
-    quality: float  #: How well the marker's cells agree with the pattern: 1 is perfect
-    #: Top left, top right, bottom right, bottom left of the marker as it is printed
+    quality: float  #: Agreement of the marker's cells with the pattern; 1 is perfect
+    #: Top left, top right, bottom right, bottom left of the marker as printed
     corners: tuple[MarkerCorner, MarkerCorner, MarkerCorner, MarkerCorner]
 
     def __post_init__(self) -> None:
@@ -177,8 +177,8 @@ class Frame:
 
     step: Step
     landmarks: tuple[Landmark, ...] = ()
-    #: Pitch and roll (rad) by which the positions of its discs were levelled; None if they are
-    #: where the camera as calibrated sees them
+    #: Pitch and roll (rad) by which the positions of its discs were levelled; None if they were
+    #: not
     levelled_by: tuple[float, float] | None = None
 
     @property
@@ -199,17 +199,17 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of a landmark file together with the text it was read from."""
+    """A row of a landmark file with its text."""
 
     record: Record | None  #: None for comments, blank lines and settings of a detector
-    #: The row's text in the file, continuation lines and line end included; None for a row that was
-    #: not read from a file, or was changed since
+    #: The row's text in the file, including continuation lines and line end; None for a row that
+    #: was not read from a file, or was changed
     source: bytes | None = None
     #: The number of the row's first line in its file, counted from 1; 0 without a file
     line: int = 0
 
     def with_record(self, record: Record) -> Row:
-        """The row with another record; it keeps its text if the record is equal."""
+        """The row with another record; its text is kept if the record is equal."""
         return self if record == self.record else Row(record, line=self.line)
 
 
@@ -220,7 +220,7 @@ def _demand_finite(names: tuple[str, ...], values: tuple[float, ...]) -> None:
 
 
 def _demand_word(word: str, name: str) -> None:
-    """Refuse text that would not be read back from a file as one word."""
+    """Reject text that would not be read back from a file as one word."""
     if not _WORD.fullmatch(word):
         raise LandmarkError(
             f"{name} is {excerpt(word)}: expected one word that starts with no # and ends with no "

@@ -1,4 +1,4 @@
-"""Tilt files: pitch and roll of each frame, as the building's verticals show it.
+"""Tilt files: pitch and roll of each frame, from the building's verticals.
 
 One row per frame, ``#`` comments and blank lines skipped:
 
@@ -7,9 +7,9 @@ One row per frame, ``#`` comments and blank lines skipped:
     TILT_D <image> <pitch> <roll> <cPP> <cPR> <cRR> <discs>
 
 Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
-that turns measured directions level; then its covariance and the number of verticals that agree
-with it. A frame with too few of them has a NOTILT row. A TILT_D row after either is what the
-outlines of discs show of the same frame; readers of tilts skip it.
+that levels measured directions; its covariance and the number of verticals that agree with it
+follow. A frame with too few of them has a NOTILT row. A TILT_D row after either is the same
+frame's tilt from the outlines of discs; readers of tilts skip it.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class FrameTilt:
     """The tilt of one frame."""
 
     prefix: str  #: The frame's image
-    #: Rotation vector about the robot's X and Y that turns measured directions level (rad)
+    #: Rotation vector about the robot's X and Y that levels measured directions (rad)
     pitch: float
     roll: float
     #: Its covariance (rad^2)
     cpp: float
     cpr: float
     crr: float
-    lines: int  #: Verticals that agree with it, or discs that show it
+    lines: int  #: Number of verticals that agree with it, or of discs used
 
 
 def format_tilt(tilt: FrameTilt) -> str:
-    """The row of a frame that has a tilt, without line end."""
+    """The row of a frame with a tilt, without line end."""
     return (
         f"TILT {tilt.prefix} {tilt.pitch:.6f} {tilt.roll:.6f} "
         f"{tilt.cpp:.6g} {tilt.cpr:.6g} {tilt.crr:.6g} {tilt.lines}"
@@ -48,17 +48,17 @@ def format_tilt(tilt: FrameTilt) -> str:
 
 
 def format_outline_tilt(tilt: FrameTilt) -> str:
-    """The row of the tilt by the outlines of a frame's discs, without line end."""
+    """The row of a frame's tilt from the outlines of discs, without line end."""
     return f"TILT_D{format_tilt(tilt).removeprefix('TILT')}"
 
 
 def format_no_tilt(prefix: str, lines: int) -> str:
-    """The row of a frame that has none, without line end."""
+    """The row of a frame without a tilt, without line end."""
     return f"NOTILT {prefix} {lines}"
 
 
 def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
-    """The tilt rounded to the digits that its row has."""
+    """The tilt rounded to the digits of its row."""
     pitch, roll, cpp, cpr, crr = map(float, format_tilt(tilt).rsplit(" ", 6)[1:-1])
     return FrameTilt(tilt.prefix, pitch, roll, cpp, cpr, crr, tilt.lines)
 
@@ -73,7 +73,7 @@ def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
     Returns
     -------
     dict
-        The frames that have a tilt, by their image prefix.
+        The tilts by image prefix; frames without a tilt are omitted.
 
     Raises
     ------

@@ -9,12 +9,12 @@ from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage.messages import excerpt
 
-#: The first line of files that are written here.
+#: The first line of written files.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """The times of images (s), by their prefixes; between the two may be a comma.
+    """The times of images (s) by prefix; rows are separated by blanks or a comma.
 
     Raises LandmarkFileError if the file cannot be read, a row is malformed or an image has two.
     """
