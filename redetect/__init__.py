@@ -6,7 +6,7 @@
 >>> found.discs.xy, found.discs.covariance                                     # doctest: +SKIP
 >>> found.to_dataframe()                                                       # doctest: +SKIP
 
-What is listed in `__all__` is the public interface; each name is imported when it is first used.
+`__all__` is the public interface; each name is imported when first used.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Names of the arrays that signatures and attributes have; shapes are in the docstrings."""
+"""Names of array types for signatures and attributes; shapes are in the docstrings."""
 
 from __future__ import annotations
 

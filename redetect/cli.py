@@ -1,6 +1,6 @@
 """The command ``redetect``: all programs of the project behind one name.
 
-Exit codes are those of the program that is run; 2 if there is no such command.
+Exit codes are those of the program; 2 if there is no such command.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PROGRAMS = {
     "groundtruth": "redetect.groundtruth.cli",
     "slam": "redetect.slam.cli",
 }
-#: Commands of `detect` that are commands of `redetect`, too.
+#: Commands of `detect` that are also commands of `redetect`.
 DIRECT = ("compare", "draw", "view", "report", "tune", "export", "explain", "demo")
 
 
@@ -30,7 +30,7 @@ _QUIET = ("-q", "--quiet")
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    # In any place it is a flag of the command.
+    # Anywhere else it is a flag of the command.
     leading = [word for word in given[:1] if word in _QUIET]
     words = [*given[len(leading) :], *leading]
     if words[:1] == ["--version"]:
@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     program = import_module(PROGRAMS[name])
     if arguments is not None:
         return int(program.main(rest))
-    # As if it had been called by its short name: it ends the process as it does then.
+    # As if it were called by its short name, including the way it ends the process.
     sys.argv = [name, *rest]
     return int(program.main())
 
@@ -74,7 +74,7 @@ _HEAD = (
 
 
 def _write_completion(words: list[str]) -> None:
-    """Have tyro write the completion of all programs' commands; ends the process."""
+    """Let tyro write the completion of all programs' commands; ends the process."""
     import tyro
     from tyro.conf import arg, subcommand
 
@@ -92,7 +92,7 @@ def _write_completion(words: list[str]) -> None:
 
 
 def _unknown(name: str) -> str:
-    """What to answer to a command that there isn't."""
+    """The message for an unknown command."""
     for program, module in PROGRAMS.items():
         if name in import_module(module).PROGRAM.commands:
             return f"redetect: no command {name!r}: did you mean redetect {program} {name}?"

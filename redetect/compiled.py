@@ -1,4 +1,4 @@
-"""How kernels are compiled."""
+"""Compilation of kernels."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 def kernel(**options: Any) -> Callable[[Kernel], Kernel]:
     """Decorator of kernels, with options of `numba.njit`.
 
-    They are kept on the disk, divide as NumPy does, and let other threads go on. The entry for code
-    in C, which nothing here uses, is left out: with it, compiling takes a tenth longer.
+    They are cached on disk, divide like NumPy, and release the GIL. The entry point for C code,
+    which is not used here, is omitted: it makes compilation a tenth slower.
     """
     decorator: Any = njit(  # type: ignore[call-overload]  # the stub lacks an option
         cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True, **options

@@ -1,6 +1,6 @@
 """Rigid motions of the plane as (x, y, theta): composition, inverse, points, fits; ellipses.
 
-A pose `a_from_b` takes points of frame b to frame a. Metres and radians; stacks of any leading
+A pose `a_from_b` transforms points of frame b to frame a. Metres and radians; stacks of any leading
 shape. Covariances are those of (x, y, theta) themselves, as in the streams of poses.
 """
 
@@ -41,7 +41,7 @@ def invert(a_from_b: ArrayLike) -> FloatArray:
 def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
     """(..., 3) poses a_from_b of two poses in one world; the heading is wrapped."""
     a, b = np.asarray(world_from_a, dtype=np.float64), np.asarray(world_from_b, dtype=np.float64)
-    # The difference is turned, not each pose: far from the origin that keeps more digits.
+    # The difference is rotated, not each pose: far from the origin this keeps more digits.
     apart = b - a
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = c * apart[..., 0] + s * apart[..., 1]
@@ -50,7 +50,7 @@ def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
 
 
 def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
-    """Poses that odometry alone leads to: the start, and that after each step.
+    """Poses from odometry alone: the start, and the pose after each step.
 
     Takes `steps` (N, 3), `start` (3,); returns (N + 1, 3), theta not wrapped.
     """
@@ -65,7 +65,7 @@ def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatAr
 def log_motion(a_from_b: ArrayLike) -> FloatArray:
     """(..., 3) constant rates vx, vy, turn that lead from a to b within one unit of time.
 
-    They are those of the moving frame itself, so that way and turn are those of an arc.
+    They are rates of the moving frame, so that the path is an arc.
     """
     pose = np.asarray(a_from_b, dtype=np.float64)
     half = 0.5 * wrap_angle(pose[..., 2])
@@ -82,7 +82,7 @@ def log_motion(a_from_b: ArrayLike) -> FloatArray:
 
 
 def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
-    """(..., 2) points of frame b taken to frame a by (..., 3) poses, broadcast."""
+    """(..., 2) points of frame b transformed to frame a by (..., 3) poses, broadcast."""
     a, p = np.asarray(a_from_b, dtype=np.float64), np.asarray(points, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * p[..., 0] - s * p[..., 1]
@@ -91,7 +91,7 @@ def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
 
 
 def fitted(points: FloatArray, target: FloatArray) -> FloatArray:
-    """(3,) pose that takes (n, 2) points nearest to their targets: least squares (Horn 1987)."""
+    """(3,) pose that best aligns (n, 2) points with their targets: least squares (Horn 1987)."""
     from_points, from_target = points - points.mean(axis=0), target - target.mean(axis=0)
     across = from_points[:, 0] * from_target[:, 1] - from_points[:, 1] * from_target[:, 0]
     turn = float(np.arctan2(np.sum(across), np.sum(from_points * from_target)))
@@ -101,7 +101,7 @@ def fitted(points: FloatArray, target: FloatArray) -> FloatArray:
 def ellipses(
     centres: ArrayLike, covariance: ArrayLike, sigmas: float, points: int = 64
 ) -> FloatArray:
-    """(..., points, 2) outlines of `sigmas` standard deviations round centres (..., 2)."""
+    """(..., points, 2) outlines of `sigmas` standard deviations around centres (..., 2)."""
     values, axes = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
     roots = axes * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     angle = 2.0 * np.pi * np.arange(points) / points

@@ -9,14 +9,14 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.least_squares.solver import NormalEquations, factor, scaled_inverse
 
-# Columns of the inverse that are computed at once.
+# Number of columns of the inverse computed at once.
 _CHUNK = 128
 
 
 def diagonal_blocks(
     equations: NormalEquations, blocks: list[tuple[int, IntArray]]
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Covariances of groups of unknowns, and of the shared ones, all others unknown too.
+    """Covariances of groups of unknowns, and of the shared ones, marginalised over all others.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def chosen_covariance(equations: NormalEquations, chosen: IntArray) -> FloatArra
 
 
 def _shared(equations: NormalEquations) -> tuple[FloatArray, FloatArray]:
-    """How the others follow the shared unknowns (K, s), and the covariance of these (s, s)."""
+    """Border solved by the matrix of the others (K, s), and covariance of the shared (s, s)."""
     if equations.corner.size == 0:
         return equations.border, equations.corner
     eliminated = factor(equations.matrix).solve(equations.border)

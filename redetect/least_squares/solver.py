@@ -1,8 +1,8 @@
 """Levenberg-Marquardt on sparse normal equations.
 
-A residual depends on a few of many unknowns (poses, landmarks), and perhaps on some that are shared
-by all residuals (a camera's mounting or lens). The latter would fill the sparse matrix: they are
-kept apart as a border, and solved for by the Schur complement of the others.
+A residual depends on a few of many unknowns (poses, landmarks), and possibly on some that are
+shared by all residuals (a camera's mounting or lens). The latter would fill the sparse matrix: they
+are separated as a border, and solved for by the Schur complement of the others.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e10
 
 
 class StartError(ValueError):
-    """A start at which what is minimised is not defined."""
+    """A start at which the cost is not defined."""
 
 
 class Loss(NamedTuple):
-    """How much a residual counts: its square, or less beyond `scale` standard deviations."""
+    """Cost of a residual: its square, or less beyond `scale` standard deviations."""
 
     kind: LossKind = "none"
     scale: float = 1.0
@@ -40,9 +40,9 @@ class Block(NamedTuple):
     Attributes
     ----------
     error : (n, d) float64
-        Each row is one residual to the loss.
+        Each row is one residual for the loss.
     by : sequence of ((n,) int64, (n, d, k) float64)
-        Derivatives by k unknowns, and the index of the first of these; below 0: not an unknown.
+        Index of the first of k unknowns (below 0: not an unknown), and derivatives by them.
     shared : (n, d, s) float64 or None
         Derivatives by the shared unknowns; None: all are 0.
     loss : Loss
@@ -55,7 +55,7 @@ class Block(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """A linear problem: the change x, m of the unknowns, m shared, least in ``|J x + B m + r|``."""
+    """A linear problem: minimise ``|J x + B m + r|`` over changes x and m, m of shared unknowns."""
 
     residual: FloatArray  # (R,)
     jacobian: sparse.csr_array  # (R, K)
@@ -63,13 +63,13 @@ class Linear(NamedTuple):
 
 
 class Problem(Protocol[X]):
-    """What is minimised: a function of unknowns of any type."""
+    """A function to minimise, of unknowns of any type."""
 
     def cost(self, at: X) -> float:
-        """The sum to minimise; infinite where it is not defined."""
+        """The sum to minimise; infinite if it is not defined."""
 
     def linear(self, at: X) -> Linear:
-        """The problem near an estimate."""
+        """The problem, linearised at an estimate."""
 
     def moved(self, at: X, step: FloatArray, shared: FloatArray) -> X:
         """The estimate after a step of the (K,) unknowns and of the (s,) shared ones."""
@@ -77,16 +77,16 @@ class Problem(Protocol[X]):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[X]):
-    """Where a descent ended: the estimate, and the costs at the start and after each step."""
+    """Result of a minimisation: the estimate, and the costs at the start and after each step."""
 
     at: X
     costs: tuple[float, ...]
-    converged: bool  # False if the steps ran out.
+    converged: bool  # False if the number of steps was exhausted
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """J^T J and J^T r, the shared unknowns apart."""
+    """J^T J and J^T r, with the shared unknowns separate."""
 
     matrix: sparse.csc_array  # (K, K)
     gradient: FloatArray  # (K,)
@@ -95,9 +95,9 @@ class NormalEquations:
     corner_gradient: FloatArray  # (s,)
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Steps of both kinds of unknowns, the diagonal raised by a share of it (Marquardt).
+        """Steps of both kinds of unknowns, with the diagonal scaled by 1 + damping (Marquardt).
 
-        Raises `numpy.linalg.LinAlgError` where the residuals do not determine the unknowns.
+        Raises `numpy.linalg.LinAlgError` if the residuals do not determine the unknowns.
         """
         factored = factor(self.matrix, damping)
         step = -factored.solve(self.gradient)
@@ -112,14 +112,14 @@ class NormalEquations:
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
-    """(..., d, d) lower triangular W with ``W C W^T = I``, of positive definite covariances C."""
+    """(..., d, d) lower triangular W with ``W C W^T = I``, for positive definite covariances C."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def robust(squared: FloatArray, loss: Loss) -> tuple[FloatArray, FloatArray]:
     """Costs of (n,) squared residuals, and their weights: the costs' derivatives by the squares.
 
-    Huber's, Cauchy's (Lorentzian) and Geman and McClure's losses are the square near 0.
+    Huber's, Cauchy's (Lorentzian) and Geman and McClure's losses are quadratic near 0.
     """
     c2 = loss.scale**2
     if loss.kind == "huber":
@@ -142,7 +142,7 @@ def robust_cost(errors: Iterable[tuple[FloatArray, Loss]]) -> float:
 
 
 def stack(blocks: Sequence[Block], unknowns: int, shared: int) -> Linear:
-    """The linear problem of blocks, robust losses as weights (iteratively reweighted)."""
+    """The linear problem of blocks, with robust losses as weights (iteratively reweighted)."""
     residuals, border, values, rows, columns = [], [], [], [], []
     first_row = 0
     for block in blocks:
@@ -181,9 +181,9 @@ def normal_equations(problem: Linear) -> NormalEquations:
 
 
 def factor(matrix: sparse.csc_array, damping: float = 0.0) -> SuperLU:
-    """Factorise a positive definite matrix, its diagonal raised by a share of it.
+    """Factorise a positive definite matrix, with its diagonal scaled by 1 + damping.
 
-    Raises `numpy.linalg.LinAlgError` where it is singular.
+    Raises `numpy.linalg.LinAlgError` if it is singular.
     """
     if damping > 0.0:
         matrix = matrix.copy()
@@ -197,7 +197,7 @@ def factor(matrix: sparse.csc_array, damping: float = 0.0) -> SuperLU:
 
 
 def scaled_inverse(matrix: FloatArray) -> FloatArray:
-    """Pseudo-inverse of a positive semidefinite matrix whose unknowns differ much in scale."""
+    """Pseudo-inverse of a positive semidefinite matrix with unknowns of very different scale."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     both = np.outer(scale, scale)
     return np.asarray(np.linalg.pinv(matrix / both, 1e-14, hermitian=True) / both)
@@ -219,13 +219,13 @@ def minimise(
     problem : Problem
     start : X
     tolerance : float
-        Stop at a step that lowers the cost by less than this share of it.
+        Stop if a step lowers the cost by less than this share of it.
     most_steps : int
-        Stop after as many.
+        Largest number of steps.
     damping : float
-        At the beginning, a share of the diagonal.
+        Initial damping, as a share of the diagonal.
     refined : callable, optional
-        Improves each trial, whose cost it takes and returns, before it is judged.
+        Improves each trial before it is judged; takes and returns the trial and its cost.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""The parts of a report, of which ``page.html`` makes a page, and the files of its figures.
+"""The parts of a report, which ``page.html`` combines to a page, and the files of its figures.
 
-A page has no scripts and loads nothing: its figures are data: addresses. Pages and figures are the
-same each time, whatever the user's own matplotlib settings are.
+A page has no scripts and loads nothing: its figures are data: addresses. Pages and figures are
+reproducible, whatever the user's matplotlib settings are.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _FORBIDDEN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]")
 
 
 class Part(NamedTuple):
-    """A piece of a section; its kind says what the template makes of it.
+    """A part of a section; the template renders it by its kind.
 
     `words` are the text or the caption. Rows of figures are names and values, those of a key
-    colours and words. `left` are the columns of a table that have text, `bold` the rows to point
-    out. Details are a table that is folded away.
+    colours and labels. `left` are the columns of a table that contain text, `bold` the rows to
+    emphasise. Details are a collapsed table.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class Section(NamedTuple):
 
 
 def image_part(words: str, content: bytes, kind: str, width: float, height: float) -> Part:
-    """An image with its caption; `kind` is its type behind ``image/``."""
+    """An image with its caption; `kind` is its subtype after ``image/``."""
     address = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return Part("image", words, address=address, width=round(width), height=round(height))
 
@@ -67,7 +67,7 @@ def page_of(title: str, sections: Sequence[Section]) -> bytes:
 
 
 def printable(value: Any) -> Any:
-    """Text without characters that are not allowed in a page; anything else as it is."""
+    """Text without characters that are not allowed in a page; other values unchanged."""
     return _FORBIDDEN.sub("\ufffd", value) if type(value) is str else value
 
 
@@ -79,10 +79,10 @@ def figure_file(
     framed: bool = False,
     new: Callable[..., Figure] = Figure,
 ) -> Iterator[tuple[Figure, io.BytesIO]]:
-    """An empty figure of a width and height (inches) to draw into, and its file afterwards.
+    """An empty figure of a given width and height (inches) to draw into, and its file afterwards.
 
-    Axes that are `framed` have a line at all four sides. `new` makes the figure: that of a window
-    is `matplotlib.pyplot.figure`.
+    `framed` axes have a line on all four sides. `new` creates the figure; for a window, it is
+    `matplotlib.pyplot.figure`.
     """
     with mpl.rc_context():
         mpl.rcdefaults()
@@ -96,9 +96,9 @@ def figure_file(
         yield figure, content
         engine = figure.get_layout_engine()
         if new is Figure and kind == "png" and engine is not None:
-            # Else all of it is drawn once more, only to be laid out.
+            # Otherwise everything is drawn once more just for the layout.
             engine.execute(figure)
             figure.set_layout_engine(None)
-        # Without date, name and version of the program: the same bytes each time.
+        # Without date, name and version of the program, for reproducible bytes.
         nameless = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
         figure.savefig(content, format=kind, dpi=_DPI, metadata=nameless)

@@ -1,6 +1,6 @@
 """Writes results to disk: completely or not at all, and never over a user's files.
 
-All packages write their files with `write_whole`, or `write_bytes` where the content is in memory.
+All packages write their files with `write_whole`, or `write_bytes` if the content is in memory.
 """
 
 from redetect.storage.parts import OutputExistsError as OutputExistsError

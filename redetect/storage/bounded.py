@@ -1,8 +1,8 @@
-"""Reads untrusted files: of bounded size, regular ones, plain arrays, within a folder.
+"""Reads untrusted files: only regular files of bounded size, plain arrays, within a folder.
 
-A file of a few hundred bytes can claim an image of gigabytes, and decoders allocate the memory
-first. So an image's size is read from its header, for the formats that are supported as input: JPEG
-(ISO/IEC 10918-1), PNG, PNM (P1 to P6), BMP, and TIFF (6.0 and BigTIFF).
+A file of a few hundred bytes can claim an image of gigabytes, for which decoders allocate memory
+first. So an image's size is read from its header, for the supported input formats: JPEG (ISO/IEC
+10918-1), PNG, PNM (P1 to P6), BMP, and TIFF (6.0 and BigTIFF).
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _LARGEST_TEXT_BYTES = 1 << 28
 
 
 def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
-    """The content of a regular file of at most `largest_bytes`, or of what a link leads to.
+    """The content of a regular file, or a link to one, of at most `largest_bytes`.
 
-    Pipes and devices are refused, never waited for; if it must be the user's `own`, so are links,
-    and files that another user may have written to. Raises an OSError whose `strerror` says why in
-    words.
+    Pipes and devices are rejected, never waited for; if it must be the user's `own`, so are links,
+    and files that another user may have written to. Raises an OSError whose `strerror` states the
+    reason.
     """
     try:
         links = os.O_NOFOLLOW if own else 0
@@ -52,7 +52,7 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool 
             raise OSError(errno.EFBIG, f"larger than {largest_bytes} bytes")
         if own and (why := writable_by_others(state)) is not None:
             raise PermissionError(errno.EACCES, why)
-        # Some file systems return only part of what is asked for in one call.
+        # Some file systems return only a part of the requested bytes per call.
         content = os.read(handle, state.st_size + 1)
         while more := os.read(handle, state.st_size + 1 - len(content)):
             content += more
@@ -66,7 +66,7 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool 
 def read_content(
     path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
 ) -> bytes:
-    """The content of a file of a kind; what `read_bounded` refuses becomes an `error`."""
+    """The content of a file of some kind; raises an `error` if `read_bounded` rejects it."""
     try:
         return read_bounded(path, largest_bytes)
     except FileNotFoundError:
@@ -88,9 +88,9 @@ def read_text(
 def rows_of_numbers(
     path: str | os.PathLike[str], kind: str, columns: str, error: type[Exception]
 ) -> Iterator[tuple[str, list[float]]]:
-    """The place and the finite numbers of each row of a text file of some columns.
+    """The place and the finite numbers of each row of a text file with the given columns.
 
-    Between them are blanks or commas; ``#`` begins a comment. What is no such file is an `error`.
+    They are separated by blanks or commas; ``#`` begins a comment. Other files raise an `error`.
     """
     count = len(columns.split())
     lines = read_text(path, _LARGEST_TEXT_BYTES, kind, error).split("\n")
@@ -110,7 +110,7 @@ def rows_of_numbers(
 
 
 def writable_by_others(state: os.stat_result) -> str | None:
-    """Why another user may have written to a file or folder; None if none can have."""
+    """Why another user may have written to a file or folder; None if that is impossible."""
     if state.st_uid != os.geteuid():
         return f"belongs to user {state.st_uid}, not {os.geteuid()}"
     if state.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -119,18 +119,18 @@ def writable_by_others(state: os.stat_result) -> str | None:
 
 
 _DRIVE = re.compile(r"[A-Za-z]:")
-#: What Windows takes for a device in any folder, whatever the ending.
+#: Names that denote a device on Windows, in any folder and with any ending.
 _DEVICE = re.compile(
     r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
 )
 
 
 def leads_out(name: str, *folders: str) -> str | None:
-    r"""Why a name may not be taken for one of a file within a folder, by its letters alone.
+    r"""Why a name cannot be that of a file within a folder, judged by its letters alone.
 
-    The name has / or \ between folders. `folders` are absolute paths of folders in any of which the
-    file may be; without them any folder will do. What is wrong is the end of a message that starts
-    with the name; None if nothing.
+    The name has / or \ between folders. `folders` are absolute paths; the file may be in any of
+    them. Without them, any folder is assumed. The result is the end of a message that starts
+    with the name; None if the name is valid.
     """
     parts = name.replace("\\", "/")
     if "\0" in name:
@@ -147,16 +147,15 @@ def leads_out(name: str, *folders: str) -> str | None:
 
 
 def link_out(path: Path, *folders: Path) -> bool:
-    """Whether a path is in none of the folders, after all links are resolved."""
+    """Whether a path, with all links resolved, is outside all of the folders."""
     real = os.path.realpath(path)
     return not any(real == home or _within(real, home) for home in map(os.path.realpath, folders))
 
 
 def path_inside(folder: Path, name: str) -> Path:
-    """Path of a file that another file names, in the other file's folder.
+    """Path of a file named in another file, in that file's folder.
 
-    Raises ValueError if it would be elsewhere; the message says why, as the end of one that starts
-    with the name.
+    Raises ValueError if it is elsewhere; its message is the end of one that starts with the name.
     """
     why = leads_out(name)
     if why is None and link_out(folder / name, folder):
@@ -175,8 +174,8 @@ def read_plain_array(
 ) -> NDArray[Any]:
     """Read an array of a known type from a stream, to the array's end.
 
-    Arrays of more bytes than `largest_bytes` are refused before memory is taken. Raises a
-    ValueError that says on one line what was found instead.
+    Arrays of more bytes than `largest_bytes` are rejected before memory is allocated. Raises a
+    ValueError that states on one line what was found instead.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
@@ -185,7 +184,7 @@ def read_plain_array(
             raise ValueError(f"version {version} of its header is not known")
         read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # headers that Python 2 wrote are not guessed at
+            warnings.simplefilter("error")  # headers written by Python 2 are rejected
             shape, fortran, stored = read(stream)
         if stored.hasobject or stored != dtype or len(shape) != dimensions or fortran:
             raise ValueError(f"it is {stored} of shape {shape}")
@@ -205,7 +204,7 @@ def read_plain_array(
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)
 
 
-#: The largest image that there can be: it fills as many bytes as grey values.
+#: Bound of an image's size: one byte per grey value.
 MOST_PIXELS = 1 << 27
 
 #: The start-of-frame markers of a JPEG: C0 to CF except tables (C4), extensions (C8, CC).
@@ -219,15 +218,15 @@ _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
 _TIFF_ORIENTATION = 274
 _TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
-# Tiles are padded and may be larger than a small image; up to this many pixels that is valid.
+# Tiles are padded and may be larger than a small image; up to this many pixels this is valid.
 _ORDINARY_TILE = 1 << 22
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height (pixels) that the header of an image file claims.
+    """Width and height (pixels) claimed by the header of an image file.
 
-    Of a TIFF with enormous tiles that are larger than the image, those of a tile. None if this is
-    no JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
+    For a TIFF with enormous tiles that are larger than the image, those of a tile. None if this is
+    not a JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
     """
     try:
         if content.startswith(b"\xff\xd8"):
@@ -245,9 +244,9 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _png_size(content: bytes) -> tuple[int, int] | None:
-    """That of the first chunk, if every chunk ends within the file.
+    """The size in the first chunk, if every chunk ends within the file.
 
-    OpenCV takes as much memory for a chunk as it claims to have, up to 4 GiB, before it reads it.
+    OpenCV allocates the claimed length of a chunk, up to 4 GiB, before it reads the chunk.
     """
     if content[12:16] != b"IHDR":
         return None
@@ -306,7 +305,7 @@ def _tiff_size(content: bytes) -> tuple[int, int] | None:
 
 def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
     """The tags of the first directory, each with the `struct` format of its number (None if it is
-    no number) and its offset.
+    not a number) and its offset.
     """
     order = "<" if content.startswith(b"II") else ">"
     big = content[2:4] in (b"+\0", b"\0+")

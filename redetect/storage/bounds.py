@@ -1,10 +1,10 @@
-"""Bounds of settings; other values are refused with the name, the value and what was expected.
+"""Bounds of settings; other values are rejected with name, value and expectation.
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
-A dataclass of many may annotate its fields instead, and call `demand_fields`.
+A dataclass with many settings may annotate its fields instead, and call `demand_fields`.
 
-NaN is always refused; infinity is refused unless it means "no limit".
+NaN is always rejected; infinity is rejected unless it means "no limit".
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from redetect.storage.messages import excerpt
 
 @dataclass(frozen=True)
 class Bounds:
-    """The numbers that a setting may have: in words, which of them, and whether whole ones only."""
+    """The allowed numbers of a setting: in words, as a test, and whether they must be whole."""
 
     expected: str
     include: Callable[[float], bool] = field(repr=False)
     whole: bool = False
 
     def hold(self, value: Any) -> bool:
-        """Whether a value is such a number."""
+        """Whether a value is allowed."""
         if isinstance(value, bool) or (self.whole and not isinstance(value, Integral)):
             return False
         try:
@@ -82,10 +82,10 @@ MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
 
 
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
-    """Refuse settings with a number out of its bounds; these are given by the attributes' names.
+    """Reject settings with a number out of its bounds, which are given by attribute name.
 
-    Each number of a tuple is checked, None is passed over. The error names the setting, its value
-    and what was expected.
+    Each number of a tuple is checked, None is skipped. The error states the setting, its value and
+    what was expected.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)
@@ -96,7 +96,7 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
 
 
 def demand_fields(settings: object, error: type[Exception]) -> None:
-    """Refuse settings, a dataclass, with a number out of the bounds that annotate its field."""
+    """Reject a dataclass of settings with a number out of the bounds that annotate its field."""
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
 

@@ -1,7 +1,7 @@
-"""The command line of a program: its commands, and how they end.
+"""The command line of a program: its commands, their errors and exit codes.
 
-Each command is carried out by a module of its own; only what `--help` needs is imported at once. A
-command ends with its exit code, and one line on the terminal where something was wrong.
+Each command is executed by its own module; only what `--help` needs is imported at once. A
+command ends with its exit code and, in case of an error, one line on the terminal.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from redetect.interrupts import interrupts_noted
 from redetect.storage import __version__
 from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
 
-#: The command could not be carried out.
+#: The command failed.
 EXIT_ERROR = 1
 #: The command line was wrong.
 EXIT_WRONG_COMMAND_LINE = 2
-#: It was interrupted from the keyboard.
+#: Interrupted from the keyboard.
 EXIT_INTERRUPTED = 130
-#: The reader of its output has gone (``| head``); the code that system tools exit with then.
+#: The reader of the output has closed it (``| head``); the code of system tools in this case.
 EXIT_UNREAD = 141
 
-#: Flags of every command, which this module takes care of.
+#: Flags of every command, which this module handles.
 _QUIET = ("-q", "--quiet")
 _HELP_ALL = "--help-all"
-#: What the help of every program says.
+#: Part of the help of every program.
 FOR_ALL = "Every command takes -q (only warnings and errors), --help, and --help-all (all flags)."
 _NUMBAS_CACHING = os.path.join("numba", "core", "caching.py")  # noqa: PTH118 - part of a path
 _ADVICE = (
@@ -52,8 +52,8 @@ def exit_code_of(work: Callable[[], int]) -> int:
     """Run a command and report its errors on one line; returns its exit code, or one of those
     above.
 
-    All packages raise `OneLineError`, the system raises OSErrors, libraries ValueErrors. Anything
-    else is a bug and shows its traceback.
+    All packages raise `OneLineError`, the system raises OSError, libraries raise ValueError.
+    Anything else is a bug and shows its traceback.
     """
     try:
         try:
@@ -74,7 +74,7 @@ def exit_code_of(work: Callable[[], int]) -> int:
 
 
 def say_interrupted() -> int:
-    """Say that there was an interrupt; returns the exit code."""
+    """Report an interrupt; returns the exit code."""
     print("interrupted", file=sys.stderr, flush=True)
     return EXIT_INTERRUPTED
 
@@ -89,7 +89,7 @@ def _is_unread() -> bool:
     poll.register(descriptor, select.POLLOUT)
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
         return False
-    # Python itself flushes once more when it ends.
+    # Python itself flushes again when it ends.
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)
@@ -109,15 +109,15 @@ def _message(error: Exception) -> str:
 
 
 def _is_of_cache(error: Exception) -> bool:
-    """Whether Numba raised it over its cache of compiled kernels, here or in a worker.
+    """Whether Numba's cache of compiled kernels caused an error, here or in a worker.
 
-    There is no folder for it, no space left in it, or its index names classes of another version of
-    the program: Numba's own words are no help.
+    It has no folder, its disk is full, or its index names classes of another version of the
+    program; Numba's own message does not help.
     """
     return _NUMBAS_CACHING in "".join(traceback.format_exception(error))
 
 
-#: As the name of a JSON file: standard output, and nothing else there.
+#: As the name of a JSON file: standard output, with no other output there.
 _STANDARD_OUTPUT = Path("-")
 
 
@@ -126,15 +126,15 @@ class Program:
     """A program with its commands."""
 
     name: str
-    description: str  # what its `--help` says
-    #: Dataclasses of flags, one for each command, which has the class's name in small letters; and
-    #: the module whose `perform` carries it out.
+    description: str  # for its `--help`
+    #: Dataclasses of flags, one for each command, whose name is that of the class in lower case,
+    #: and the module whose `perform` executes it.
     performed_by: Mapping[type, str]
     expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
 
     @property
     def commands(self) -> dict[str, type]:
-        """The dataclasses of the commands, by their names."""
+        """The dataclasses of the commands by name."""
         return {kind.__name__.lower(): kind for kind in self.performed_by}
 
     def main(self, arguments: list[str] | None = None) -> int:
@@ -148,8 +148,8 @@ class Program:
         parse: Callable[[Sequence[str]], Any],
         carry_out: Callable[[Any], int],
     ) -> int:
-        """Parse a command line and carry it out, quietly if it says so; returns the exit code."""
-        # Matrices are small or sparse here: threads of BLAS would cost more than they save.
+        """Parse and execute a command line, quietly if requested; returns the exit code."""
+        # Matrices are small or sparse here: BLAS threads would cost more time than they save.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         words = [word for word in arguments if word not in _QUIET]
         command = parse(words)
@@ -163,7 +163,7 @@ class Program:
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help`, `--version` and on errors.
 
-        `defaults` are commands whose values the flags of these commands start from.
+        `defaults` are commands whose values become the defaults of their flags.
         """
         words = list(arguments)
         if words == ["--version"]:
@@ -188,12 +188,12 @@ class Program:
         )
 
     def carry_out(self, command: Any) -> int:
-        """Carry out a command; returns the exit code."""
+        """Execute a command; returns the exit code."""
         code: int = import_module(self.performed_by[type(command)]).perform(command)
         return code
 
     def _brief(self, kind: type) -> type:
-        """The dataclass of a command without the flags for experts, for its help."""
+        """The dataclass of a command without its expert flags, for its help."""
         short = _without(kind, self.expert)
         if short is not kind:
             text, section, parameters = (kind.__doc__ or "").partition("\n\n    Parameters\n")
@@ -203,26 +203,26 @@ class Program:
 
 
 def all_but(kind: type, *names: str) -> frozenset[str]:
-    """The names of a dataclass's fields but these."""
+    """The names of a dataclass's fields except these."""
     return frozenset(each.name for each in fields(kind)) - {*names}
 
 
 def no_such(what: str, word: str, known: Iterable[str]) -> str:
-    """What to answer to a word that is none of the known ones: the nearest of them."""
+    """The message for an unknown word, with the nearest known one."""
     near = difflib.get_close_matches(word, sorted(known), 1, 0.5)
     names = ", ".join(sorted(known))
     return f"{what} {excerpt(word)}: " + (f"did you mean {near[0]}?" if near else f"one of {names}")
 
 
 def end_with(words: str) -> None:
-    """End for a wrong command line, saying why."""
+    """Exit because of a wrong command line, with a message."""
     print(f"error: {words}", file=sys.stderr)
     raise SystemExit(EXIT_WRONG_COMMAND_LINE)
 
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Nothing goes to standard output, and neither progress nor announcements anywhere."""
+    """Suppress standard output, progress and notices."""
     before = os.environ.get(QUIET)
     os.environ[QUIET] = "1"  # workers inherit it
     try:
@@ -233,7 +233,7 @@ def _quietly() -> Iterator[None]:
 
 
 def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
-    """Carry out a command, with what goes into its JSON file alone on standard output."""
+    """Execute a command with only the content of its JSON file on standard output."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "result.json"
         with _quietly():
@@ -244,7 +244,7 @@ def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
 
 
 def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
-    """A dataclass whose fields for experts are no flags; itself if it has none."""
+    """A dataclass whose expert fields are not flags; itself if it has none."""
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
     changed: list[tuple[str, Any, Any]] = []

@@ -1,6 +1,6 @@
 """Quotes the content of untrusted files in messages: escaped, bounded, on one line.
 
-A terminal acts upon control characters, so those of a file must not reach it; and a file may hold
+Terminals interpret control characters, so those of a file must not reach it; and a file may contain
 a word of a gigabyte. Every typed error of the project passes its message through `one_line`.
 """
 
@@ -9,9 +9,9 @@ from __future__ import annotations
 import os
 import reprlib
 
-#: Environment variable that is set where only warnings and errors are to be shown.
+#: Environment variable that is set if only warnings and errors are to be shown.
 QUIET = "REDETECT_QUIET"
-#: Characters of a message at most; a path may be the most of it.
+#: Largest number of characters in a message; a path may be most of it.
 LONGEST_MESSAGE = 1000
 _LONGEST_EXCERPT = 60
 _ELLIPSIS = " ... "
@@ -29,7 +29,7 @@ def is_quiet() -> bool:
 def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
     """Make a text printable: control characters escaped, and at most `longest` characters kept."""
     if len(text) > longest:
-        # Escapes make a text longer, never shorter: no more than this can be shown.
+        # Escapes make a text longer, never shorter: more than this is never shown.
         text = text[:longest] + _ELLIPSIS + text[-longest:]
     text = "".join(
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
@@ -41,10 +41,10 @@ def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
 
 
 def excerpt(value: object) -> str:
-    """Show a value of a file, however large and deep it is, in some 60 characters."""
+    """Show a value from a file, however large and deep it is, in about 60 characters."""
     try:
         return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
-    except ValueError:  # Python does not write numbers of thousands of digits
+    except ValueError:  # Python does not format numbers of thousands of digits
         return "a very long number"
 
 

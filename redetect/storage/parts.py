@@ -3,7 +3,7 @@
 A result is written to ``.NAME.part`` in its folder and renamed in one step when it is complete. The
 operating system releases the lock however the writing process ends: an unlocked file was left by a
 killed process, and the next process that writes the same result removes it. While one is being
-written, the next one is ``.NAME.1.part``. Of a symbolic link, the target is the result.
+written, the next one is ``.NAME.1.part``. For a symbolic link, the target is the result.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-#: Number of names that are searched for files of killed processes.
+#: Number of names that are searched for files left by killed processes.
 _NUMBERS = 8
 
 _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-# Anything may have been put there: follow no link and wait for no pipe.
+# The file may be anything: follow no link and wait for no pipe.
 _OLD = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class OutputExistsError(FileExistsError):
-    """A result's file exists already and must not be overwritten."""
+    """A result's file already exists and must not be overwritten."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path}: exists already: give --force to overwrite it")
 
 
 def demand_place(path: Path, *, overwrite: bool) -> None:
-    """Refuse a path where no result can be, or where there is one that must not be replaced."""
+    """Reject a path that cannot be a result's, or has one that must not be replaced."""
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     if path.is_dir():
@@ -47,8 +47,8 @@ def demand_place(path: Path, *, overwrite: bool) -> None:
 
 
 def demand_writable(path: Path) -> None:
-    """Refuse a path in a folder that may not be written to; of a folder yet to be made, the nearest
-    above it counts.
+    """Reject a path in a folder without write permission; for a folder yet to be created, that of
+    the nearest existing one above it.
     """
     above = next(place for place in Path(os.path.realpath(path)).parents if place.exists())
     if not above.is_dir():
@@ -59,7 +59,7 @@ def demand_writable(path: Path) -> None:
 
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
-    """Refuse before the work what could not be written after it; folders may yet be made."""
+    """Reject outputs that could not be written later; folders may be created later."""
     for path in paths:
         if path.exists() and not overwrite:
             raise OutputExistsError(path)
@@ -69,8 +69,8 @@ def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
 class PartFile(AbstractContextManager["PartFile"]):
     """A hidden file that this process has locked, and a stream to read and write it.
 
-    Its number is 0 unless others were being written. As a context manager it is removed at the end,
-    unless it was closed or has taken the result's place. Errors of the stream name the result.
+    Its number is 0 unless others are being written. As a context manager it is removed at the end,
+    unless it was closed or has replaced the result. Errors of the stream name the result.
     """
 
     def __init__(self, result: Path, place: Path, number: int, handle: int) -> None:
@@ -81,13 +81,13 @@ class PartFile(AbstractContextManager["PartFile"]):
         self.remove()
 
     def sync(self) -> None:
-        """Bring what is written to the disk."""
+        """Flush everything written to disk."""
         self.stream.flush()
         with _naming(self._result):
             os.fsync(self.stream.fileno())
 
     def replace(self, path: Path, *, overwrite: bool) -> None:
-        """Move it to the result's path, unless there is a file that must not be overwritten."""
+        """Rename it to the result's path, unless a file there must not be overwritten."""
         with _naming(path):
             if overwrite:
                 self.place.replace(os.path.realpath(path))
@@ -99,7 +99,7 @@ class PartFile(AbstractContextManager["PartFile"]):
         return _is_at(self.stream.fileno(), self.place)
 
     def remove(self) -> None:
-        """Remove it, unless it was closed or has taken its place."""
+        """Remove it, unless it was closed or renamed to the result."""
         if not self.stream.closed:
             if self.is_in_place():
                 self.place.unlink(missing_ok=True)
@@ -124,7 +124,7 @@ class _NamedFile(io.FileIO):
 
 
 def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> PartFile:
-    """A new hidden file beside `path`; those that killed processes left are removed.
+    """A new hidden file beside `path`; files left by killed processes are removed.
 
     Errors name `named`, by default the path.
     """
@@ -139,14 +139,14 @@ def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> Par
             handle = os.open(place, _NEW, 0o666)
             if _lock(handle) is not False and _is_at(handle, place):
                 return PartFile(named or path, place, number, handle)
-            os.close(handle)  # another process took it for one that was left
+            os.close(handle)  # another process took it for a leftover
         number += 1
 
 
 def left_part(
     path: Path, suffix: str = "part", number: int = 0, named: Path | None = None
 ) -> PartFile | None:
-    """A hidden file that an ended process left; None if there is none or it is in use."""
+    """A hidden file left by a process that ended; None if there is none or it is in use."""
     place = _place(path, suffix, number)
     try:
         handle = os.open(place, _OLD)
@@ -162,16 +162,15 @@ def left_part(
 def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[BinaryIO]:
     """Open a binary stream whose content appears at `path` only once it is complete.
 
-    It is written to a hidden file in the same folder, which takes the place of `path` (or, if that
-    is a symbolic link, of its target) in one step when the block ends, and is removed when it
-    raises.
+    It is written to a hidden file in the same folder, which replaces `path` (or, if that is a
+    symbolic link, its target) in one step when the block ends, and is removed if it raises.
 
     Raises
     ------
     OutputExistsError
         If `path` exists and `overwrite` is false.
     OSError
-        If `path` is no regular file, its folder cannot be written to, or the disk is full.
+        If `path` is not a regular file, its folder cannot be written to, or the disk is full.
     """
     path = Path(path)
     demand_place(path, overwrite=overwrite)
@@ -182,7 +181,7 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
 
 
 def write_bytes(path: str | os.PathLike[str], content: bytes, *, overwrite: bool) -> None:
-    """Write a file, whole or not at all: `write_whole` of content that is in memory."""
+    """Write a file, whole or not at all: `write_whole` for content in memory."""
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(content)
 
@@ -198,7 +197,7 @@ def folder_locked(folder: Path) -> Iterator[None]:
     """Lock a folder for the duration of a block; waits for other processes that hold the lock."""
     handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
-        # Without locks on this file system, results of runs at once may be mixed; each is whole.
+        # Without locks, results of concurrent runs may be mixed; each file is complete.
         with suppress(OSError):
             fcntl.flock(handle, fcntl.LOCK_EX)
         yield
@@ -208,7 +207,7 @@ def folder_locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _naming(result: Path) -> Iterator[None]:
-    """Let errors name the result: the name of a hidden file would mean nothing to a reader."""
+    """Let errors name the result, since the name of a hidden file would confuse users."""
     try:
         yield
     except OutputExistsError:
@@ -242,14 +241,14 @@ def _is_at(handle: int, place: Path) -> bool:
 
 
 def _link_new(part: Path, path: Path) -> None:
-    """Give a file its name unless the name was taken meanwhile."""
+    """Give a file its name unless the name is taken."""
     try:
         os.link(part, path)
     except FileExistsError:
         if not path.is_file() or not part.samefile(path):
             raise OutputExistsError(path) from None
-        # Else a process was killed after it had given it the name.
-    except OSError:  # a file system without hard links: the name is taken first
+        # Otherwise a process was killed after it had given the file its name.
+    except OSError:  # a file system without hard links: claim the name first
         try:
             os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
         except FileExistsError:
