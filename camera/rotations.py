@@ -11,7 +11,7 @@ def rotation_of(vectors: FloatArray) -> FloatArray:
     """(..., 3, 3) rotations of (..., 3) rotation vectors."""
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     cross = cross_matrices(vectors)
-    # Rodrigues' formula; `np.sinc` has the pi of signal processing.
+    # Rodrigues' formula; `np.sinc` is the normalised one, with a factor pi.
     of_square = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + of_square * (cross @ cross))
 

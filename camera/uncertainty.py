@@ -1,9 +1,9 @@
-"""How well a calibration is known, and what its errors do to projections, positions and tilts.
+"""Covariance of a calibration, and its effect on projections, positions and tilts.
 
 The parameters are the intrinsics (`camera.calibration.model.INTRINSICS`) and the pose: position (m)
 and a small rotation from the left about the robot's axes (rad). Errors of a calibration are the
-same in all images: they are the common part of covariances, which no number of landmarks averages
-out.
+same in all images: they are the common part of covariances, which does not average out over
+landmarks.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from camera.rotations import cross_matrices
 from redetect.array_types import FloatArray
 
 IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-#: A camera without a pose, to be given intrinsics.
+#: A camera without a pose, as a template for intrinsics.
 UNPOSED = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, (0.0,) * 5, IDENTITY, IDENTITY)
 
 _COLUMNS, _ROWS = 49, 37
@@ -49,21 +49,21 @@ def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> C
 def with_pose(camera: Camera, pose: FloatArray) -> Camera:
     """The camera at a (3, 4) pose `robot_from_camera`.
 
-    A ``sensor2Tcp`` that it has stays: it belongs to its mount. One that has none gets the
-    identity, which says that the sensor is its own tool.
+    Its ``sensor2Tcp`` is kept, if it has one, since that belongs to the mount; otherwise it becomes
+    the identity.
     """
     rows = checked_pose("sensor2World", pose)
     return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
 
 
 def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
-    """Standard deviation of where directions are projected, whatever the camera's rotation.
+    """Standard deviation of the projection of directions, apart from a rotation of the camera.
 
     A small rotation has the same effect as a shift of the principal point, and the pose absorbs it;
-    so the component common with a rotation is removed, as in mrcal.
+    so the component equivalent to a rotation is removed, as in mrcal.
 
-    Root of the trace of each pixel's covariance (u and v together) over the image, (37, 49) pixels,
-    by the (14, 14) covariance of the intrinsics.
+    Returns the root of the trace of each pixel's covariance over the image, (37, 49) pixels, from
+    the (14, 14) covariance of the intrinsics.
     """
     rays = camera.unproject(pixel_grid(camera.width, camera.height))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
@@ -75,7 +75,7 @@ def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
 
 
 _LOWER = np.tril_indices(PARAMETERS)
-#: Directions in which verticals are imagined: bearings and elevations (rad).
+#: Directions of hypothetical verticals: bearings and elevations (rad).
 _BEARINGS = np.linspace(-np.pi, np.pi, 145)
 _ELEVATIONS = np.linspace(-0.7, 0.7, 57)
 
@@ -87,7 +87,7 @@ def with_covariance(camera: Camera, covariance: FloatArray) -> Camera:
 
 
 def covariance_of(camera: Camera) -> FloatArray | None:
-    """The (20, 20) covariance of a camera's parameters, if it states any."""
+    """The (20, 20) covariance of a camera's parameters, if it has one."""
     if camera.covariance is None:
         return None
     lower = np.zeros((PARAMETERS, PARAMETERS))
@@ -96,7 +96,7 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """Derivatives of where on the floor pixels are taken to see, by the camera's parameters.
+    """Derivatives of pixels' positions on the floor by the camera's parameters.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     Returns
     -------
     (N, 2, 20) float64
-        Of the position that the same pixel gets.
+        Of the position assigned to the same pixel.
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     _, by_intrinsics, by_point = project_points(
@@ -121,10 +121,10 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
 
 
 def tilt_by_parameters(camera: Camera) -> FloatArray:
-    """(2, 20) derivatives of pitch and roll, as verticals all over the image show them.
+    """(2, 20) derivatives of pitch and roll, estimated from verticals all over the image.
 
-    A camera that is wrong takes true verticals for ones that lean; the tilt that turns them
-    vertical is fitted by least squares.
+    With a wrong calibration, true verticals seem to lean; the tilt that makes them vertical is
+    fitted by least squares.
     """
     bearing, elevation = np.meshgrid(_BEARINGS, _ELEVATIONS, indexing="ij")
     ray = np.stack([np.sin(bearing), -np.cos(bearing), np.tan(elevation)], axis=-1)
@@ -150,7 +150,7 @@ def tilt_by_parameters(camera: Camera) -> FloatArray:
 
 
 def _ray_by_parameters(camera: Camera, ray: FloatArray) -> FloatArray:
-    """(N, 3, 20) derivatives of the (N, 3) robot-frame directions that pixels are taken to see."""
+    """(N, 3, 20) derivatives of the (N, 3) directions assigned to pixels, in the robot frame."""
     in_camera = ray @ camera.camera_from_robot.T
     depth = in_camera[:, 2:]
     normalised = in_camera / depth

@@ -15,7 +15,7 @@ DEMO_RUN = Path(__file__).resolve().parent.parent / "redetect" / "demo"
 
 
 def perform(command: Demo) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     run = command.run or DEMO_RUN
     page = command.output / "demo.html"
     demand_free([page], overwrite=command.force)

@@ -16,7 +16,7 @@ from redetect.storage import demand_place, write_bytes
 
 
 def perform(command: Explain) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     for path in (command.output, command.json):
         if path is not None:
             demand_place(path, overwrite=command.force)
@@ -55,7 +55,7 @@ def _print(found: DiscExplanation) -> None:
     if found.place:
         console.print(found.place, highlight=False, markup=False)
     table = Table(box=box.SIMPLE_HEAD, padding=0)
-    for heading in ("", "u", "v", "ahead m", "left m", "votes", "contrast", "what became of it"):
+    for heading in ("", "u", "v", "ahead m", "left m", "votes", "contrast", "result"):
         table.add_column(heading, justify="left" if heading.startswith("what") else "right")
     for number, row in enumerate(found.candidates, start=1):
         figures = f"{row.u:.0f} {row.v:.0f} {-row.y_m:.2f} {row.x_m:.2f} {row.votes:.1f}"

@@ -45,7 +45,7 @@ _LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
 
 
 def perform(options: Level) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     run = open_run(options.run, options.camera)
     camera, height_m = run.camera, float(run.camera.centre[2])

@@ -36,7 +36,7 @@ from redetect.storage import demand_free, write_bytes
 
 
 def perform(options: Tune) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     varied = dict(map(_name_and_values, options.vary))
     grid = () if options.serve else combinations(varied)

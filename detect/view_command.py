@@ -30,7 +30,7 @@ _EARLIEST_DATE_S = 1e8
 
 
 def perform(options: View) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     rr = _rerun()
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)

@@ -152,7 +152,7 @@ _INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 
 
 def perform(command: options.Board) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand_place(command.output, overwrite=command.force)
     if command.board == "discs":
         sheet = sheet_of_discs(command.circle_m, command.columns, command.rows)

@@ -44,7 +44,7 @@ _WHETHER = {"auto": None, "on": True, "off": False}
 
 
 def perform(options: Calibrate) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     output = options.output
     kinds = ("residuals", "coverage")
     names = {kind: output.with_name(f"{output.stem}.{kind}.png") for kind in kinds}

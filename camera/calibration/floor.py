@@ -51,7 +51,7 @@ _LARGEST_FILE_BYTES = 1 << 24
 
 
 def perform(options: Floor) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     camera = read_camera(options.camera)
     seen = floor_points(options, (camera.width, camera.height))

@@ -1,4 +1,4 @@
-"""Pictures of a calibration: residuals, coverage, corners, and the floor as the camera sees it."""
+"""Pictures of a calibration: residuals, coverage, corners, and the floor."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _image_axes(figure: Figure, place: int, calibration: Calibration) -> Axes:
     axes = figure.add_subplot(1, 2, place)
     axes.set_xlim(-0.5, calibration.points.width - 0.5)
     axes.set_ylim(calibration.points.height - 0.5, -0.5)
-    # Half-height images are shown as the scene looks.
+    # Half-height images are shown with the proportions of the scene.
     axes.set_aspect(float(calibration.intrinsics[0] / calibration.intrinsics[1]))
     axes.set_xlabel("u (px)")
     axes.set_ylabel("v (px)")
@@ -57,7 +57,7 @@ def _draw_residuals(calibration: Calibration, figure: Figure) -> None:
         np.minimum(calibration.adjusted.weights.min(axis=1), 1.0), cmap="viridis_r",
         angles="xy", scale_units="xy", scale=1.0 / gain, width=0.0015,
     )  # fmt: skip
-    axes.set_title(f"Residuals, enlarged {gain:.0f} times; yellow: pulled less (robust loss)")
+    axes.set_title(f"Residuals, enlarged {gain:.0f} times; yellow: down-weighted (robust loss)")
     flat = figure.add_subplot(1, 2, 2)
     reach = float(np.quantile(np.abs(residuals), 0.995)) * 1.3
     flat.scatter(residuals[:, 0], residuals[:, 1], s=4, alpha=0.4, linewidths=0)
@@ -99,15 +99,15 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
 
 #: Blue, green, red.
 _FOUND, _PROJECTED, _GRID, _HORIZON = (0, 200, 0), (0, 0, 255), (0, 200, 255), (255, 120, 0)
-#: Width that small pictures are enlarged to (px), and of the rectified floor.
+#: Width to which small pictures are enlarged, and of the rectified floor (px).
 _LEAST_WIDTH_PX, _RECTIFIED_PX = 900, 800
-#: Floor that is drawn: to the left and right, and ahead (m), and from one line to the next.
+#: Extent of the drawn floor to the left and right, and ahead, and spacing of the grid (m).
 _ASIDE_M, _AHEAD_M, _GRID_M = 3.0, 6.0, 0.5
 _STEPS = 400
 
 
 def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> ByteArray:
-    """A board's points where they were found (circles) and where they project (crosses)."""
+    """A board's detected points (circles) and projected points (crosses)."""
     points, estimate = calibration.points, calibration.adjusted.estimate
     rows = points.views == view
     found = points.pixels[rows]
@@ -142,12 +142,12 @@ def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
     level = np.column_stack([np.sin(bearing), -np.cos(bearing), np.zeros(4 * _STEPS)])
     _polyline(picture, camera.project_robot(camera.centre + 1e6 * level), scale, _HORIZON, 2)
     return _captioned(
-        picture, f"floor: a line every {_GRID_M:g} m, whole metres thick; blue: the horizon"
+        picture, f"floor: a line every {_GRID_M:g} m, thick every metre; blue: the horizon"
     )
 
 
 def rectified_floor(image: GreyImage, camera: Camera) -> ByteArray:
-    """The floor from above, ahead is up: what lies flat on it has its true shape."""
+    """The floor from above, ahead is up: flat objects on it have their true shape."""
     per_metre = _RECTIFIED_PX / (2.0 * _ASIDE_M)
     height = round(_AHEAD_M * per_metre)
     u, v = np.meshgrid(np.arange(_RECTIFIED_PX), np.arange(height))
@@ -167,7 +167,7 @@ def rectified_floor(image: GreyImage, camera: Camera) -> ByteArray:
 
 
 def _enlarged(image: GreyImage) -> tuple[ByteArray, float]:
-    """The image in colour and large enough to draw into, and how much it is enlarged."""
+    """The image in colour, enlarged enough to draw into, and the factor."""
     scale = float(max(1, round(_LEAST_WIDTH_PX / image.shape[1])))
     size = int(scale * image.shape[1]), int(scale * image.shape[0])
     large = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
@@ -175,7 +175,7 @@ def _enlarged(image: GreyImage) -> tuple[ByteArray, float]:
 
 
 def _place(place: FloatArray, scale: float, parts: int = 1) -> tuple[int, int]:
-    """A place in the enlarged picture's pixels, or in parts of them."""
+    """A position in the enlarged picture, in pixels or fractions of them."""
     u, v = np.rint(parts * ((place + 0.5) * scale - 0.5)).astype(int).tolist()
     return u, v
 
@@ -183,7 +183,7 @@ def _place(place: FloatArray, scale: float, parts: int = 1) -> tuple[int, int]:
 def _polyline(
     picture: ByteArray, line: FloatArray, scale: float, colour: tuple[int, int, int], width: int
 ) -> None:
-    """Draw what of a line is seen, in pieces."""
+    """Draw the visible pieces of a line."""
     reach = 2.0 * max(picture.shape)
     near = np.isfinite(line).all(axis=1) & (np.abs(np.nan_to_num(line)) < reach).all(axis=1)
     for first, last in zip(line[:-1][near[:-1] & near[1:]], line[1:][near[:-1] & near[1:]]):

@@ -1,8 +1,8 @@
 """COLMAP's cameras.txt, and ``pycolmap.Camera``.
 
 COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
-principal point is moved by half a pixel on the way in and out. For programs that use pycolmap,
-`camera_from_pycolmap` and `pycolmap_from_camera` do without a file.
+principal point is shifted by half a pixel in either direction. For programs that use pycolmap,
+`camera_from_pycolmap` and `pycolmap_from_camera` need no file.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _HALF_PIXEL = 0.5
 _LONGEST_LIST = 100
 
-#: COLMAP's models that have one of ours, and their numbers of focal lengths and of coefficients.
-#: Between these are two numbers of the principal point; coefficients are the first of ours.
+#: COLMAP's models with the corresponding ones here, and their numbers of focal lengths and of
+#: coefficients. Between these is the principal point; coefficients are the first ones of ours.
 MODELS: dict[str, tuple[Model, int, int]] = {
     "SIMPLE_PINHOLE": ("radtan", 1, 0),
     "PINHOLE": ("radtan", 2, 0),
@@ -62,7 +62,7 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
         width, height = int(fields[2]), int(fields[3])
         parameters = [float(field) for field in fields[4:]]
     except ValueError:
-        raise ConversionError(f"{where}: a size or parameter that is no number") from None
+        raise ConversionError(f"{where}: a size or parameter is not a number") from None
     return _from_parameters(where, fields[1], width, height, parameters)
 
 

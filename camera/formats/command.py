@@ -40,7 +40,7 @@ MODELS: dict[str, dict[Model, int]] = {
 
 
 def perform(options: Convert) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand_place(options.target, overwrite=options.force)
     text = read_text(options.source)
     from_format = format_of_text(options.source, text)

@@ -25,7 +25,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         def compose_node(self, parent: Any, index: Any) -> Any:
-            # Aliases of aliases grow without end, and no calibration has any.
+            # Nested aliases can grow exponentially, and calibrations have none.
             if self.check_event(yaml.events.AliasEvent):
                 line = self.peek_event().start_mark.line + 1
                 raise ConversionError(f"{name}:{line}: an alias: expected plain values")
@@ -44,13 +44,13 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or "no YAML"
+        problem = getattr(error, "problem", None) or "not YAML"
         raise ConversionError(f"{name}{where}: {problem}: expected YAML") from None
     except (ValueError, RecursionError) as error:
         if isinstance(error, ConversionError):
             raise
         raise ConversionError(
-            f"{name}: not YAML that can be read: {one_line(str(error), 100)}"
+            f"{name}: invalid YAML: {one_line(str(error), 100)}"
         ) from None
     if not isinstance(content, dict):
         raise ConversionError(f"{name}: expected YAML with keys and values")
@@ -68,7 +68,7 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
         value = value.get("data")
     result = []
     for item in np.array(value, dtype=object).ravel():
-        # YAML 1.1 takes 1e-3 for text, because it lacks the dot.
+        # YAML 1.1 parses 1e-3 as text, because it lacks the dot.
         try:
             number = float(item) if not isinstance(item, bool) else float("nan")
         except (OverflowError, TypeError, ValueError):
@@ -80,7 +80,7 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
 
 
 def first_of(content: dict[str, Any], keys: tuple[str, ...], name: str) -> Any:
-    """The value of the first key that is there."""
+    """The value of the first key that exists."""
     for key in keys:
         if key in content:
             return content[key]
@@ -95,7 +95,7 @@ def whole(value: Any, key: str, name: str) -> int:
 
 
 def image_size(content: dict[str, Any], name: str) -> tuple[int, int]:
-    """Width and height of the images, as OpenCV or ROS name them."""
+    """Width and height of the images, by the keys of OpenCV or ROS."""
     sides = []
     for side in ("width", "height"):
         key = f"image_{side}"
@@ -167,7 +167,7 @@ def opencv_model(coefficients: list[float], *, fisheye: bool, name: str) -> Mode
 
 
 def name_of_one(held: Sequence[str], camera_name: str, name: str, what: str = "camera") -> str:
-    """The name of the camera that is asked for of those that a file holds, or of the only one."""
+    """The name of the requested camera in a file, or of the only one."""
     listed = one_line(", ".join(held), _LONGEST_LIST) or "none"
     if camera_name and camera_name not in held:
         raise ConversionError(f"{name}: no camera {camera_name}: it holds {listed}")
@@ -185,7 +185,7 @@ def foreign(
     pinhole: tuple[float, float, float, float],
     coefficients: list[float],
 ) -> ForeignCamera:
-    """Make a camera; coefficients of the model that the file does not give are 0."""
+    """Make a camera; coefficients of the model that are not in the file are 0."""
     count = COEFFICIENTS[model]
     padded = (*coefficients, *(0.0,) * count)[:count]
     try:
@@ -237,7 +237,7 @@ def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
 
 
 def camera_of_info(content: dict[str, Any], name: str) -> ForeignCamera:
-    """A camera of the fields of a ``sensor_msgs/CameraInfo``, as a message or a file has them."""
+    """A camera of the fields of a ``sensor_msgs/CameraInfo``, from a message or a file."""
     width, height = image_size(content, name)
     for key in ("binning_x", "binning_y"):
         binning = content.get(key)
@@ -264,7 +264,7 @@ def camera_of_info(content: dict[str, Any], name: str) -> ForeignCamera:
 
 
 def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None:
-    """Refuse a region of interest other than none (all 0) or the whole image."""
+    """Reject a region of interest other than none (all 0) or the whole image."""
     if not isinstance(roi, dict):
         return
     found = tuple(roi.get(key, 0) for key in ("x_offset", "y_offset", "width", "height"))
@@ -276,7 +276,7 @@ def _demand_whole_image(roi: object, width: int, height: int, name: str) -> None
 
 
 def format_ros(camera: ForeignCamera) -> str:
-    """The text of a camera_info YAML file, as camera_calibration writes it."""
+    """The text of a camera_info YAML file, as written by camera_calibration."""
 
     def matrix(rows: int, *values: float) -> dict[str, Any]:
         return {"rows": rows, "cols": len(values) // rows, "data": list(values)}
@@ -302,7 +302,7 @@ _LONGEST_LIST = 100
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
-    """A camera of the text of a camchain; `camera_name` says which, such as ``cam0``."""
+    """A camera of the text of a camchain; `camera_name` selects it, such as ``cam0``."""
     content = parse_yaml(text, name)
     cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
     cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
@@ -336,7 +336,7 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
             "expected 4 and 4"
         )
     if not isinstance(resolution, list) or len(resolution) != 2:
-        raise ConversionError(f"{where}: resolution is no pair: expected [width, height]")
+        raise ConversionError(f"{where}: resolution is not a pair: expected [width, height]")
     width, height = (whole(side, "resolution", where) for side in resolution)
     fx, fy, cx, cy = intrinsics
     return foreign(where, _KALIBR_MODELS[label], width, height, (fx, fy, cx, cy), d)

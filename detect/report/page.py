@@ -89,7 +89,7 @@ def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
 
 
 def perform(options: Report) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     if options.worst < 0:
         raise DetectError(f"worst is {options.worst}: expected 0 or more")
     demand_recording(options.run)

@@ -1,7 +1,7 @@
-"""Rows as a differently mounted camera would have written them, with derivatives.
+"""Rows as written by a differently mounted camera, with derivatives.
 
-A row puts a pixel on the floor through the camera as calibrated. If the camera is really mounted
-otherwise, the same pixel's ray meets the floor elsewhere.
+A row is a pixel projected to the floor through the camera as calibrated. If the camera's true
+mounting is different, the same pixel's ray meets the floor elsewhere.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from redetect.slam.errors import SlamError
 def rows_through_mounting(
     camera: Camera, floor_xy: FloatArray, mounting: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where rows' rays meet the floor if the camera is mounted otherwise.
+    """Intersections of rows' rays with the floor for a different mounting of the camera.
 
-    Takes `floor_xy` (n, 2) as the rows have it, and robot_from_camera as mounted (3, 4). Returns
-    `floor_xy` (n, 2) in the robot frame (m), NaN where a ray does not go down, and `by_mounting`
+    Takes `floor_xy` (n, 2) of the rows, and robot_from_camera as mounted (3, 4). Returns
+    `floor_xy` (n, 2) in the robot frame (m), NaN if a ray does not go down, and `by_mounting`
     (n, 2, 6): derivatives by a rotation vector in the robot frame, applied to the mounting from the
-    left, and by the camera's place.
+    left, and by the camera's position.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
@@ -38,9 +38,9 @@ def rows_through_mounting(
 
 
 def _on_floor(ray: FloatArray, height_m: float) -> tuple[FloatArray, FloatArray]:
-    """Slopes (n, 2) of rays (n, 3), NaN where one does not go down.
+    """Slopes (n, 2) of rays (n, 3), NaN if one does not go down.
 
-    And the derivatives (n, 2, 3) of where they meet the floor, ``-height_m * slope``, by the rays.
+    Also the derivatives (n, 2, 3) of their points on the floor, ``-height_m * slope``, by the rays.
     """
     ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
     slope = ray[:, :2] / ray[:, 2:]
@@ -53,10 +53,10 @@ def _on_floor(ray: FloatArray, height_m: float) -> tuple[FloatArray, FloatArray]
 def rows_as_recorded(
     camera: Camera, floor_xy: FloatArray, mounting: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows by the calibration of discs that the camera sees as mounted.
+    """Rows, written with the calibration, of discs seen by the camera as mounted.
 
-    The lens cancels: the ray that shows a disc is put on the floor from where the calibration has
-    the camera.
+    The lens cancels: the ray of a disc is intersected with the floor from the camera's calibrated
+    pose.
 
     Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
     its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter by the numbers that
@@ -72,7 +72,7 @@ def rows_as_recorded(
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
-    """Rotation vector in the robot frame (rad) and place (m), true less calibrated.
+    """Rotation vector in the robot frame (rad) and position (m), true minus calibrated.
 
     Takes `mounting` (3, 4); returns (6,).
     """
@@ -81,7 +81,7 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
 
 
 def mounted_camera(camera: Camera, mounting: FloatArray, covariance: FloatArray) -> Camera:
-    """The camera as mounted, with the covariance of that if it states one.
+    """The camera as mounted, with the mounting's covariance if the camera has a covariance.
 
     Takes `mounting` (3, 4), and the `covariance` (6, 6) of its change.
     """
@@ -90,18 +90,18 @@ def mounted_camera(camera: Camera, mounting: FloatArray, covariance: FloatArray)
     if stated is None:
         return mounted
     stated[COUNT:] = stated[:, COUNT:] = 0.0
-    # A calibration has the place before the rotation.
+    # In a calibration, the position precedes the rotation.
     stated[COUNT:, COUNT:] = np.roll(covariance, 3, axis=(0, 1))
     return with_covariance(mounted, stated)
 
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
-    """See that rows can come from a camera at all."""
+    """Check that rows can be from a camera at all."""
     pixels = camera.project_floor(floor_xy)
     outside = ~np.all(np.isfinite(pixels), axis=-1)
     if np.any(outside):
         x, y = floor_xy[np.flatnonzero(outside)[0]]
         raise SlamError(
-            f"--calibrate: {int(np.sum(outside))} rows, the first at ({x:g}, {y:g}), lie where the "
-            "camera as calibrated cannot see: expected the calibration that the rows were made with"
+            f"--calibrate: {int(np.sum(outside))} rows, the first at ({x:g}, {y:g}), are not "
+            "visible to the camera as calibrated: expected the calibration used to make the rows"
         )

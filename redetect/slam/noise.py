@@ -25,7 +25,7 @@ from redetect.slam.settings import AddedNoise
 
 
 def perform(options: Noise) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     noise = options.noise
     (source,) = landmark_files(
         options.run, circles=not options.lines, lines=options.lines, stem=options.stem

@@ -154,7 +154,7 @@ NASTY = [
     ("opencv", b"image_width: 4\nimage_height: 4\nK: [" + b"1, " * 900 + b"1]\n", "expected the 9"),
     ("opencv", b"? 0x" + b"f" * 9000 + b"\n: 1\n", "lacks image_width"),
     ("opencv", b"a: &a [1]\nb: *a\n", "an alias"),
-    ("opencv", b"[" * 5000, "not YAML that can be read"),
+    ("opencv", b"[" * 5000, "invalid YAML"),
     ("camera info", b"!!python/object/apply:os.system ['true']\n", "expected YAML"),
     ("kalibr", b"a: {intrinsics: 1}\n" + b"b" * 900 + b": {intrinsics: 1}\n", "it holds a, bbb"),
     ("floor points", b"u,v,x,y\n\"" + b"1" * 200_000, "expected floor points"),

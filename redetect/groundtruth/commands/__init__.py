@@ -1,1 +1,1 @@
-"""The commands of ``groundtruth``: a module each, its `perform` carries it out."""
+"""The commands of ``groundtruth``: each is a module whose `perform` executes it."""

@@ -35,7 +35,7 @@ _DISTURBED = 3
 
 
 def perform(options: Laser) -> int:
-    """Carry the command out; returns the exit code: 1 without a single pose."""
+    """Execute the command; returns the exit code: 1 without a single pose."""
     output = options.output or options.session / "laser.csv"
     account, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
     check_outputs([output, account, summary], options.force)

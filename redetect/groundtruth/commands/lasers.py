@@ -29,7 +29,7 @@ _ICP_STEPS = 30
 
 
 def perform(options: Lasers) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     session = options.session
     output = options.output or session / "aligned.json"
     picture = output.with_suffix(".png")

@@ -1,4 +1,4 @@
-"""``groundtruth network``: files and messages round the cameras' poses."""
+"""The command ``groundtruth network``: files and messages of the cameras' poses."""
 
 from __future__ import annotations
 

@@ -21,21 +21,21 @@ T = TypeVar("T")
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
-    """Refuse to begin where an output exists, unless it may be replaced, or two are one file."""
+    """Raise an error if an output exists and must not be replaced, or two are the same file."""
     given = [path for path in paths if path is not None]
     demand_free(given, overwrite=force)
     places: set[Path] = set()
     for path in given:
         if path.resolve() in places:
             raise GroundTruthError(
-                f"{path}: two of the outputs would be written there: expected another name or "
-                "ending"
+                f"{path}: two of the outputs would be written there: expected different names or "
+                "endings"
             )
         places.add(path.resolve())
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
-    """Metadata of a result: version, settings, and the files that it depends on."""
+    """Metadata of a result: version, settings, and the files on which it depends."""
     return {
         "version": __version__,
         "settings": settings if isinstance(settings, dict) else asdict(settings),
@@ -46,16 +46,16 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
 
 
 def progress(items: Sequence[T], label: str) -> Iterable[T]:
-    """The items one after the other, on a terminal with a bar of their progress."""
-    # The file is checked: environment variables can make rich take a log for a terminal, and of a
-    # disabled bar, older versions of it print the line's end.
+    """The items one after the other, with a progress bar on a terminal."""
+    # The file is checked: environment variables can make rich treat a log as a terminal, and its
+    # older versions print the line end of a disabled bar.
     if not sys.stderr.isatty():
         return items
     return track(items, label, console=Console(stderr=True))
 
 
 def residual_figures(adjusted: Any, views: Sequence[int]) -> dict[str, Any]:
-    """Figures of some of a bundle's views: how many, how many wrong, residuals of the others."""
+    """Figures of some of a bundle's views: number, outliers, residuals of the others."""
     chosen = np.isin(adjusted.bundle.view, views)
     used = chosen & adjusted.used
     wrong = len(np.unique(adjusted.bundle.view[chosen & ~adjusted.used]))

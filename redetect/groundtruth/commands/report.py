@@ -13,7 +13,7 @@ from redetect.storage import write_bytes
 
 
 def perform(options: Report) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     output = options.output or options.session / "report.html"
     check_outputs([output], options.force)
     inputs = gather(options.session, options.truth)
@@ -22,5 +22,5 @@ def perform(options: Report) -> int:
     for problem in inputs.problems:
         print(f"warning: {problem}", file=sys.stderr)
     shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]
-    print(f"{output}: {', '.join(shown) or 'no poses'}; {len(inputs.missing)} files not there")
+    print(f"{output}: {', '.join(shown) or 'no poses'}; {len(inputs.missing)} missing files")
     return 0

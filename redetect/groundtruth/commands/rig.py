@@ -1,4 +1,4 @@
-"""The command ``groundtruth rig``: reads runs, estimates a rig, puts it into the robot's frame."""
+"""The command ``groundtruth rig``: reads runs, estimates a rig in the robot's frame, writes it."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def perform(command: RigCommand) -> int:
 
 
 def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]:
-    """The cameras, and images grouped by time, or each by itself without a network's file."""
+    """The cameras, and images grouped by time, or separately without a network's file."""
     if command.network is not None:
         network = read_network(command.network)
         frames = read_all_frames(command.runs, network)

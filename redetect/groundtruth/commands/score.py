@@ -1,4 +1,4 @@
-"""``groundtruth score``: files and messages round errors against the truth."""
+"""The command ``groundtruth score``: files and messages of errors against the truth."""
 
 from __future__ import annotations
 

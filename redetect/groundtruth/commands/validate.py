@@ -55,7 +55,7 @@ OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.
 
 
 def perform(options: Validate) -> int:
-    """Carry the command out; returns the exit code: 1 without a reference pose to compare with."""
+    """Execute the command; returns the exit code: 1 without a reference pose to compare with."""
     session, folder = options.session, options.output
     outputs = {name: folder / name for name in OUTPUTS}
     check_outputs(list(outputs.values()), options.force)

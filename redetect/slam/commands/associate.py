@@ -34,7 +34,7 @@ Scores = dict[str, dict[str, AssociationScore]]
 
 
 def perform(options: Associate) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
     settings = options.settings
     sources = [(k, f) for k, run in enumerate(options.runs) for f in files_of(options, run)]

@@ -29,7 +29,7 @@ _COLUMNS = (
 
 
 def perform(options: Options) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand(options, SlamError, gate=ABOVE_0)
     (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")

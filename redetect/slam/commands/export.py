@@ -27,7 +27,7 @@ _LANDMARKS = (".circles", ".lines", ".markers")
 
 
 def perform(command: Export | Import) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     if isinstance(command, Import):
         return _import(command)
     if command.to == "g2o":

@@ -52,7 +52,7 @@ _Result = tuple[FilterRun, LandmarkMap, list[str]]
 
 
 def perform(command: Localize | Ekf) -> int:
-    """Carry the command out; returns the exit code."""
+    """Execute the command; returns the exit code."""
     demand(command, SlamError, start=FINITE)
     name = type(command).__name__.lower()
     output = command.output or default_output(command.run, name)

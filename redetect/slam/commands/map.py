@@ -51,7 +51,7 @@ MOST_LANDMARKS_TOGETHER = 5000
 
 
 def perform(command: Map) -> int:
-    """Carry the command out; 0 if all went well."""
+    """Execute the command; returns 0 if it succeeds."""
     output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
     paths = [PATH_NAME]

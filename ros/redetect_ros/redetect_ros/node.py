@@ -1,7 +1,7 @@
 """The node `redetect`: discs, verticals and tilt in each image of a topic, as standard messages.
 
-What becomes of a row is decided by `detect.ros_messages`, for files of messages as well; here are
-parameters, topics and the life of the node.
+`detect.ros_messages` converts rows to messages, also for files of messages; this module has the
+parameters, topics and life cycle of the node.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from detect.sources.interface import RunFrame, read_image, still
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.columns import TableName, values_of
 
-#: The parameters with their defaults; README.md says what they mean.
+#: The parameters with their defaults; README.md describes them.
 PARAMETERS = {
     "camera": "",
     "settings": "",
@@ -61,7 +61,7 @@ def tables_of(found: rd.Detection) -> dict[TableName, list[Values]]:
 
 
 def camera_transform(camera: rd.Camera, header: Any, image_frame: str) -> Any:
-    """Where the camera is on the robot, which the header names, as `tf2_msgs/TFMessage`.
+    """The camera's pose on the robot, whose frame is in the header, as `tf2_msgs/TFMessage`.
 
     The camera's frame has x to the right, y down and z forward: REP 103's suffix `_optical`.
     """
@@ -70,12 +70,12 @@ def camera_transform(camera: rd.Camera, header: Any, image_frame: str) -> Any:
 
 
 class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
-    """Detects in the newest image; those that come meanwhile are left out.
+    """Processes the newest image; others that arrive meanwhile are dropped.
 
     Raises
     ------
     rd.Error
-        If the calibration or the settings cannot be read or cannot be.
+        If the calibration or the settings cannot be read, or are impossible.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
             settings=settings.circles,
             line_settings=settings.lines,
         )
-        # Compiles the kernels and makes the tables, before the first image comes.
+        # Compiles the kernels and makes the tables before the first image arrives.
         self._detect(np.zeros((self._camera.height, self._camera.width), np.uint8))
         self._frame_prefix = given["frame_prefix"]
         self._outputs = {
@@ -118,7 +118,7 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
         )
 
     def on_image(self, message: Any) -> None:
-        """Detect in an image and publish what is found, with the image's time."""
+        """Process an image and publish the detections, with the image's time."""
         try:
             frame = RunFrame(still("image"), None, content_of_message(message, "image"))
             found = self._detect(read_image(frame, self._camera))
@@ -131,7 +131,7 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
             robot = header_of(make, time_ns, f"{self._frame_prefix}base_link")
             image_frame = message.header.frame_id
             self._mounting.publish(camera_transform(self._camera, robot, image_frame))
-            self._mounting = None  # it stays, for those who come later, too
+            self._mounting = None  # it is latched for late subscribers
         frames = [(time_ns, tables_of(found))]
         for _, topic, made in ros_messages(make, frames, self._frame_prefix):
             self._outputs[topic].publish(made)
