@@ -49,9 +49,7 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if isinstance(error, ConversionError):
             raise
-        raise ConversionError(
-            f"{name}: invalid YAML: {one_line(str(error), 100)}"
-        ) from None
+        raise ConversionError(f"{name}: invalid YAML: {one_line(str(error), 100)}") from None
     if not isinstance(content, dict):
         raise ConversionError(f"{name}: expected YAML with keys and values")
     # Keys of calibrations are words, or cameras' numbers; others may be too long to be written.
