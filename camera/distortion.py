@@ -67,7 +67,7 @@ _NODES_BETWEEN = 513
 def radial_factor(
     radius: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> FloatArray:
-    """f(r), by which the distortion moves points of undistorted normalised radii r >= 0."""
+    """f(r), the factor of the distortion at undistorted normalised radii r >= 0."""
     a2, a3, b1, b2, b3 = coef
     numerator = radius * (a2 + radius * a3)
     denominator = 1.0 + radius * (b1 + radius * (b2 + radius * b3))
@@ -174,7 +174,7 @@ def undistorted_radius(
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step = error / (f + r * radial_factor_derivative(r, coef, polynomial))
         moved = np.clip(r + np.where(error == 0.0, 0.0, step), low, high)
-        # Newton's error squares with each step: after one this small nothing is left to gain.
+        # Newton's error is squared by each step: after one this small it has converged.
         small = np.abs(moved - r) <= _LAST_STEP * np.maximum(1.0, r)
         r = np.where(ended, r, moved)
         ended = ended | small
@@ -208,7 +208,7 @@ def brown_jacobian(xy: FloatArray, brown: Brown) -> FloatArray:
     jacobian = 2.0 * (along + outer + outer.swapaxes(-1, -2))
     if any(polynomial_of(brown)):
         squared = np.sum(xy * xy, axis=-1)[..., None, None]
-        # d(x p)/dx = p + x dp/dx, and the derivative of p by r is r times what is in brackets.
+        # d(x p)/dx = p + x dp/dx, and dp/dr is r times the slope below.
         jacobian = jacobian + squared * (k1 + squared * (k2 + squared * k3)) * np.eye(2)
         slope = 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
         jacobian = jacobian + slope * (xy[..., :, None] * xy[..., None, :])

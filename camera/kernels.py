@@ -125,7 +125,7 @@ def straightened_point(
             x_step = (yy * x_off - xy * y_off) / determinant
             y_step = (xx * y_off - xy * x_off) / determinant
             length = math.sqrt(x_step * x_step + y_step * y_step)
-            # Newton's error squares with each step: after one this small nothing is left to gain.
+            # Newton's error is squared by each step: after one this small it has converged.
             last = length <= _LAST_STEP * max(1.0, r)
         else:
             # Go back, and make a smaller step.

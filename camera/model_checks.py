@@ -26,7 +26,7 @@ _PLACES = 65
 
 
 def check_numbers(camera: Camera) -> None:
-    """Refuse sizes, scales and coefficients that are impossible each for itself."""
+    """Reject sizes, scales and coefficients that are impossible by themselves."""
     for name, side in (("width", camera.width), ("height", camera.height)):
         if not 1 <= side <= _LARGEST_SIDE_PX:
             raise CameraError(f"{name} is {side}: expected 1 to {_LARGEST_SIDE_PX} pixels")
@@ -51,7 +51,7 @@ def check_numbers(camera: Camera) -> None:
 
 
 def check_one_to_one(camera: Camera) -> None:
-    """Refuse a distortion that folds so far inside the image that less than half of it is left."""
+    """Reject a distortion whose fold leaves less than half of the image usable."""
     beyond = _first_unseen(camera)
     if beyond is None or (share := seen_share(camera)) >= LEAST_SEEN_SHARE:
         return
@@ -70,9 +70,9 @@ def check_one_to_one(camera: Camera) -> None:
 
 
 def seen_share(camera: Camera) -> float:
-    """Share of the image's pixels that see anything: 1, if the distortion folds beyond the image.
+    """Share of the image's pixels with a direction: 1 if the distortion folds outside the image.
 
-    Fits of few coefficients often fold in the corners, where no board was.
+    Fits with few coefficients often fold in the corners, where there was no board.
     """
     if _first_unseen(camera) is None:
         return 1.0

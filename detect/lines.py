@@ -1,6 +1,6 @@
 """The detector of verticals: from one image to lines with bearings and standard deviations.
 
-The stages of an image, each a function of its own:
+The stages of an image, each in its own function:
 
     starts          maxima of the response on the horizon (or the anchor: `lut.verticals`)
     tracks          the edges through them, followed up and down

@@ -6,8 +6,8 @@ A board's frame: origin in the middle of its points, x right, y up, z out of the
 - a ChArUco board's first marker is at the top left, as OpenCV prints it;
 - the first of a circle grid's points is at the top left.
 
-A board's points go row by row from the top left. What is printed is a list of black shapes in
-metres, in the same frame.
+A board's points are in rows from the top left. The print is a list of black shapes in metres, in
+the same frame.
 """
 
 from __future__ import annotations

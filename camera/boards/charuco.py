@@ -1,6 +1,6 @@
 """Corners of a ChArUco board: OpenCV reads the markers, and each corner is measured on its edges.
 
-The markers fill most of the white squares. A window round a corner therefore contains marker edges,
+The markers fill most of the white squares. A window around a corner thus contains marker edges,
 which bias the corner. Instead, two strips along the corner's own edges are measured, as wide as the
 white margin between edge and marker. Corners whose markers were not read (small, oblique or cut off
 by the image's border) are searched at positions predicted from their neighbours.
@@ -73,10 +73,10 @@ def _interpolated(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]
 def both_heights(
     image: GreyImage,
 ) -> Iterator[tuple[GreyImage, Callable[[FloatArray], FloatArray]]]:
-    """The image, and stretched to twice its height, each with what takes (N, 2) pixels back.
+    """The image, and the image stretched to twice its height, each with its map of pixels back.
 
-    Half-height images flatten what is square or round. Row v of these is at 2 v + 0.5 when
-    stretched.
+    Half-height images flatten squares and circles. Their row v is at 2 v + 0.5 in the stretched
+    image.
     """
     yield image, lambda pixels: pixels
     height, width = image.shape

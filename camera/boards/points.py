@@ -13,13 +13,13 @@ from camera.boards.charuco import both_heights, find_charuco
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
-# Half the side of the window round a corner, as a share of its squares in the image.
+# Half the side of the window around a corner, as a share of its squares in the image.
 _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW = 2
 _LARGEST_HALF_WINDOW = 9
 _FEWEST_POINTS = 8
-# Lengths of the longer side (px) to which an image is reduced, in turn, to search a checkerboard.
-# The time of OpenCV's search grows faster than the image, most of all in images without a board,
+# Lengths of the longer side (px) to which an image is reduced, one after the other, to search a
+# checkerboard. The time of OpenCV's search grows faster than the image, especially without a board,
 # and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
@@ -40,9 +40,9 @@ def find_board(
     Returns
     -------
     indices : (K,) int64 array
-        Which of `Board.points`; ascending.
+        Indices of `Board.points`, ascending.
     pixels : (K, 2) array
-        Where they are (the top left pixel's centre is 0, 0).
+        Their positions (the top left pixel's centre is 0, 0).
 
     Raises
     ------
@@ -111,8 +111,8 @@ def _reductions(image: GreyImage) -> Iterator[GreyImage]:
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
     """Refine saddle points, each in a window without other features.
 
-    Each corner has a small window of its own: a larger one is affected by distortion of the edges,
-    and one that reaches the next corner is attracted by it. Corners that are NaN stay so.
+    Each corner has its own small window: a larger one is affected by distortion of the edges, and
+    attracted by the next corner if it contains that. NaN corners remain NaN.
     """
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
@@ -216,7 +216,7 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
     spacing = _least_spacing(grid.astype(np.float32))
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):
-        # Twice, because the first window is round the finder's centre.
+        # Twice, because the first window is around the finder's centre.
         for _ in range(2):
             moved = _centroid(image, result[index], 0.5 * spacing)
             if moved is None:
@@ -226,7 +226,7 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 
 
 def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | None:
-    """Centroid of the dark blob in the square window round `at`; None where there is none."""
+    """Centroid of the dark blob in the square window around `at`; None if there is none."""
     half = max(int(reach), 3)
     u, v = int(np.rint(at[0])), int(np.rint(at[1]))
     top, left = max(v - half, 0), max(u - half, 0)
@@ -237,7 +237,7 @@ def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | No
     dark = float(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
     if light - dark < 20.0:
         return None
-    # Paper and ink are flat; only the circle's edge, where a pixel holds both, counts in part.
+    # Paper and ink are uniform; only pixels on the circle's edge have fractional weights.
     weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
     weight[weight < 0.15] = 0.0
     connected = _blob(weight, v - top, u - left)

@@ -52,10 +52,10 @@ _SCALE_ROUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of boards, where they were seen."""
+    """Points of boards and their pixels."""
 
     board: FloatArray  #: (N, 3) points in their board's frame, metres
-    pixels: FloatArray  #: (N, 2) where they were seen
+    pixels: FloatArray  #: (N, 2) measured pixels
     views: IntArray  #: (N,) the view of each, counted from 0; no view is empty
     #: Size of the image, pixels
     width: int

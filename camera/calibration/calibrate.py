@@ -113,8 +113,8 @@ class BoardView:
     """A board in a picture."""
 
     name: str  #: of the picture
-    indices: IntArray  #: (K,) which of the board's points were seen
-    pixels: FloatArray  #: (K, 2) where they were seen
+    indices: IntArray  #: (K,) indices of the board's points that were found
+    pixels: FloatArray  #: (K, 2) their pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +122,12 @@ class Calibration:
     """A calibrated camera."""
 
     adjusted: Adjusted
-    points: Points  #: The points that it was fitted to, corrected for the circles' shifts
+    points: Points  #: The fitted points, corrected for the circles' shifts
     names: tuple[str, ...]  #: The views' names
-    outliers: tuple[tuple[str, float], ...]  #: Views left out, with the RMS of their residuals (px)
+    outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
-    #: RMS reprojection error (u and v together) in views that the intrinsics were not fitted to, by
-    #: what was free; all that was tried
+    #: RMS reprojection error (u and v together) in held-out views, for each set of coefficients that
+    #: was tried
     holdout_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 

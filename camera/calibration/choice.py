@@ -169,7 +169,7 @@ def holdout_error(
         there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
             test = fitted(there, held, nothing, sigma_px=fit.sigma_px)
-        except StartError:  # a held-out point lies past this fit's fold
+        except StartError:  # a held-out point is beyond this fit's fold
             return float("inf")
         squares += float(np.sum(test.residuals**2))
     return float(np.sqrt(squares / len(points.board)))

@@ -261,7 +261,7 @@ def _check(pixels: FloatArray, floor: FloatArray, size: tuple[int, int]) -> None
     for what, values in (("on the floor", floor[:, :2]), ("in the image", pixels)):
         away = values - values.mean(axis=0)
         spreads = np.linalg.eigvalsh(
-            # Of all but one, each in turn.
+            # Leaving out one point at a time.
             away.T @ away - len(away) / (len(away) - 1) * away[:, :, None] * away[:, None, :]
         )
         if np.any(spreads[:, 0] < 1e-6 * spreads[:, 1]):

@@ -1,8 +1,8 @@
 """Model of the calibration: the projection with its derivatives, and which parameters are free.
 
 Intrinsics are always the vector ``(scaleX, scaleY, offsetX, offsetY, a2, a3, b1, b2, b3, p1, p2,
-k1, k2, k3)``, the order of the ``.cam`` file. What is free of them is a matrix `span`, so that
-equal scales are one column and a coefficient that is left at 0 has none.
+k1, k2, k3)``, the order of the ``.cam`` file. The columns of a matrix `span` are the free ones:
+equal scales are one column, and a coefficient that is kept at 0 has none.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class FreeLens(NamedTuple):
     tangential: bool = False
     """Whether p1 and p2 are."""
     polynomial: int = 0
-    """How many of k1, k2, k3 are."""
+    """Number of k1, k2, k3 that are."""
 
     def span(self, aspect: float | None) -> FloatArray:
         """(14, K) directions in which intrinsics may change.
@@ -198,7 +198,7 @@ class FreeLens(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationSettings:
-    """How to calibrate: what is None is chosen, as by the flags (`camera.options.Calibrate`)."""
+    """Settings of a calibration; None means automatic, as for the flags of `camera calibrate`."""
 
     #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
     #: are free

@@ -60,7 +60,7 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estim
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
     coef, brown = lens_of(intrinsics)
     straight = straightened(normalised, coef, brown, one_to_one_radius(coef, brown))
-    # A point past the fold stays where it is: this is but a start.
+    # A point beyond the fold is not changed, which is sufficient for a start.
     straight = np.where(np.isnan(straight), normalised, straight)
     found = []
     for view in range(len(points.counts)):

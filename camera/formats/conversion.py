@@ -119,7 +119,7 @@ def nearer(*found: Converted) -> Converted:
 
 
 def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> FloatArray:
-    """Parameters towards the smallest largest distance: weights grow where it is large.
+    """Parameters with the least maximal distance, by increasing weights where it is large.
 
     References
     ----------
@@ -268,7 +268,7 @@ def convert_to_camera(
 
 
 def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
-    """The source itself in a model of which `number` coefficients are free, if that holds it."""
+    """The source, exactly, in a model with `number` free coefficients, if that contains it."""
     if isinstance(source, Camera):
         if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None

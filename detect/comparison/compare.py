@@ -1,8 +1,8 @@
 """Compares detected discs, or lines, with reference rows of the same run.
 
-Discs are paired in the image, where they were seen, or on the floor; lines by bearing. Differences
-of paired discs on the floor are given twice: as the rows are, and after levelling both by the tilt
-that levelled the detected ones.
+Discs are paired at their positions in the image, or on the floor; lines by bearing. Differences of
+paired discs on the floor are computed twice: for the rows as written, and after levelling both by
+the tilt of the detected ones.
 
 A detected line can represent several that were joined: unpaired reference lines within its sigma
 count as found, too.

@@ -141,7 +141,7 @@ class Comparison(ABC):
     missed: int
     extra: int
     set_aside: int
-    on_lookalikes: int | None  # extra rows on what resembles a disc, where that is known
+    on_lookalikes: int | None  # extra rows on known look-alikes; None if unknown
     recall: float | None
     precision: float | None
     normalised_error: NormalisedError

@@ -77,11 +77,11 @@ COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgE
 class FrameDetections:
     """Detections in one image; None for kinds that were not searched."""
 
-    image: GreyImage | None = None  # (H, W); None where it cannot be read
+    image: GreyImage | None = None  # (H, W); None if it cannot be read
     lines: LineDetections | None = None
     tilt: FrameTilt | None = None  # from the lines, if enough determine it, or prior data
     seen: CircleDetections | None = None  # discs, assuming a level robot
-    discs: CircleDetections | None = None  # corrected for the tilt, if the plan says so
+    discs: CircleDetections | None = None  # corrected for the tilt, if planned
     outline_tilt: FrameTilt | None = None  # from the discs, if a run is levelled by all frames
     markers: MarkerDetections | None = None
     error: str | None = None  # why the frame cannot be processed
@@ -208,8 +208,8 @@ _Tilted = tuple[str, int, FrameTilt | None]
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-#: Least lean that the search for discs takes into account, degrees, and the factor by which it has
-#: to increase the evidence: all verticals may lean, and a slight lean does no harm.
+#: Least lean that the search for discs considers, degrees, and the factor by which it must increase
+#: the evidence: all verticals of a building may lean, and a slight lean does no harm.
 _LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
 #: Steps of the lean of a single frame, degrees.
 _FRAME_LEAN_DEG = 2.0

@@ -1,7 +1,7 @@
 """The output files of a run, each with kind, path, head and rows; and the log.
 
-The log, ``<output>.log.json``, contains the program and its settings, the frames that could not be
-processed and why, and how much was found. It does not depend on the time of day or the workers: the
+The log, ``<output>.log.json``, contains the program and its settings, the failed frames with
+reasons, and the number of detections. It does not depend on the time of day or the workers: the
 same run writes the same bytes.
 """
 

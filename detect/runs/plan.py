@@ -154,8 +154,8 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: Whether discs are levelled by nothing, by the tilt of their own frame, or, after all frames
-    #: are done, by that of the run.
+    #: Whether discs are not levelled, levelled by the tilt of their own frame, or, after all frames
+    #: are processed, by that of the run.
     levelling: Levelling = "frame"
     #: Lean of the camera in the search for discs; set by `detect_run`.
     lean: Lean | None = None

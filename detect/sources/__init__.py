@@ -2,7 +2,7 @@
 
 ::
 
-    source             module        how it is named
+    source             module        name
     run folder         image_files   the folder
     images             image_files   a folder, one image, or a pattern such as 'drive/*.png'
     video file         video         the file

@@ -110,7 +110,7 @@ def draw_map(
     Raises
     ------
     SlamError
-        If it is `interactive` where no window can be opened.
+        If it is `interactive` and no window can be opened.
     """
     panels = [("", landmark_map, path)]
     if before is not None:

@@ -71,7 +71,7 @@ def test_a_path_comes_back(tmp_path: Path, with_covariance: bool) -> None:
         (HEAD + "disc,1.5,0,0,1,0,1,3\n", ":2: id is '1.5'"),
         (HEAD + "disc,1,nan,0,1,0,1,3\n", ":2: x_m is 'nan'"),
         (HEAD + "disc,1,0,0,1,2,1,3\n", "covariance is negative"),
-        (HEAD + "disc,1,0,0,1,0,1,3\n\ndisc,1,0,0,1,0,1,3\n", ":4: disc 1 is in the map"),
+        (HEAD + "disc,1,0,0,1,0,1,3\n\ndisc,1,0,0,1,0,1,3\n", ":4: disc 1 is already in the map"),
         (HEAD + "disc,1,0,0,1,0,1\n", ":2: 7 values: expected 8"),
     ],
 )

@@ -1,4 +1,4 @@
-"""``groundtruth fuse``: files and messages round the fusion."""
+"""The command ``groundtruth fuse``: files and messages of the fusion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``groundtruth poses``: files and messages round the poses of a session."""
+"""The command ``groundtruth poses``: files and messages of a session's poses."""
 
 from __future__ import annotations
 

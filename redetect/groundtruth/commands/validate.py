@@ -175,7 +175,7 @@ def _table_rows(
 
 
 def _table_text(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows as lines between commas, with a head; empty where there is no value."""
+    """Rows as comma-separated lines with a head; missing values are empty."""
     decimals = {"nees": 4, "angular_deg": 5}
 
     def word(name: str, value: Any) -> str:

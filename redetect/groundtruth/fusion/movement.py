@@ -261,9 +261,9 @@ class MovementProblem:
         """(N, 3) noise of movements to nodes: along the path, across it (m^2), of the turn (rad^2).
 
         `noise` (4,): see `redetect.groundtruth.fusion.inputs.noise_of`. All of it is proportional
-        to way, turn and time, so that it adds up over parts of a movement; but for what pauses
-        hide: there odometry's systematic bend has a way to act on that is not known, and what a
-        wrong heading leads aside is taken to be that of a way out and back.
+        to way, turn and time, so that it adds up over parts of a movement, except in pauses: there
+        odometry's systematic bend acts on an unknown way, and the lateral error of a wrong heading
+        is assumed to be that of a way out and back.
         """
         along, across, by_turn, by_way = np.square(noise)
         way, turn = np.hypot(self.controls[:, 0], self.controls[:, 1]), np.abs(self.controls[:, 2])

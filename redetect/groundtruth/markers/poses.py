@@ -223,7 +223,7 @@ class PoseEstimate:
     # The best first; several if the markers are ambiguous.
     candidates: tuple[RefinedPose, ...]
     views: BoolArray  # (V,): which of all views they explain
-    # Natural logarithm of how much likelier the first is than each candidate: 0 for the first
+    # Log-odds of the first against each candidate: 0 for the first
     log_odds: tuple[float, ...]
 
     @property

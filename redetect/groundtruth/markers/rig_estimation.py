@@ -43,10 +43,10 @@ _WRONG_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """A rig and what it was made from."""
+    """An estimated rig, and the views used."""
 
     # In the robot's frame if markers were known in it, else in that of the reference; the
-    # covariance is scaled by the residuals where those are larger than the corners' say.
+    # covariance is scaled by the residuals if they are larger than implied by the corners'.
     rig: Rig
     reference: int  # The marker from which the others were chained
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig

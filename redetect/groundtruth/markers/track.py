@@ -243,9 +243,9 @@ def _steps(
     frame: IntArray,
     settings: PoseSettings,
 ) -> list[_Step]:
-    """Steps between candidates of neighbouring frames, each with its cost, by where they lead.
+    """Steps between candidates of neighbouring frames, each with its cost, by their end.
 
-    `frame` (K,): which frame each candidate, counted over all frames, is of.
+    `frame` (K,): frame of each candidate, counted over all frames.
     """
     nearest = np.searchsorted(frame, frame)
     farthest = np.searchsorted(frame, frame - 1 - _MOST_LEFT_OUT)

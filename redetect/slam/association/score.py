@@ -29,9 +29,9 @@ class AssociationScore:
     # Share of rows whose label is that of their landmark, where labels and landmarks are matched
     # one to one so that this share is largest. A row with several IDs may be any of them.
     right_rows: float
-    # Labels in excess: for each label how many landmarks it has taken in besides its first.
+    # Sum over labels of the number of landmarks that they contain besides the first.
     wrong_merges: int
-    splits: int  # for each landmark how many labels its rows have besides the first
+    splits: int  # sum over landmarks of the number of labels of their rows besides the first
 
 
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:

@@ -1,4 +1,4 @@
-"""Finds rows of discs whose identifier contradicts the rest of a run, and what they show instead.
+"""Finds rows of discs whose identifier contradicts the rest of a run, and their true landmark.
 
 Suspects are the rows that a robust map rejects. Each of them is then compared with the map of the
 others: the squared error of measurements added to a least-squares problem is
