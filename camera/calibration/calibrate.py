@@ -126,8 +126,8 @@ class Calibration:
     names: tuple[str, ...]  #: The views' names
     outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
-    #: RMS reprojection error (u and v together) in held-out views, for each set of coefficients that
-    #: was tried
+    #: RMS reprojection error (u and v together) in held-out views, by the sets of free coefficients
+    #: that were tried
     holdout_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 
