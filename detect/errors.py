@@ -30,7 +30,7 @@ class WorkerError(OneLineError, RuntimeError):
 def imported_for(
     use: str, extra: str, otherwise: str = "", error: type[Exception] = DetectError
 ) -> Iterator[None]:
-    """Import a package of an extra in a block; if missing, the error tells how to install it."""
+    """Import a package of an extra in a block; if missing, the error states how to install it."""
     try:
         yield
     except ImportError:
