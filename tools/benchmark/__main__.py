@@ -1,4 +1,4 @@
-"""Time the detectors, their parts and peers in one process: ``python -m tools.benchmark``."""
+"""Measure times of the detectors, their parts and peers: ``python -m tools.benchmark``."""
 
 from __future__ import annotations
 
@@ -40,42 +40,42 @@ from tools.benchmark.timing import decodings, measure_in_turn, number, spread
 from tools.evaluation.figures import Figures, Study, run_quietly, study_main
 from tools.evaluation.tables import Table
 
-#: Pictures of each point of the growth curves.
+#: Number of pictures at each point of the growth curves.
 _GROWTH_PICTURES = 2
-#: A command that has taken this long is left out of later rounds, seconds.
+#: A command that has taken this long is omitted in later rounds, seconds.
 _RUN_BUDGET_S = 15.0
 _PACKAGES = ("numpy", "numba", "opencv-python-headless", "scikit-image")
 
-#: Of a table: what its pictures are, these, and the functions that are timed on them.
+#: Rows of a table: the kind of pictures, the pictures, and the functions measured on them.
 Cases = Iterable[tuple[str, Sequence[Picture], dict[str, f.Function]]]
 
 
 @dataclass(frozen=True)
 class Benchmark(Study):
-    """Time the detectors, their parts and peers side by side, in one process.
+    """Measure the times of the detectors, their parts and peers, alternating in one process.
 
-    Prints Markdown tables: ratios to decoding first, since they hold on any machine.
+    Prints Markdown tables: ratios to decoding first, since they hardly depend on the machine.
     Example: python -m tools.benchmark --photographs ../shared/data/discs
     """
 
     run: Path = Path("images/e")  # The demo run: camera, pictures, and whole passes.
-    photographs: Path | None = None  # Folder with photographs; without it they are left out.
+    photographs: Path | None = None  # Folder with photographs; omitted without it.
     pictures: int = 8  # Pictures of each kind.
-    rounds: int = 10  # How often each function gets each picture.
-    run_frames: int = 1600  # Frames of a whole run: those of the demo run over and over.
+    rounds: int = 10  # Number of times that each function processes each picture.
+    run_frames: int = 1600  # Frames of a whole run: those of the demo run, repeated.
     run_rounds: int = 5  # Passes over a whole run; slow commands get fewer.
-    budget_s: float = 3.0  # A function that took this long is left out of later rounds, seconds.
+    budget_s: float = 3.0  # A function that took this long is omitted in later rounds, seconds.
     factors: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # Sides of growing images.
-    landmarks: tuple[int, ...] = (0, 5, 10, 20, 30, 50)  # Discs, and edges, painted into an image.
+    landmarks: tuple[int, ...] = (0, 5, 10, 20, 30, 50)  # Discs, and edges, drawn into an image.
     frames: tuple[int, ...] = (80, 320, 1600, 6400)  # Lengths of the growing runs.
     jobs: tuple[int, ...] = (1, 2)  # Numbers of jobs, for the growing runs.
-    seed: int = 0  # Of noise and places.
+    seed: int = 0  # Of noise and positions.
 
     def measured(self) -> Figures:
         import cv2
         import numba
 
-        # All are measured on one core; only the jobs of whole passes may take more.
+        # All are measured on one core; only the jobs of whole runs may use more.
         cv2.setNumThreads(1)
         numba.set_num_threads(1)
         run = open_run(self.run)
@@ -124,7 +124,7 @@ class Benchmark(Study):
             yield f"{camera.width * camera.height / 1e6:.6g}", scaled, f.whole_detectors(camera)
 
     def _print_table(self, cases: Cases) -> None:
-        """Times of functions, in turn with decoding, a column per case."""
+        """Times of functions, alternating with decoding, a column per case."""
         columns = {}
         for case, pictures, functions in cases:
             print(f"{case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
@@ -141,7 +141,7 @@ class Benchmark(Study):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             for command in f.commands(self.run, folder).values():
-                perform(command)  # compiles what is to be compiled
+                perform(command)  # compiles the kernels
             whole = repeated_run(run, folder / "whole", self.run_frames)
             every = [(command, 1) for command in f.commands(whole, folder)]
             yield from measure_runs(whole, every, folder, self.run_rounds)
@@ -152,7 +152,7 @@ class Benchmark(Study):
 
 
 def perform(command: f.Command) -> None:
-    """Carry out a command as ``detect`` does, but silently."""
+    """Execute a command like ``detect``, but silently."""
     run_quietly("detect", lambda: carry_out(command))
 
 
@@ -163,9 +163,9 @@ def _on_each(function: f.Function, pictures: Sequence[Picture]) -> Callable[[int
 def measure_runs(
     run: Path, chosen: Sequence[tuple[str, int]], folder: Path, rounds: int
 ) -> Iterator[list[str]]:
-    """Rows of the table of whole runs: passes of commands by name and jobs, in turn with decoding.
+    """Rows of the table of whole runs: commands by name and jobs, alternating with decoding.
 
-    Shares of decoding are per job, between passes of the same round.
+    Shares of decoding are per job, within the same round.
     """
     print(f"whole runs: {run}", file=sys.stderr, flush=True)
     paths = [frame.image for frame in open_run(run).frames if frame.image is not None]
@@ -183,7 +183,7 @@ def measure_runs(
         "reading": lambda _: decode_all(np.fromfile(path, np.uint8) for path in paths),
         **{f"{name} {jobs}": partial(timed, name, jobs) for name, jobs in chosen},
     }
-    # By the clock on the wall, since jobs are processes of their own.
+    # By wall clock, since jobs are separate processes.
     seconds = measure_in_turn(
         functions, 1, rounds, _RUN_BUDGET_S, time.perf_counter, warm_up=False, least_calls=1
     )
@@ -197,7 +197,7 @@ def measure_runs(
 
 
 def this_machine() -> str:
-    """Processor, cores, system and versions, in a line."""
+    """Processor, cores, system and versions, on one line."""
     file = Path("/proc/cpuinfo")
     rows = (
         line.partition(":") for line in (file.read_text() if file.is_file() else "").split("\n")

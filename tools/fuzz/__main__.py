@@ -1,7 +1,7 @@
 """Fuzz readers with atheris: `python -m tools.fuzz --help`.
 
-Each reader is fuzzed for so many seconds in a process of its own. Inputs that break it are kept as
-``NAME-crash-*`` in the working folder. atheris is no dependency of the project:
+Each reader is fuzzed for the given time in its own process. Inputs that break it are stored as
+``NAME-crash-*`` in the working folder. atheris is not a dependency of the project:
 `pip install atheris`.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from redetect.storage.command_line import exit_code_of
 
-#: Files are at most twice as long as the longest that a reader accepts, and at least so long.
+#: Files are at most twice as long as the longest that a reader accepts, but at least this long.
 _SHORT_BYTES = 2048
 _INSTRUMENTED = (
     "camera", "detect.drawing.inputs", "detect.runs.stream", "detect.sources", "redetect",
@@ -25,11 +25,11 @@ _INSTRUMENTED = (
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fuzz; not 0 if anything was found."""
+    """Fuzz; returns 0 if nothing was found."""
     parser = argparse.ArgumentParser(prog="python -m tools.fuzz", description="Fuzz the readers.")
-    parser.add_argument("seconds", type=int, nargs="?", default=20, help="for each (default: 20)")
-    parser.add_argument("names", nargs="*", metavar="NAME", help="with - for a space; default: all")
-    parser.add_argument("--corpus", type=Path, help="keep what was found to lead further here")
+    parser.add_argument("seconds", type=int, nargs="?", default=20, help="per reader (default: 20)")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="- for a space; default: all")
+    parser.add_argument("--corpus", type=Path, help="folder to keep the corpora")
     options = parser.parse_args(arguments)
     import atheris  # type: ignore[import-untyped,import-not-found,unused-ignore]
 

@@ -19,17 +19,17 @@ from tools.simulator.markers.session import CalibrationErrors, ImageFormat, Sess
 from tools.simulator.renderer import Sensor
 from tools.simulator.runs import RunSettings
 
-# A run of the data set has so many frames, discs and things that look like discs.
+# Numbers of frames, discs and look-alikes in a run of the data set.
 _FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Render the demo run of the project (images/e) anew."""
+    """Render the demo run of the project (images/e) again."""
 
     output: Path = Path("images/e")  # Folder of the run.
-    jobs: int = 1  # Processes that render.
-    force: bool = False  # Replace files that exist.
+    jobs: int = 1  # Number of processes.
+    force: bool = False  # Replace existing files.
 
     def __call__(self) -> str:
         from tools.simulator.runs import DEMO, write_run
@@ -43,17 +43,17 @@ class _Drive:
     """A drive through the office."""
 
     output: Positional[Path]  # Folder of the run; its name is the run's.
-    frames: int = _FULL_FRAMES  # Steps to drive, a frame after each.
-    seed: int = 1  # Everything about the run follows from it.
-    discs: int | None = None  # On the floor along the way; by default 576 in 3297 frames.
-    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
-    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
+    frames: int = _FULL_FRAMES  # Number of steps, each followed by a frame.
+    seed: int = 1  # Seed of everything random in the run.
+    discs: int | None = None  # Discs on the floor along the way; by default 576 in 3297 frames.
+    visits: float = 0.6  # Probability that a room with an open door is visited.
+    unlabelled: float = 0.03  # Share of rows with unknown ID (-1).
     camera: Path | None = None  # Calibration (.cam); the published one by default.
-    force: bool = False  # Replace files that exist.
+    force: bool = False  # Replace existing files.
     style: DriveStyle = field(default_factory=DriveStyle)
 
     def settings(self) -> RunSettings:
-        """What the run is to be like, without things that look like discs."""
+        """Settings of the run, without look-alikes."""
         from camera import format_camera, read_camera
 
         settings = RunSettings(
@@ -66,7 +66,7 @@ class _Drive:
         return replace(settings, camera_text=format_camera(read_camera(self.camera)))
 
     def by_length(self, given: int | None, full: int) -> int:
-        """What was asked for, or as many things as the length of a run allows."""
+        """The given number, or one in proportion to the length of the run."""
         return given if given is not None else max(1, round(full * self.frames / _FULL_FRAMES))
 
 
@@ -74,9 +74,9 @@ class _Drive:
 class Run(_Drive):
     """Render a run through the office: images, odometry, and the truth."""
 
-    lookalikes: int | None = None  # Other things on the floor; by default 140 in 3297 frames.
-    skip: int = 0  # Steps of the drive that go by before the first frame.
-    jobs: int = 1  # Processes that render.
+    lookalikes: int | None = None  # Look-alikes on the floor; by default 140 in 3297 frames.
+    skip: int = 0  # Number of steps before the first frame.
+    jobs: int = 1  # Number of processes.
     sensor: Sensor = field(default_factory=Sensor)
 
     def __call__(self) -> str:
@@ -94,8 +94,8 @@ class Run(_Drive):
 class Rows(_Drive):
     """Write odometry and disc rows of a run, without images."""
 
-    exact: bool = False  # Leave the rows without measurement noise.
-    miss: float = 0.0  # Probability that a row is left out.
+    exact: bool = False  # Omit the measurement noise of rows.
+    miss: float = 0.0  # Probability that a row is missing.
 
     def __call__(self) -> str:
         from tools.simulator.runs import write_rows
@@ -108,13 +108,13 @@ class Rows(_Drive):
 
 @dataclass(frozen=True)
 class MarkerFrames:
-    """Render random frames of markers among things that look like markers, with exact truth."""
+    """Render random frames of markers and look-alikes, with exact truth."""
 
     output: Positional[Path]  # Folder of the frames.
-    count: int = 100  # Frames to render.
-    seed: int = 1  # Everything about them follows from it.
-    jobs: int = 1  # Processes that render.
-    force: bool = False  # Replace files that exist.
+    count: int = 100  # Number of frames.
+    seed: int = 1  # Seed of everything random.
+    jobs: int = 1  # Number of processes.
+    force: bool = False  # Replace existing files.
     sample: SampleSettings = field(default_factory=SampleSettings)
 
     def __call__(self) -> str:
@@ -129,17 +129,17 @@ class MarkerFrames:
 
 @dataclass(frozen=True)
 class MarkerSession:
-    """Render a session: cameras in a room, a robot with six markers, standing and driving.
+    """Render a session: cameras in a room, a robot with six markers, at rest and driving.
 
-    With images for estimating the calibrations of robot and cameras, in `calibration`.
+    Also renders images for estimating the calibrations of robot and cameras, in `calibration`.
     """
 
     output: Positional[Path]  # Folder of the session; its name is the session's.
     calibration: bool = True  # Also render the images for calibrations.
     image_format: ImageFormat = "jpg"  # Of the images.
     quality: int = 92  # Of the jpg images.
-    jobs: int = 1  # Processes that render.
-    force: bool = False  # Replace files that exist.
+    jobs: int = 1  # Number of processes.
+    force: bool = False  # Replace existing files.
     session: SessionSettings = field(default_factory=SessionSettings)
     errors: CalibrationErrors = field(default_factory=CalibrationErrors)
 
@@ -158,10 +158,10 @@ class MarkerSession:
 
 @dataclass(frozen=True)
 class MarkerDemo:
-    """Render the session of the project (images/m) anew."""
+    """Render the session of the project (images/m) again."""
 
     output: Path = Path("images/m")  # Folder of the session.
-    force: bool = False  # Replace files that exist.
+    force: bool = False  # Replace existing files.
 
     def __call__(self) -> str:
         from tools.simulator.markers.session import DEMO, DEMO_QUALITY, SessionWriter, write_session
@@ -178,8 +178,8 @@ class LaserSession:
     """
 
     output: Positional[Path]  # Folder of the session.
-    seed: int = 1  # Everything about it follows from it and the settings.
-    force: bool = False  # Replace files that exist.
+    seed: int = 1  # Seed of everything random.
+    force: bool = False  # Replace existing files.
     session: Annotated[LaserSettings, arg(name="")] = field(default_factory=LaserSettings)
 
     def __call__(self) -> str:
@@ -192,7 +192,7 @@ class LaserSession:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; 0 if all went well."""
+    """Run the command line; returns the exit code."""
     command = tyro.cli(
         Annotated[Demo, subcommand("demo")]
         | Annotated[Run, subcommand("run")]

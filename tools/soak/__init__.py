@@ -1,1 +1,1 @@
-"""Long runs, and many short ones: does anything grow, slow down or stay behind?"""
+"""Soak test: long runs, and many short ones, checked for leaks, slowdown and leftovers."""

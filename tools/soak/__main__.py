@@ -1,4 +1,4 @@
-"""Long runs, and many short ones: ``python -m tools.soak``."""
+"""Soak test: ``python -m tools.soak``."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tools.soak.short_runs import ShortRuns, repeat_short_runs
 
 @dataclass(frozen=True)
 class Soak(Study):
-    """A long run of `detect all`, or with --short many short ones; demands that nothing grows.
+    """A long run of `detect all`, or with --short many short ones, checked for growth.
 
-    The exit code is 1 where a demand is not met.
+    The exit code is 1 if a check fails.
     """
 
-    frames: int = 200_000  # How long the run is: the images of the source, linked over and over.
-    jobs: int = 2  # Processes that share the work.
+    frames: int = 200_000  # Length of the run: the images of the source, linked repeatedly.
+    jobs: int = 2  # Number of worker processes.
     short: int = 0
-    """So many runs of eight frames instead, one after the other, with and without workers."""
+    """Number of runs of eight frames instead, one after the other, with and without workers."""
     source: Path = Path("images/e")  # A run folder whose images are repeated.
     scratch: Path | None = None
-    """Where the run and its results are made, and removed again; on the source's file system."""
+    """Folder for the run and its results, which are removed; on the source's file system."""
 
     def measured(self) -> Figures:
         result: ShortRuns | SoakResult

@@ -1,4 +1,4 @@
-"""A run of as many frames as one likes, watched while it is worked on."""
+"""A run of any length, monitored while it is processed."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ import psutil  # type: ignore[import-untyped,unused-ignore]
 from tools.evaluation.figures import StudyError
 
 #: Throughput is compared between these shares of the run: before and after them, processes start
-#: and files take their places.
+#: and files are renamed.
 _FIRST, _LAST = (0.01, 0.11), (0.89, 0.99)
-#: The processes are looked at when another such share of the run is done, however fast that goes.
+#: The processes are examined each time such a share of the run is done, whatever its duration.
 _LOOK_EVERY = 0.004
 _POLL_EVERY_S = 0.02
 _DECODINGS = 5
 _MIB = 1 << 20
 
-#: The demands: growth from a tenth of the run to its end, and change of the throughput.
+#: Limits of the growth from a tenth of the run to its end, and of the change of the throughput.
 MOST_GROWTH_MIB = 8.0
 MOST_SLOWER = 0.05
 
 
 class ProcessState(NamedTuple):
-    """A process at a moment."""
+    """State of a process."""
 
     pid: int
-    resident_bytes: int  # Memory of its own and shared that is in use.
+    resident_bytes: int  # Private and shared memory in use.
     descriptors: int  # Open files, pipes and the like.
-    processor_s: float  # What it has computed so far.
+    processor_s: float  # Processor time so far.
 
 
 def family(pid: int) -> list[ProcessState]:
-    """A process and all that descend from it, itself first, but for those that have just ended."""
+    """A process, first, and all its descendants, except those that have just ended."""
     found = []
     with suppress(psutil.Error):
         first = psutil.Process(pid)
@@ -56,36 +56,36 @@ class _Look(NamedTuple):
     time_s: float
     frames: int
     processor_s: float  # Of all processes.
-    resident_mib: float  # Of the process that hands out the frames.
+    resident_mib: float  # Of the process that dispatches the frames.
     worker_mib: float  # Of the largest other one.
     descriptors: int  # Of all processes.
     processes: int
-    decoding_s: float  # What decoding an image took of the processor just now.
+    decoding_s: float  # Processor time for decoding an image at this moment.
 
 
 @dataclass(frozen=True)
 class SoakResult:
-    """What came of a long run."""
+    """Result of a long run."""
 
     frames: int
     jobs: int
     duration_s: float
-    frames_per_s: tuple[float, float]  # In the first tenth and in the last one, by the clock.
+    frames_per_s: tuple[float, float]  # In the first and the last tenth, by wall clock.
     decoding_ms: tuple[float, float]
-    """What decoding one of the images took of the processor meanwhile, in this process: how fast
-    the machine was, beside whatever else it had to do."""
+    """Processor time for decoding one of the images meanwhile, in this process: the speed of the
+    machine under its other load."""
     decodings_per_frame: tuple[float, float]
-    """What all processes computed for a frame, in units of that: this is compared."""
+    """Processor time of all processes per frame, in units of that: this is compared."""
     resident_mib: tuple[float, ...]
-    """Memory of the process that hands out the frames, and of the largest worker, at 10, 50, 90 and
-    99 % of the run."""
+    """Memory of the process that dispatches the frames, and of the largest worker, at 10, 50, 90
+    and 99 % of the run."""
     worker_mib: tuple[float, ...]
     descriptors: tuple[int, ...]
-    """Open in all processes, at the same moments; the least of nine looks around each."""
-    processes: int  # The most that there were.
+    """Open in all processes, at the same moments; the least of nine samples around each."""
+    processes: int  # Largest number of processes.
 
     def unmet(self) -> list[str]:
-        """The demands that are not met, a sentence each."""
+        """The failed checks, a sentence each."""
         found = []
         for what, values in (("memory", self.resident_mib), ("a worker's memory", self.worker_mib)):
             if values[-1] - values[0] > MOST_GROWTH_MIB:
@@ -99,7 +99,7 @@ class SoakResult:
 
 
 def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
-    """Work on a run by `detect all`, and watch its processes."""
+    """Process a run by `detect all`, and monitor its processes."""
     output.mkdir()
     arguments = ["all", str(run), "-o", str(output), "--jobs", str(jobs)]
     begin_s = time.monotonic()
@@ -125,9 +125,9 @@ def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
 def _looks_at(
     process: subprocess.Popen[str], journal: Path, image: bytes, least: int
 ) -> list[_Look]:
-    """Look at the processes whenever more than so many further frames are noted in the journal."""
+    """Sample the processes whenever enough further frames are in the journal."""
     looks: list[_Look] = []
-    lines, place = -1, 0  # the first line is no frame
+    lines, place = -1, 0  # the first line is not a frame
     while process.poll() is None:
         content = b""
         with suppress(OSError), journal.open("rb") as stream:
@@ -149,7 +149,7 @@ def _looks_at(
 
 
 def _decoding_s(image: bytes) -> float:
-    """What decoding an image takes of the processor; the first of some is not counted."""
+    """Processor time for decoding an image; the first of several is ignored."""
     content = np.frombuffer(image, np.uint8)
     times_s = []
     for _ in range(_DECODINGS):
@@ -162,7 +162,7 @@ def _decoding_s(image: bytes) -> float:
 def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> SoakResult:
     done = np.array([look.frames for look in looks], float)
     if len(looks) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
-        raise StudyError(f"{frames} frames: too few to be looked at, expected more")
+        raise StudyError(f"{frames} frames: too few to be sampled, expected more")
     columns = _Look(*np.array(looks, float).T)
 
     def per_frame(values: Any, share: tuple[float, float]) -> float:
@@ -189,7 +189,7 @@ def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> So
         decodings_per_frame=(computed[0] / decoding[0], computed[1] / decoding[1]),
         resident_mib=tuple(looks[moment].resident_mib for moment in moments),
         worker_mib=tuple(looks[moment].worker_mib for moment in moments),
-        # The least around a moment: an image may be read just then.
+        # The least around a moment, since an image may be read just then.
         descriptors=tuple(
             min(look.descriptors for look in looks[max(moment - 4, 0) : moment + 5])
             for moment in moments

@@ -1,4 +1,4 @@
-"""Many short runs, one after the other: what do they leave behind?"""
+"""Many short runs, one after the other, checked for leftovers."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ _TRACKER_S = 10.0
 
 @dataclass(frozen=True)
 class ShortRuns:
-    """What many short runs left behind."""
+    """Leftovers of many short runs."""
 
     runs: int
     processes: int
-    """Processes that still run; pieces of shared memory; files in the folder for temporary files;
-    hidden files beside the results; and files that the cache of tables has more of than after the
-    first run."""
+    """Running processes; segments of shared memory; files in the folder for temporary files; hidden
+    files beside the results; and files in the cache of tables in excess of those after the first
+    run."""
     shared: int
     temporary: int
     hidden: int
     caches: int
-    different: int  # Runs whose results were not those of the first.
+    different: int  # Number of runs whose results differ from the first.
 
     def unmet(self) -> list[str]:
-        """What there should be none of, a sentence each."""
+        """The failed checks, a sentence each."""
         left = {
             "processes": self.processes,
-            "pieces of shared memory": self.shared,
+            "segments of shared memory": self.shared,
             "temporary files": self.temporary,
             "hidden files": self.hidden,
             "files in the cache": self.caches,
         }
-        found = [f"{count} {name} stayed behind" for name, count in left.items() if count]
+        found = [f"{count} {name} left over" for name, count in left.items() if count]
         if self.different:
             found.append(f"{self.different} runs had other results than the first")
         return found
 
 
 def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> ShortRuns:
-    """Carry out `detect all` on a few frames again and again, every second time with workers."""
+    """Run `detect all` on a few frames repeatedly, every second time with workers."""
     run = repeated_run(open_run(source), folder / "short", _FRAMES)
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
@@ -86,7 +86,7 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
 
 
 def marked(variable: str) -> list[int]:
-    """Processes with a ``NAME=value`` in their environment, but for this one."""
+    """Processes with a ``NAME=value`` in their environment, except this one."""
     name, _, value = variable.partition("=")
     found = []
     for process in psutil.process_iter():
@@ -97,19 +97,19 @@ def marked(variable: str) -> list[int]:
 
 
 def _shared() -> set[str]:
-    """Shared memory and semaphores as Python names them, of all programs."""
+    """Shared memory and semaphores of all programs, by Python's names."""
     return {name for name in _names(_SHARED_MEMORY) if name.startswith(("sem.", "psm_"))}
 
 
 def in_nobodys_use(names: set[str]) -> set[str]:
-    """Which pieces of shared memory are there that no process has mapped.
+    """Segments of shared memory that no process has mapped.
 
-    Those of programs that run at the same time are mapped: under the names that they were made by,
-    which are others, so that only their numbers tell.
+    Those of running programs are mapped, but under the different names with which they were
+    created, so that only their numbers identify them.
     """
     mapped = set()
     for maps in Path("/proc").glob("[0-9]*/maps"):
-        with suppress(OSError):  # it ended, or is somebody else's
+        with suppress(OSError):  # it ended, or is another user's
             for line in maps.read_text().splitlines():
                 if str(_SHARED_MEMORY) in line:
                     mapped.add(int(line.split()[4]))
@@ -122,10 +122,10 @@ def in_nobodys_use(names: set[str]) -> set[str]:
 
 
 def _left_for_good(names: set[str]) -> set[str]:
-    """Which pieces of shared memory stay in nobody's use.
+    """Segments of shared memory that remain unused.
 
-    Those of a program that was killed do for a moment only, until Python's process that looks after
-    them has removed them: others may run, and be killed, at the same time.
+    Those of a killed program remain only for a moment, until Python's resource tracker has removed
+    them: other programs may run, and be killed, at the same time.
     """
     left = in_nobodys_use(names)
     latest_s = time.monotonic() + _TRACKER_S
