@@ -91,11 +91,11 @@ def _render(
 
 @dataclass(frozen=True)
 class AccuracyStudy(Study):
-    """Refined centres of rendered single discs against the truth, by blur and distance."""
+    """Compare refined centres of rendered single discs with the truth, by blur and distance."""
 
-    camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
+    camera: Path = Path("images/e/e.cam")  # Calibration for rendering and detection.
     discs: int = 400  # Discs per blur.
-    seed: int = 1  # Of places and noise.
+    seed: int = 1  # Of positions and noise.
 
     def measured(self) -> Figures:
         camera = read_camera(self.camera)

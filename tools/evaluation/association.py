@@ -35,7 +35,7 @@ class Association(Study):
     """
 
     runs: Positional[tuple[Path, ...]]  # Run folders or landmark files with IDs.
-    circles: bool = False  # Use the discs; the default where neither kind is asked for.
+    circles: bool = False  # Use the discs; the default if neither kind is given.
     lines: bool = False  # Use the vertical lines.
     methods: tuple[Literal["nearest", "joint"], ...] = ("nearest", "joint")  # See `slam associate`.
     noise: tuple[float, ...] = (0.0, 1.0, 2.0)
@@ -74,12 +74,12 @@ class Association(Study):
 
 @dataclass(frozen=True)
 class WakingUp(Study):
-    """Let a robot wake up along a run, its identifiers unknown, and compare with a known path."""
+    """Locate a robot at places along a run, without identifiers, and compare with a known path."""
 
     run: Positional[Path]  # Run folder or `.circles` file.
     map: Path  # `map.csv`.
     path: Path  # `path.csv` of the same run in that map.
-    every: int = 50  # Frames from one waking to the next.
+    every: int = 50  # Number of frames between the places.
 
     def measured(self) -> Figures:
         recording, discs = read_recording(self.run), read_map(self.map).discs.xy
@@ -106,13 +106,13 @@ class WakingUp(Study):
 
 @dataclass(frozen=True)
 class Joining(Study):
-    """Cut a run into several, join them without their identifiers, and compare with the whole.
+    """Split a run, join the parts without their identifiers, and compare with the whole.
 
-    Each part is in a frame of its own. The whole is associated and mapped the same way.
+    Each part has its own frame. The whole is associated and mapped in the same way.
     """
 
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
-    at: tuple[int, ...] = ()  # The frames with which new runs begin; by default half way.
+    at: tuple[int, ...] = ()  # First frames of the further parts; by default the middle.
 
     def measured(self) -> Figures:
         whole = read_recording(self.run)
@@ -148,11 +148,11 @@ class Joining(Study):
 
 @dataclass(frozen=True)
 class JoiningPairs(Study):
-    """Cut a run into pieces, join each with each other one, and see which have discs in common."""
+    """Split a run into pieces, join all pairs, and compare with the discs they have in common."""
 
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
-    frames: int = 300  # In a piece.
-    least: int = 5  # Discs that pieces have in common if they show one place.
+    frames: int = 300  # Frames per piece.
+    least: int = 5  # Least number of common discs of pieces that show the same place.
 
     def measured(self) -> Figures:
         whole = read_recording(self.run)

@@ -198,12 +198,12 @@ FLOOR_ORIGIN = (0.0, -1.3)
 
 @dataclass(frozen=True)
 class TutorialPhotographs(Study):
-    """Render the tutorial's photographs through the demo run's camera, so that truth is known."""
+    """Render the tutorial's photographs with the demo run's camera, so that the truth is known."""
 
     output: Positional[Path]  # Folder for `boards/*.png` and `floor.png`.
     camera: Path = Path("images/e/e.cam")  # The camera that takes them.
-    count: int = 14  # Photographs of the board in the hand.
-    seed: int = 3  # Of the board's places, and the noise.
+    count: int = 14  # Number of photographs of the hand-held board.
+    seed: int = 3  # Of the board's positions and the noise.
 
     def measured(self) -> Figures:
         import cv2

@@ -204,14 +204,14 @@ def compare(
 
 @dataclass(frozen=True)
 class CameraRendered(Study):
-    """Calibrate from rendered pictures of a known camera: noise floor, and how near the truth."""
+    """Calibrate from rendered pictures of a known camera: residuals, and errors of the result."""
 
     camera: Positional[Path]  # The true camera.
     boards: tuple[str, ...] = tuple(BOARDS)  # `checkerboard`, `charuco`, `asymmetric-circles`.
-    views: int = 24  # Pictures.
+    views: int = 24  # Number of pictures.
     blur_px: float = 0.6  # Standard deviation of a Gaussian blur.
     noise: float = 2.0  # Standard deviation of a pixel's noise; ink and paper differ by 160.
-    seed: int = 7  # Everything random follows from it.
+    seed: int = 7  # Of everything random.
 
     def measured(self) -> Figures:
         camera = read_camera(self.camera)
@@ -241,16 +241,16 @@ class CameraRendered(Study):
 
 @dataclass(frozen=True)
 class CameraPhotographs(Study):
-    """Hold-out error on photographs of disc boards, against OpenCV's models.
+    """Hold-out error on photographs of disc boards, compared with OpenCV's models.
 
-    The points are the centroids of the discs, found from where the truth has them; both
-    calibrations get the same points and board, and leave out the same photographs.
+    The points are the centroids of the discs, searched near their true positions; both
+    calibrations use the same points and board, and hold out the same photographs.
     """
 
     folder: Positional[Path]  # Folder of photographs with truth.
-    groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras: the names' beginnings.
-    free_aspect: bool = True  # Both scales free, as OpenCV has them; else equal.
-    polynomial: bool = False  # Radial distortion k1 k2 k3 here; else chosen as by default.
+    groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras, by prefix of the names.
+    free_aspect: bool = True  # Both scales free, as in OpenCV; else equal.
+    polynomial: bool = False  # Radial distortion k1 k2 k3; else chosen automatically.
 
     def measured(self) -> Figures:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")

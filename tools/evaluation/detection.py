@@ -113,12 +113,12 @@ class Buildings(Study):
 class Rendered(Study):
     """Detect a rendered run's light discs, its verticals and the tilt, and level the discs.
 
-    Scored by its evaluate.py: the discs, the verticals, and the discs levelled.
+    Its evaluate.py scores the discs, the verticals, and the levelled discs.
     """
 
-    run: Positional[Path] = Path("../shared/data/rendered/r1")  # `evaluate.py` lies beside it.
+    run: Positional[Path] = Path("../shared/data/rendered/r1")  # `evaluate.py` is beside it.
     preset: Preset = "default"  # Of the line detector.
-    polarity: Polarity = "light"  # Stated to the detector of discs.
+    polarity: Polarity = "light"  # Given to the disc detector.
 
     def measured(self) -> Figures:
         figures: dict[str, Any] = {}
@@ -144,7 +144,7 @@ class Tilt(Study):
 
     run: Positional[Path] = Path("images/e")  # Run made by `python -m tools.simulator`.
     tilt_prior_deg: float = LINE_PRESETS["default"].tilt_prior_deg
-    """What is known of the tilt beforehand: its standard deviation about level, degrees."""
+    """Prior standard deviation of the tilt about level, degrees."""
 
     def measured(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:

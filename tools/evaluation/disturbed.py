@@ -264,14 +264,14 @@ def _panel(image: ByteArray, outline: FloatArray, name: str) -> ByteArray:
 
 @dataclass(frozen=True)
 class Disturbed(Study):
-    """Discs partly hidden, stained, badly lit or blurred, and look-alikes, rendered."""
+    """Detect rendered look-alikes, and discs partly hidden, stained, badly lit or blurred."""
 
-    camera: Path = Path("images/e/e.cam")  # Calibration to render and detect through.
+    camera: Path = Path("images/e/e.cam")  # Calibration for rendering and detection.
     discs: int = 100  # Discs of each family and share.
-    shares: tuple[float, ...] = (0.2, 0.3, 0.4)  # Of the rim that are disturbed.
-    polarity: Literal["light", "any"] = "light"  # Stated to the detector; the discs are light.
+    shares: tuple[float, ...] = (0.2, 0.3, 0.4)  # Disturbed shares of the rim.
+    polarity: Literal["light", "any"] = "light"  # Given to the detector; the discs are light.
     seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
-    picture: Path | None = None  # Draw one disc of every family, and detect nothing.
+    picture: Path | None = None  # Only draw one disc of each family, without detection.
 
     def measured(self) -> Figures:
         camera = read_camera(self.camera)

@@ -98,9 +98,9 @@ def compared(run: Path, detected: Path, *flags: object) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Programs(Study):
-    """Run command lines of the project one after the other, in which @ is an empty folder.
+    """Run command lines of the project one after the other; @ in them is an empty folder.
 
-    The figures are the numbers of the JSON files that they write there, logs aside.
+    The figures are the numbers in the JSON files that they write there, except logs.
     """
 
     commands: Positional[tuple[str, ...]]  # Each in quotes: `detect circles RUN -o @/x.circles`.
@@ -115,7 +115,7 @@ class Programs(Study):
 
 
 def numbers_in(content: Figures) -> dict[str, Any]:
-    """The numbers of a JSON object and of those in it; texts and lists are left out."""
+    """The numbers of a JSON object and its nested objects, without texts and lists."""
     nested = {k: numbers_in(v) if isinstance(v, dict) else v for k, v in content.items()}
     return {k: v for k, v in nested.items() if isinstance(v, int | float | dict)}
 
@@ -143,7 +143,7 @@ def _formatted(value: float | None, form: str) -> str:
 
 @dataclass(frozen=True)
 class Documents(Study):
-    """Put the figures of docs/figures into the documents: run from a checkout."""
+    """Insert the figures of docs/figures into the documents; run it from a checkout."""
 
     def measured(self) -> Figures:
         pages = documents(Path())

@@ -77,14 +77,14 @@ def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Record
 
 @dataclass(frozen=True)
 class MapStudy(Study):
-    """Map simulated runs (python -m tools.simulator rows) and compare with their truth.
+    """Map simulated runs (python -m tools.simulator rows) and compare them with their truth.
 
-    Each is mapped twice: as simulated (odometry wrong on the outside stretch), and with odometry
+    Each is mapped twice: as simulated (with wrong odometry outdoors), and with odometry
     whose covariances are right everywhere.
     """
 
     runs: Positional[tuple[Path, ...]]  # Run folders.
-    seed: int = 1  # Of the odometry that takes the place of the wrong one.
+    seed: int = 1  # Of the odometry that replaces the wrong one.
 
     def measured(self) -> Figures:
         table = Table(
@@ -121,10 +121,10 @@ def _plain_gtsam(kind: str, graph: Graph, start: Estimate) -> tuple[float, int]:
 
 @dataclass(frozen=True)
 class MapSpeed(Study):
-    """Time the least squares of a run beside plain GTSAM on the same factors, in one process."""
+    """Compare the time of a run's least squares with plain GTSAM on the same factors."""
 
     run: Positional[Path]  # Run folder or .circles file.
-    repeats: int = 3  # Rounds, in each of which every solver has its turn.
+    repeats: int = 3  # Number of rounds, each with every solver, in one process.
 
     def measured(self) -> Figures:
         graph = graph_of_recording(read_recording(self.run))

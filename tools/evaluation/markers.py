@@ -166,24 +166,24 @@ def time_searches(
 
 @dataclass(frozen=True)
 class Markers(Study):
-    """Markers in rendered frames: corner errors, detection rate, false ones; beside OpenCV's ArUco.
+    """Markers in rendered frames: corner errors, recall, false ones, compared with OpenCV's ArUco.
 
-    Four parts: statistics of `--statistics` frames with one dictionary, all detectors; the
-    processor time of searching `--timing` of these frames; a search for false and misidentified
-    markers in `--frames` frames of many dictionaries; photographs below `--photographs`, on which
-    everything found is false. Exit code 1 if anything is.
+    Four parts: statistics of `--statistics` frames with one dictionary, for all detectors; the
+    processor time for `--timing` of these frames; a search for false and misidentified
+    markers in `--frames` frames of many dictionaries; photographs below `--photographs`, in which
+    all detections are false. The exit code is 1 if there are false ones.
     """
 
-    statistics: int = 1000  # Frames for the statistics; 0 leaves them out.
-    dictionary: str = "6x6_250"  # Of the statistics; without OpenCV where it does not know it.
-    spot: bool = True  # Also measure the corners of markers some 60 px wide at noise sigma 3.
-    timing: int = 0  # Frames to time the detectors on, beside decoding; 0 leaves that out.
-    frames: int = 0  # Frames to search for false and misidentified markers.
+    statistics: int = 1000  # Number of frames for the statistics; 0: none.
+    dictionary: str = "6x6_250"  # Of the statistics; without OpenCV if that does not know it.
+    spot: bool = True  # Also measure the corners of markers about 60 px wide at noise sigma 3.
+    timing: int = 0  # Number of frames for measuring times, compared with decoding; 0: none.
+    frames: int = 0  # Number of frames to search for false and misidentified markers.
     dictionaries: tuple[str, ...] = _SEARCHED  # Of that search, and of the photographs'.
-    backgrounds: Path | None = None  # Photographs behind half the frames of that search.
+    backgrounds: Path | None = None  # Photographs as backgrounds of half the frames of that search.
     photographs: tuple[Path, ...] = ()  # Folders of photographs without markers to search.
     seed: int = 1  # Of all frames.
-    jobs: int = 1  # Processes.
+    jobs: int = 1  # Number of processes.
 
     def measured(self) -> Figures:
         wrong: list[Offence] = []

@@ -285,9 +285,9 @@ def _turning(times_s: Any, theta_rad: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Pictures(Study):
-    """Draw the pictures of the documentation anew, as far as there is input for them.
+    """Draw the pictures of the documentation again, as far as their inputs are given.
 
-    The run of `--rows` R and the session of `--session` S come from
+    The run of `--rows` R and the session of `--session` S are made by
 
         python -m tools.simulator rows R --frames 900 --seed 1
         slam associate R -o R/found.circles

@@ -27,7 +27,7 @@ WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 @dataclass(frozen=True)
 class RealRun(Study):
-    """Detect a recorded run by several presets, compare with its shipped rows, and map the rows."""
+    """Detect a recorded run with several presets, compare with shipped rows, and map the result."""
 
     run: Positional[Path] = Path("../shared/data/dlr/e")
     """Run folder with images, calibration and `map.circles`."""

@@ -154,7 +154,7 @@ def figures_of(result: TiltComparison) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class TiltOfDiscs(Study):
-    """Compare the tilt that verticals show with the tilt that the discs of a map show."""
+    """Compare the tilt from verticals with the tilt from the discs of a map."""
 
     rows: Positional[Path]
     """Raw rows of discs with the map's identifiers (`detect circles --ids-from`)."""
@@ -162,7 +162,7 @@ class TiltOfDiscs(Study):
     camera: Path  # Calibration.
     map: Path  # `map.csv` of `slam map`.
     path: Path  # Its `path.csv`.
-    raised_m: float = 0.0  # How much higher the camera is than calibrated.
+    raised_m: float = 0.0  # Height of the camera above the calibrated one.
 
     def measured(self) -> Figures:
         camera = read_camera(self.camera)
