@@ -136,6 +136,14 @@ def test_stretches_hold_what_their_frames_saw() -> None:
     assert found[0].xy[3].tolist() == [4.0, 0.0]
 
 
+def test_stretches_that_are_compared_hold_what_was_seen_most() -> None:
+    labels = np.array([0, 1, 2, 2, 3, 4, 4, 4, 1])
+    xy = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
+    (found,) = stretches_of(np.arange(9), labels, xy, 9, least=1, most=3)
+    assert found.labels.tolist() == [1, 2, 4]
+    assert found.xy[:, 0].tolist() == [1.0, 2.0, 4.0]
+
+
 @given(
     rows=st.lists(st.tuples(st.integers(0, 6), st.integers(0, 7)), min_size=1, max_size=25),
     pairs=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), max_size=12),

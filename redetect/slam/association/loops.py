@@ -154,6 +154,9 @@ _COVER_M = 0.6
 _GRID_M = 0.15
 #: Number of frames whose landmarks form a constellation, and from one constellation to the next.
 STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
+#: Most landmarks of a constellation that is compared with others, at the cost of their number to
+#: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
+MOST_COMPARED = 80
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 
@@ -194,16 +197,20 @@ def stretches_of(
     *,
     stride: int = STRIDE_FRAMES,
     least: int = Search().least_agreeing,
+    most: int | None = None,
 ) -> list[Stretch]:
     """The constellations with enough landmarks along a run of `count` frames.
 
-    Takes `frames, labels` (n,), `xy` (M, 2).
+    Of more landmarks than `most`, those with most rows are used. Takes `frames, labels` (n,), `xy`
+    (M, 2).
     """
     found = []
     for start in range(0, max(count - STRETCH_FRAMES // 2, 1), stride):
         first, last = np.searchsorted(frames, [start, start + STRETCH_FRAMES])
-        seen = np.unique(labels[first:last])
-        seen = seen[np.isfinite(xy[seen, 0])]
+        seen, rows = np.unique(labels[first:last], return_counts=True)
+        known = np.isfinite(xy[seen, 0])
+        seen, rows = seen[known], rows[known]
+        seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:
             middle = min(start + STRETCH_FRAMES // 2, count - 1)
             found.append(Stretch(middle, seen, xy[seen]))

@@ -40,6 +40,7 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.loops import (
+    MOST_COMPARED,
     REACH_M,
     STRETCH_FRAMES,
     Match,
@@ -260,7 +261,8 @@ def _closed(
     matches: list[Match] = []
     for number in range(1, _MOST_ROUNDS + 1):
         report(f"loops, round {number}")
-        found = find_matches(stretches_of(frames, labels, xy, len(recording)), search)
+        compared = stretches_of(frames, labels, xy, len(recording), most=MOST_COMPARED)
+        found = find_matches(compared, search)
         found = consistent_matches(found, matches, path, recording.step_covariance)
         labels, matched = merge_labels(
             frames, labels, pairs_by_votes(match.pairs for match in found)
