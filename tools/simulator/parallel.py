@@ -7,15 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TypeVar
 
-State = TypeVar("State")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def in_order(
-    function: Callable[[State, Item], Result], state: State, items: Sequence[Item], jobs: int = 1
+    function: Callable[[Item], Result], items: Sequence[Item], jobs: int = 1
 ) -> Iterator[Result]:
-    """Results of ``function(state, item)`` in the order of the items.
+    """Results of a function that can be pickled, in the order of the items.
 
     On a terminal a bar shows how many there are already.
     """
@@ -26,10 +25,9 @@ def in_order(
     terminal = Console(stderr=True)
     bar = partial(track, description="", total=len(items), console=terminal, transient=True,
                   disable=not terminal.is_terminal)  # fmt: skip
-    of_state = partial(function, state)
     if jobs <= 1:
-        yield from bar(map(of_state, items))
+        yield from bar(map(function, items))
         return
     context = multiprocessing.get_context("spawn")
     with context.Pool(jobs, cv2.setNumThreads, (1,)) as pool:
-        yield from bar(pool.imap(of_state, items, chunksize=8))
+        yield from bar(pool.imap(function, items, chunksize=8))

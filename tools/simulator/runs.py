@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -282,7 +283,7 @@ def write_run(
         what += f" after {settings.skip} skipped"
     (folder / "images").mkdir(parents=True, exist_ok=True)
     truths: list[FrameTruth] = []
-    for truth in in_order(render_frame, plan, range(settings.frames), jobs):
+    for truth in in_order(partial(render_frame, plan), range(settings.frames), jobs):
         assert truth.jpeg is not None
         image = folder / "images" / f"{plan.prefix(truth.frame)}.jpg"
         write_bytes(image, truth.jpeg, overwrite=overwrite)

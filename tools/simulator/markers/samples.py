@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -430,8 +430,4 @@ def sample_frames(
     settings: SampleSettings, seed: int, indices: Sequence[int], jobs: int = 1
 ) -> Iterator[SampleFrame]:
     """Frames of a seed in order, rendered by one or more processes; the same either way."""
-    return in_order(_sample, (settings, seed), indices, jobs)
-
-
-def _sample(state: tuple[SampleSettings, int], index: int) -> SampleFrame:
-    return sample_frame(*state, index)
+    return in_order(partial(sample_frame, settings, seed), indices, jobs)
