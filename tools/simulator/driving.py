@@ -90,12 +90,10 @@ def smooth_noise(count: int, length: float, rng: np.random.Generator) -> FloatAr
 
 def _rounded(route: FloatArray, radius: float) -> FloatArray:
     """Dense poses along the route with rounded corners and turns on the spot."""
+    apart = np.hypot(*np.diff(route, axis=0).T) > 1e-9
+    route = route[np.concatenate([[True], apart])]
     leg = np.diff(route, axis=0)
-    length = np.hypot(leg[:, 0], leg[:, 1])
-    keep = np.concatenate([[True], length > 1e-9])
-    route = route[keep]
-    leg = np.diff(route, axis=0)
-    length = np.hypot(leg[:, 0], leg[:, 1])
+    length = np.hypot(*leg.T)
     unit = leg / length[:, None]
     # Heading h looks along (sin h, -cos h).
     heading = np.arctan2(unit[:, 0], -unit[:, 1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,11 @@ def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:
     if not done:
         raise ValueError(f"an image of {grey.shape} could not be encoded as {ending}")
     return bytes(content)
+
+
+def write_lines(path: Path, lines: Iterable[str], *, overwrite: bool) -> None:
+    """Write lines of text."""
+    write_bytes(path, "".join(f"{line}\n" for line in lines).encode(), overwrite=overwrite)
 
 
 def write_truth(

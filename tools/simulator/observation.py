@@ -129,9 +129,10 @@ def see_discs(
     seen: list[SeenDisc] = []
     near = np.hypot(robot_xy[:, 0], robot_xy[:, 1]) < _DISC_REACH_M
     for k in np.flatnonzero(inside & near):
-        world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
+        world_xy = disc_xy[k] + spots
+        world = np.column_stack([world_xy, np.full(len(spots), 1e-3)])
         free = points_visible(scene, eye, world, _SLACK_M)
-        uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
+        uv = true.project_floor(disc_in_robot(pose, world_xy))
         within = _in_image(true, uv)
         share = float((free & within).mean())
         if share <= 0.0:
@@ -266,18 +267,10 @@ def _sunflower(count: int) -> FloatArray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
-def _rotated(points: FloatArray, angle: float) -> FloatArray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]))
-
-
 def _longest_run(flags: BoolArray) -> tuple[int, int]:
-    """First and last index of the longest run of true values; (0, -1) if there is none."""
-    padded = np.concatenate([[False], flags, [False]]).astype(np.int8)
-    steps = np.diff(padded)
+    """First and last index of the longest run of true values; there is at least one."""
+    steps = np.diff(flags.astype(np.int8), prepend=0, append=0)
     begin, end = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
-    if not len(begin):
-        return 0, -1
     best = int(np.argmax(end - begin))
     return int(begin[best]), int(end[best])
 

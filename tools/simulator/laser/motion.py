@@ -159,16 +159,11 @@ def ptpd_lines(
     drifts = 1e9 * clock.drift + rng.normal(0.0, 300.0, len(times_s))
     lines = []
     for time, offset, drift in zip(times_s, offsets, drifts):
-        nanoseconds = round(abs(offset) * 1e9)
-        sign = "-" if offset < 0.0 else ""
-        seconds, rest = divmod(nanoseconds, 10**9)
+        nanoseconds = round(offset * 1e9)
+        seconds = int(nanoseconds / 1e9)
         lines.append(
-            f"{time:.6f} (ptpd debug) offset from master: {_signed(sign, seconds):>10}s "
-            f"{_signed(sign, rest):>11}ns"
+            f"{time:.6f} (ptpd debug) offset from master: {seconds:>10}s "
+            f"{nanoseconds - seconds * 10**9:>11}ns"
         )
         lines.append(f"{time:.6f} (ptpd debug) observed drift: {round(drift):>10}")
     return lines
-
-
-def _signed(sign: str, number: int) -> str:
-    return f"{sign if number else ''}{number}"

@@ -23,7 +23,7 @@ from redetect.groundtruth.validation.reference_poses import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
-from redetect.storage import write_bytes
+from tools.simulator.files import write_lines
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
@@ -177,7 +177,7 @@ def write_session(
     _write_tape(plan, folder, overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
-    _write_lines(folder / "ptpd.log", lines, overwrite)
+    write_lines(folder / "ptpd.log", lines, overwrite=overwrite)
     _write_truth(plan, folder, overwrite)
     return plan
 
@@ -191,16 +191,13 @@ def _write_tape(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
         f"wall{i},{','.join(f'{x:.4f}' for x in drawn[i])},{length[i] + rng.normal(0.0, sigma):.4f}"
         for i in np.argsort(-length, kind="stable")[:_DIMENSIONS]
     ]
-    _write_lines(folder / "dimensions.csv", [DIMENSIONS_HEAD, *rows], overwrite)
+    write_lines(folder / "dimensions.csv", [DIMENSIONS_HEAD, *rows], overwrite=overwrite)
     rows = [
         f"{a},{b},{math.dist(FIDUCIALS[a], FIDUCIALS[b]) + rng.normal(0.0, sigma):.4f}"
         for a, b in combinations(FIDUCIALS, 2)
     ]
-    _write_lines(folder / "fiducial_distances.csv", [FIDUCIAL_DISTANCES_HEAD, *rows], overwrite)
-
-
-def _write_lines(path: Path, lines: list[str], overwrite: bool) -> None:
-    write_bytes(path, ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
+    rows.insert(0, FIDUCIAL_DISTANCES_HEAD)
+    write_lines(folder / "fiducial_distances.csv", rows, overwrite=overwrite)
 
 
 def _drawn(plan: SessionPlan) -> FloatArray:

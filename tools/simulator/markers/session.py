@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +18,7 @@ from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse
 from redetect.storage import write_bytes
 from tools.simulator.driving import planar_transform
-from tools.simulator.files import encoded, rounded, write_truth
+from tools.simulator.files import encoded, rounded, write_lines, write_truth
 from tools.simulator.markers.rendering import (
     Imaging,
     grey_image,
@@ -181,6 +181,16 @@ class SessionPlan:
         rng = random_for(self.settings.seed, "light", camera)
         return uneven_light(rng, model.width, model.height, 0.6, 0)
 
+    def image(
+        self, camera: int, exposures: list[list[Surface]], background: Float32Array, noise: int
+    ) -> ByteArray:
+        """(H, W) image that a camera takes of surfaces in its frame; `noise` seeds the noise."""
+        settings, model = self.settings, self.network.cameras[camera]
+        imaging, samples = settings.imaging, settings.samples
+        light = render_light(model, exposures, background, fine=imaging.fine, samples=samples)
+        rng = random_for(settings.seed, "frame", camera, noise)
+        return grey_image(light, self.illumination(camera), imaging, rng)
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -255,17 +265,12 @@ def view_robot(
     plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray, noise: int
 ) -> View:
     """What a camera sees of the robot. `pose`, `speed` (3,)."""
-    settings, model = plan.settings, plan.network.cameras[camera]
     camera_from_world = plan.camera_from_world[camera]
     exposures = [
-        _surfaces(plan, camera_from_world, pose + offset * settings.exposure_s * speed)
+        _surfaces(plan, camera_from_world, pose + offset * plan.settings.exposure_s * speed)
         for offset in _instants(plan, camera, pose, speed)
     ]
-    imaging = settings.imaging
-    background = _shadowed(plan, camera, pose)
-    light = render_light(model, exposures, background, fine=imaging.fine, samples=settings.samples)
-    rng = random_for(settings.seed, "frame", camera, noise)
-    image = grey_image(light, plan.illumination(camera), imaging, rng)
+    image = plan.image(camera, exposures, _shadowed(plan, camera, pose), noise)
     return View(image, seen_markers(plan, camera, pose))
 
 
@@ -407,8 +412,7 @@ class SessionWriter:
         for name in plan.network.names:
             own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
             rows = [f"# {NOTE}", "# image seconds", *(f"{s.prefix} {s.time_s:.6f}" for s in own)]
-            text = "\n".join([*rows, ""]).encode()
-            write_bytes(folder / name / f"{name}.times", text, overwrite=self.overwrite)
+            write_lines(folder / name / f"{name}.times", rows, overwrite=self.overwrite)
 
     def poses(self, path: Path, times_s: FloatArray, poses: FloatArray) -> None:
         """Write rows t, x, y, theta as RAWSEEDS' streams have them."""
@@ -455,7 +459,7 @@ def write_session(
     writer.calibrations(plan, folder)
     work = [(c, f) for c in range(len(names)) for f in range(len(plan.times_s))]
     seen: list[SeenFrame] = []
-    for (camera, frame), view in zip(work, in_order(_view, plan, work, jobs)):
+    for (camera, frame), view in zip(work, in_order(partial(_view, plan), work, jobs)):
         prefix = plan.prefix(frame)
         writer.image(folder, names[camera], prefix, view.image)
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))

@@ -13,6 +13,7 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import FloatArray
+from tools.simulator.files import rounded
 from tools.simulator.markers.kernels import SurfaceArrays, count_visible
 from tools.simulator.markers.surface import Surface, square_corners
 
@@ -48,11 +49,9 @@ class MarkerTruth:
         return {
             "dictionary": self.dictionary,
             "id": self.id,
-            "corners": [[round(float(x), 5) for x in corner] for corner in self.corners],
+            "corners": [rounded(corner, 5) for corner in self.corners],
             "width_m": self.width_m,
-            "camera_from_marker": [
-                [round(float(x), 9) for x in row] for row in self.camera_from_marker[:3]
-            ],
+            "camera_from_marker": [rounded(row, 9) for row in self.camera_from_marker[:3]],
             "width_px": round(self.width_px, 3),
             "slant_deg": round(self.slant_deg, 3),
             "contrast_grey": round(self.contrast_grey, 2),
