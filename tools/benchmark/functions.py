@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,15 +100,11 @@ def peers() -> dict[str, Function]:
 
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
     """The commands that are measured on a run, by name; their files go into a folder."""
+    circles = Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs)
+    published = replace(circles, output=output / "published.circles", parameters=PUBLISHED)
     return {
-        "detect circles --preset published": Circles(
-            run=run,
-            output=output / "published.circles",
-            force=True,
-            jobs=jobs,
-            parameters=PUBLISHED,
-        ),
-        "detect circles": Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs),
+        "detect circles --preset published": published,
+        "detect circles": circles,
         "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),
         "detect all": All(run=run, output=output, force=True, jobs=jobs),
     }

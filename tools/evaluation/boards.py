@@ -10,7 +10,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from camera.boards.board import Board
+from camera.boards.board import Board, charuco_of
 from camera.calibration.model import project_points
 from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
@@ -98,16 +98,8 @@ def _greys(xy: FloatArray, board: Board, rotation: FloatArray, place: FloatArray
 
 @lru_cache(maxsize=4)
 def _charuco(board: Board) -> ByteArray:
-    import cv2
-
-    pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_m,
-        board.marker_m,
-        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
-    )
     size = (_DOTS * board.columns, _DOTS * board.rows)
-    return np.asarray(pattern.generateImage(size), dtype=np.uint8)
+    return np.asarray(charuco_of(board).generateImage(size), dtype=np.uint8)
 
 
 def board_poses(

@@ -56,7 +56,9 @@ def detector_of(name: str) -> Detector:
 
 def known_to_opencv(dictionary: str) -> bool:
     """Whether OpenCV has a dictionary of that name."""
-    return dictionary in _opencv_dictionaries()
+    from cv2 import aruco
+
+    return hasattr(aruco, f"DICT_{dictionary.upper()}")
 
 
 def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
@@ -81,16 +83,8 @@ def _aruco_detector(name: str, dictionary: str):  # type: ignore[no-untyped-def]
 
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = getattr(aruco, _REFINEMENTS[name][0])
-    known = aruco.getPredefinedDictionary(_opencv_dictionaries()[dictionary])
+    known = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{dictionary.upper()}"))
     return aruco.ArucoDetector(known, parameters)
-
-
-@cache
-def _opencv_dictionaries() -> dict[str, int]:
-    from cv2 import aruco
-
-    names = [name for name in dir(aruco) if name.startswith("DICT_")]
-    return {name.removeprefix("DICT_").lower(): getattr(aruco, name) for name in names}
 
 
 MISSED, FOUND, MISIDENTIFIED = 0, 1, 2

@@ -48,15 +48,13 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     quality, _ = quality_of_centres(image, every)
     found = detect_circles(image, camera, table, settings)
     loose = detect_circles(image, camera, every, without_fit)
-    panels = figure.subplots(3, 1)
     titles = (
         "quality of the outlines round every pixel: between-class over total variance",
         f"candidates: {len(loose)} local maxima above {settings.threshold:g}, one per "
         f"{settings.separation_m:g} m",
         f"fitted through the lens, and weighed: {len(found)} discs (edge, and the two outlines)",
     )
-    for axes, title in zip(panels, titles, strict=True):
-        _image(axes, image, title)
+    panels = _panels(figure, (3, 1), image, titles)
     panels[0].imshow(np.where(quality > 0.0, quality, np.nan), cmap="magma", vmin=0, vmax=1)
     panels[1].plot(*loose.pixels.T, "+", color=_RINGS, markersize=7)
     radii = settings.radius_m, settings.inner_radius_m, settings.outer_radius_m
@@ -74,7 +72,6 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
     response = line_response(image, table, settings)
     found = detect_lines(image, table, settings)
     tilt = found.tilt
-    panels = figure.subplots(3, 1)
     said = "" if tilt is None else (
         f"; pitch {np.degrees(tilt.pitch_rad):.2f}°, roll {np.degrees(tilt.roll_rad):.2f}°"
     )  # fmt: skip
@@ -83,8 +80,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
         f"{len(found.fate)} tracks from the horizon (dashed) up and down",
         f"{len(found)} verticals{said}, on which {0 if tilt is None else tilt.lines} tracks agree",
     )
-    for axes, title in zip(panels, titles, strict=True):
-        _image(axes, image, title)
+    panels = _panels(figure, (3, 1), image, titles)
     panels[0].imshow(response, cmap="RdBu", vmin=-0.7, vmax=0.7)
     for t, fate in enumerate(found.fate):
         place = track_pixels(found.tracks, table, t)
@@ -101,10 +97,12 @@ def draw_tables(figure: Any, run: Path) -> None:
     radii = settings.inner_radius_m, settings.outer_radius_m
     table = cached_disc_table(camera, disc_shape(settings))
     verticals = cached_vertical_table(camera)
-    panels = figure.subplots(2, 1)
     said = " and ".join(f"{radius:.3g}" for radius in radii)
-    _image(panels[0], image, f"the two outlines (radius {said} m) about some pixels")
-    _image(panels[1], image, "horizon, and the verticals through some of its columns")
+    titles = (
+        f"the two outlines (radius {said} m) about some pixels",
+        "horizon, and the verticals through some of its columns",
+    )
+    panels = _panels(figure, (2, 1), image, titles)
     panels[0].imshow(np.where(table.usable, np.nan, 0.35), cmap="gray", vmin=0, vmax=1, alpha=0.5)
     for u in range(60, camera.width, 108):
         for v in (140, 180, 225, 265):
@@ -129,19 +127,15 @@ def draw_markers(figure: Any, run: Path, frame: int) -> None:
     camera, image = _frame(run, frame)
     settings = MarkerSettings()
     found = detect_markers(image, settings, camera)
-    panels = figure.subplots(1, 3)
+    titles = (
+        "1. dark against the closing (one of the thresholds)",
+        f"2. corners of {len(found.candidates)} candidates",
+        f"3. {len(found)} markers, fitted and identified",
+    )
+    panels = _panels(figure, (1, 3), image, titles)
     middles = found.corners.mean(axis=1)
     low, high = middles.min(axis=0) - 70, middles.max(axis=0) + 70
-    for axes, title in zip(
-        panels,
-        (
-            "1. dark against the closing (one of the thresholds)",
-            f"2. corners of {len(found.candidates)} candidates",
-            f"3. {len(found)} markers, fitted and identified",
-        ),
-        strict=True,
-    ):
-        _image(axes, image, title)
+    for axes in panels:
         axes.set(
             xlim=(max(low[0], 0), min(high[0], camera.width)),
             ylim=(min(high[1], camera.height), max(low[1], 0)),
@@ -166,11 +160,15 @@ def _frame(run: Path, number: int) -> tuple[Camera, Any]:
     return opened.camera, read_image(frame, opened.camera)
 
 
-def _image(axes: Any, image: Any, title: str) -> None:
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-    axes.autoscale(False)
-    axes.set_title(title, fontsize=9)
-    axes.axis("off")
+def _panels(figure: Any, shape: tuple[int, int], image: Any, titles: tuple[str, ...]) -> Any:
+    """Axes that show an image, by their titles."""
+    panels = figure.subplots(*shape)
+    for axes, title in zip(panels, titles, strict=True):
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+        axes.autoscale(False)
+        axes.set_title(title, fontsize=9)
+        axes.axis("off")
+    return panels
 
 
 def draw_association(figure: Any, run: Path) -> None:

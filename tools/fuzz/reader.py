@@ -6,9 +6,13 @@ file, fits on one line, is of bounded length and shows nothing that a terminal w
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from tools.published_camera import PUBLISHED_CAM
 
@@ -20,6 +24,14 @@ JSON_WORDS = (b"[", b"]", b"{", b"}", b'"', b":", b"null", b"true", b"1e999", b"
 NPZ_WORDS = (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", b"\xff\xff\xff\xff")
 
 CAMERA_TEXT = PUBLISHED_CAM.encode()
+
+
+def npz(**arrays: Any) -> bytes:
+    """The content of a ``.npz`` of some arrays."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
 
 #: Characters of a message beside the file's name.
 LONGEST_MESSAGE = 500

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, arg
 
 from redetect.storage.command_line import exit_code_of
 from tools.simulator.driving import DriveStyle
@@ -194,13 +194,7 @@ class LaserSession:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(
-        Annotated[Demo, subcommand("demo")]
-        | Annotated[Run, subcommand("run")]
-        | Annotated[Rows, subcommand("rows")]
-        | Annotated[MarkerFrames, subcommand("marker-frames")]
-        | Annotated[MarkerSession, subcommand("marker-session")]
-        | Annotated[MarkerDemo, subcommand("marker-demo")]
-        | Annotated[LaserSession, subcommand("laser-session")],
+        Demo | Run | Rows | MarkerFrames | MarkerSession | MarkerDemo | LaserSession,
         prog="python -m tools.simulator",
         description="Rendered runs and sessions with known truth.",
         args=arguments,

@@ -230,13 +230,10 @@ def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
     middle = edge.ends.mean(axis=0)
     aside = nominal.directions_robot(middle + np.array([[-0.5, 0.0], [0.5, 0.0]]))
     bearing = np.arctan2(aside[:, 0], -aside[:, 1])
-    top, bottom = edge.normalised
+    beta = float(np.arcsin(np.clip(normal[2], -1.0, 1.0)))
+    (x0, y0), (x1, y1) = edge.normalised.tolist()
     return LineLandmark(
-        float(top[0]),
-        float(top[1]),
-        float(bottom[0]),
-        float(bottom[1]),
-        alpha=edge.bearing_rad, beta=float(np.arcsin(np.clip(normal[2], -1.0, 1.0))),
+        x0, y0, x1, y1, alpha=edge.bearing_rad, beta=beta,
         quality=0.0, sigma=float(abs(bearing[0] - bearing[1])), ids=(edge.edge_id,),
     )  # fmt: skip
 

@@ -196,8 +196,8 @@ def _write_tape(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
         f"{a},{b},{math.dist(FIDUCIALS[a], FIDUCIALS[b]) + rng.normal(0.0, sigma):.4f}"
         for a, b in combinations(FIDUCIALS, 2)
     ]
-    rows.insert(0, FIDUCIAL_DISTANCES_HEAD)
-    write_lines(folder / "fiducial_distances.csv", rows, overwrite=overwrite)
+    path = folder / "fiducial_distances.csv"
+    write_lines(path, [FIDUCIAL_DISTANCES_HEAD, *rows], overwrite=overwrite)
 
 
 def _drawn(plan: SessionPlan) -> FloatArray:

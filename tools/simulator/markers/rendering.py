@@ -33,8 +33,7 @@ def pixel_rays(camera: Camera) -> FloatArray:
     pixels = np.stack([u, v], axis=-1)
     rays = np.empty((camera.height, camera.width, 6))
     rays[..., :2] = camera.undistort(pixels)
-    for axis in range(2):
-        step = np.array([0.5, 0.0]) if axis == 0 else np.array([0.0, 0.5])
+    for axis, step in enumerate(0.5 * np.eye(2)):
         change = camera.undistort(pixels + step) - camera.undistort(pixels - step)
         rays[..., 2 + axis], rays[..., 4 + axis] = change[..., 0], change[..., 1]
     rays.setflags(write=False)

@@ -80,12 +80,8 @@ def poster(rng: np.random.Generator) -> Texture:
     height, width = 256, 192
     page = int(rng.integers(120, 245))
     image = np.full((height, width), page, dtype=np.uint8)
-    left, right, top, bottom = (
-        10,
-        width - 10,
-        int(rng.integers(34, 60)),
-        int(rng.integers(120, 190)),
-    )
+    left, right = 10, width - 10
+    top, bottom = int(rng.integers(34, 60)), int(rng.integers(120, 190))
     picture = blotches(rng, (bottom - top, right - left), octaves=3)
     image[top:bottom, left:right] = np.clip(255 * picture, 0, 255).astype(np.uint8)
     for _ in range(int(rng.integers(1, 6))):
