@@ -13,6 +13,8 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
+import numba
 import numpy as np
 
 from detect import __version__
@@ -72,9 +74,6 @@ class Benchmark(Study):
     seed: int = 0  # Of noise and positions.
 
     def measured(self) -> Figures:
-        import cv2
-        import numba
-
         # All are measured on one core; only the jobs of whole runs may use more.
         cv2.setNumThreads(1)
         numba.set_num_threads(1)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from camera import Camera, write_camera
@@ -37,8 +38,6 @@ class Picture:
 
 def decode(encoded: ByteArray) -> ByteArray:
     """(H, W) grey values of an image file's content."""
-    import cv2
-
     grey = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise StudyError("an image file's content cannot be decoded: expected an image")
@@ -47,8 +46,6 @@ def decode(encoded: ByteArray) -> ByteArray:
 
 def jpeg_picture(grey: ByteArray) -> Picture:
     """An image through a JPEG of quality 90."""
-    import cv2
-
     _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return Picture(encoded.ravel(), decode(encoded))
 
@@ -71,8 +68,6 @@ def noise_pictures(camera: Camera, count: int, seed: int) -> list[Picture]:
 
 def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Picture]:
     """Photographs found anywhere below a folder, scaled to the camera's size."""
-    import cv2
-
     pictures = []
     for path in _spread_out(list(photograph_files(folder)), count):
         size = camera.width, camera.height
@@ -101,8 +96,6 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
 
 def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
     """A picture enlarged to a scaled camera's size, with a sensor's noise."""
-    import cv2
-
     size = (camera.width, camera.height)
     grey = np.asarray(cv2.resize(picture.grey, size, interpolation=cv2.INTER_CUBIC), np.float64)
     noisy = grey + np.random.default_rng(seed).normal(0.0, _SENSOR_NOISE, grey.shape)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tyro.conf import Positional
 
@@ -54,8 +55,6 @@ def render_board(
     seed: int = 0,
 ) -> ByteArray:
     """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
-    import cv2
-
     fine: FloatArray = np.empty(rays.xy.shape[:2])
     for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
         fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
@@ -198,8 +197,6 @@ class TutorialPhotographs(Study):
     seed: int = 3  # Of the board's positions and the noise.
 
     def measured(self) -> Figures:
-        import cv2
-
         camera = read_camera(self.camera)
         boards = self.output / "boards"
         if boards.exists():

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tyro.conf import Positional
 
@@ -136,8 +137,6 @@ def splits(views: int) -> dict[str, list[IntArray]]:
 
 def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -> float:
     """RMS error (px) in photographs left out, whose poses alone are fitted, by OpenCV's model."""
-    import cv2
-
     every = np.arange(len(points.counts))
     flags = cv2.CALIB_RATIONAL_MODEL | (0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST)
     squares = 0.0

@@ -11,6 +11,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from detect.markers.candidates import closing
+from detect.markers.detect import detect_markers
+from detect.settings import MarkerSettings
 from tools.benchmark.material import decode, jpeg_picture
 from tools.benchmark.timing import measure_in_turn
 from tools.evaluation.figures import WRONG, Figures, Study
@@ -126,10 +129,6 @@ def time_searches(
     timed twice: with no width given, and with the median width of the frame's markers. Prints, and
     returns, medians and quartiles of the times in those of decoding, and milliseconds.
     """
-    from detect.markers.candidates import closing
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     cv2.setNumThreads(1)
     (dictionary,) = settings.dictionaries
     sampled: list[SampleFrame] = []

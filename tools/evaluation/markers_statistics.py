@@ -9,8 +9,11 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from cv2 import aruco
 
 from camera import Camera
+from detect.markers.detect import detect_markers
+from detect.settings import MarkerSettings
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
 from tools.evaluation import tables
@@ -56,15 +59,10 @@ def detector_of(name: str) -> Detector:
 
 def known_to_opencv(dictionary: str) -> bool:
     """Whether OpenCV has a dictionary of that name."""
-    from cv2 import aruco
-
     return hasattr(aruco, f"DICT_{dictionary.upper()}")
 
 
 def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
     return Found(found.ids, found.corners, found.covariance)
 
@@ -79,8 +77,6 @@ def _aruco(name: str, image: ByteArray, dictionary: str) -> Found:
 
 @cache
 def _aruco_detector(name: str, dictionary: str):  # type: ignore[no-untyped-def]
-    from cv2 import aruco
-
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = getattr(aruco, _REFINEMENTS[name][0])
     known = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{dictionary.upper()}"))

@@ -8,15 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import matplotlib as mpl
 import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
+from detect.discs.quality import quality_of_centres
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
+from detect.markers.candidates import closing, dark_pixels
+from detect.markers.detect import detect_markers
 from detect.seen import circle_on_floor, summed_steps
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from detect.verticals.response import line_response
@@ -41,8 +46,6 @@ def draw_discs(figure: Any, run: Path, frame: int) -> None:
     camera, image = _frame(run, frame)
     settings = CircleSettings()
     table = disc_table(camera, settings)
-    from detect.discs.quality import quality_of_centres
-
     without_fit = CircleSettings(refine=False)
     every = cached_disc_table(camera, disc_shape(without_fit))
     quality, _ = quality_of_centres(image, every)
@@ -120,10 +123,6 @@ def draw_tables(figure: Any, run: Path) -> None:
 
 def draw_markers(figure: Any, run: Path, frame: int) -> None:
     """The three phases: dark regions, corners and edges, identities."""
-    from detect.markers.candidates import closing, dark_pixels
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     camera, image = _frame(run, frame)
     settings = MarkerSettings()
     found = detect_markers(image, settings, camera)
@@ -173,8 +172,6 @@ def _panels(figure: Any, shape: tuple[int, int], image: Any, titles: tuple[str, 
 
 def draw_association(figure: Any, run: Path) -> None:
     """Rows of a run where odometry and where the map puts them, coloured by what was found."""
-    import matplotlib as mpl
-
     frames = list(read_frames(run / "found.circles"))
     summed = summed_steps(frame.step for frame in frames)
     mapped = read_path(run / "slam" / "path.csv").poses
@@ -331,8 +328,6 @@ class Pictures(Study):
 
 
 def _photographs(figure: Any, folder: Path) -> None:
-    import cv2
-
     files = [*sorted((folder / "boards").glob("*.png"))[1:3], folder / "floor.png"]
     for axes, file in zip(figure.subplots(1, 3), files, strict=True):
         axes.imshow(np.asarray(cv2.imread(str(file), 0)), cmap="gray", vmin=0, vmax=255)

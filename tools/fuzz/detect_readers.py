@@ -10,6 +10,7 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from camera import CameraError, parse_camera
@@ -20,6 +21,7 @@ from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
 from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses
+from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage.bounded import claimed_size
@@ -71,8 +73,6 @@ def steps_of(poses: Iterable[TimedPose]) -> object:
 @cache
 def _encoded() -> tuple[bytes, ...]:
     """Images as OpenCV writes them, of 8 and 16 bits, grey and coloured."""
-    import cv2
-
     grey = (np.arange(64, dtype=np.uint8) * 3).reshape(8, 8)
     deep = grey.astype(np.uint16) * 16
     colour = np.dstack([grey, grey.T, 255 - grey])
@@ -153,8 +153,6 @@ def _table(path: Path) -> object:
 
 @cache
 def _table_content() -> tuple[bytes, ...]:
-    from lut import build_vertical_table
-
     return (npz(**vars(build_vertical_table(_TABLE_CAMERA))),)
 
 

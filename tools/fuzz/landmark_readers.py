@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
+from redetect.landmarks import LandmarkError, frames_of_rows, parse_rows, read_rows
+from redetect.landmarks.files import format_record
 from redetect.landmarks.map_file import covariance_file, read_map, read_path, with_joint_covariance
 from redetect.landmarks.tilts import read_tilts
 from redetect.landmarks.times import read_times
@@ -19,9 +20,6 @@ from tools.fuzz.reader import NUMBERS, Reader
 
 def _landmarks(path: Path) -> object:
     """Frames of a file; what was accepted is given back byte by byte, and its records too."""
-    from redetect.landmarks import parse_rows
-    from redetect.landmarks.files import format_record
-
     rows = list(read_rows(path))
     assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"
     frames = list(frames_of_rows(rows))

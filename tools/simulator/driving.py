@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
@@ -79,8 +80,6 @@ def robot_tilt(frames: int, style: DriveStyle, rng: np.random.Generator) -> Floa
 
 def smooth_noise(count: int, length: float, rng: np.random.Generator) -> FloatArray:
     """(count,) Gaussian noise of unit variance that stays similar over `length` samples."""
-    from scipy.ndimage import gaussian_filter1d
-
     margin = int(np.ceil(4.0 * length))
     white = rng.standard_normal(count + 2 * margin)
     smooth = gaussian_filter1d(white, length, mode="constant")[margin : margin + count]

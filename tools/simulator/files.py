@@ -7,14 +7,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from redetect.array_types import ByteArray
 from redetect.storage import write_bytes
 
 
 def encoded(grey: ByteArray, ending: str = ".jpg", quality: int = 95) -> bytes:
     """The bytes of a grey image's file; `quality` is that of a JPEG."""
-    import cv2
-
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if ending == ".jpg" else []
     done, content = cv2.imencode(ending, grey, options)
     if not done:

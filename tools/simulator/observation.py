@@ -12,6 +12,7 @@ from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, LineLandmark
 from redetect.slam.models import disc_in_robot
 from tools.simulator.driving import planar_transform
+from tools.simulator.ray_kernels import points_visible
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 
@@ -119,8 +120,6 @@ def see_discs(
     radius_m: float,
 ) -> list[SeenDisc]:
     """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
-    from tools.simulator.ray_kernels import points_visible
-
     robot_xy = disc_in_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
     inside = _in_image(true, pixels)
@@ -172,8 +171,6 @@ def see_edges(
     scene: Scene, true: Camera, pose: FloatArray, edges: list[UprightEdge], grey: ByteArray
 ) -> list[SeenEdge]:
     """Which vertical edges within 12 m are in view from a pose. `grey` (H, W)."""
-    from tools.simulator.ray_kernels import points_visible
-
     eye = camera_in_world(true, pose)[:, 3]
     place = np.array([[e.x, e.y] for e in edges]).reshape(-1, 2)
     heights = np.array([[e.z0, e.z1] for e in edges]).reshape(-1, 2)

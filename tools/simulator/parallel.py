@@ -7,6 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TypeVar
 
+import cv2
+from rich.console import Console
+from rich.progress import track
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -18,10 +22,6 @@ def in_order(
 
     On a terminal a bar shows how many there are already.
     """
-    import cv2
-    from rich.console import Console
-    from rich.progress import track
-
     terminal = Console(stderr=True)
     bar = partial(track, description="", total=len(items), console=terminal, transient=True,
                   disable=not terminal.is_terminal)  # fmt: skip

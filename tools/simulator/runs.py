@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import cv2
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
@@ -217,8 +218,6 @@ class FrameTruth:
 
 def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
     """Render one frame of a run and say what is in it."""
-    import cv2
-
     # Its own random numbers, whatever was rendered before it.
     seed = np.random.SeedSequence([plan.settings.seed, len(_PURPOSES), frame])
     rng = np.random.default_rng(seed)

@@ -12,8 +12,10 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
@@ -312,8 +314,6 @@ def make_scene(
     `extent` (x0, y0, x1, y1); `floor_kind` (Ny, Nx); `floorings` (F, 5); `indoors` (Ny, Nx); `sun`
     (x, y, z, light).
     """
-    from scipy.ndimage import gaussian_filter
-
     from tools.simulator.ray_kernels import bake_light
 
     x0, y0, x1, y1 = extent
@@ -445,7 +445,6 @@ def _cosine_directions(count: int) -> FloatArray:
 @lru_cache(maxsize=1)
 def _photographs() -> Float32Array:
     """Photographs that come with scikit-image, each with its halved versions."""
-    import cv2
     from skimage import data
 
     # Only those that lie in the package itself: nothing is fetched.

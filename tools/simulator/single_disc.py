@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
 
 from camera import Camera
 from redetect.array_types import FloatArray
@@ -133,8 +134,6 @@ def render_disc(
     ValueError
         If there is noise without `rng`, or part of the disc is not in front of the camera.
     """
-    from scipy.ndimage import gaussian_filter
-
     blur_u, blur_v = blur_px if isinstance(blur_px, tuple) else (blur_px, blur_px)
     if noise_sigma > 0.0 and rng is None:
         raise ValueError("rng is None: expected a numpy Generator, since there is noise")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from redetect.array_types import FloatArray
 from tools.simulator.laser.settings import DrivingLimits, WheelErrors
@@ -65,8 +66,6 @@ class Curve:
     """A cubic spline through waypoints by its length; `way` (M,) and `bend` (M,) on a fine grid."""
 
     def __init__(self, waypoints: FloatArray, grid_m: float = _GRID_M) -> None:
-        from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
         chords = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints, axis=0).T))])
         self._spline = CubicSpline(chords, waypoints, bc_type="natural")
         u = np.linspace(0.0, chords[-1], int(np.ceil(chords[-1] / grid_m)) + 1)

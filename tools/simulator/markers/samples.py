@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from camera import Camera, format_camera, write_camera
 from camera.uncertainty import IDENTITY
@@ -351,8 +352,6 @@ def _motion(
     settings: SampleSettings, camera: Camera, cards: list[tuple[int, int]], rng: np.random.Generator
 ) -> tuple[list[FloatArray], float]:
     """How far everything has turned about the camera at each instant of the exposure."""
-    from scipy.spatial.transform import Rotation
-
     moving = rng.random() < settings.motion
     length = float(rng.uniform(*settings.motion_px))
     direction = rng.uniform(0.0, 2.0 * np.pi)

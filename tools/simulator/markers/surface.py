@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -175,8 +176,6 @@ def pattern_distance(dictionary: MarkerDictionary, pattern: BoolArray) -> int:
 
 def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
     """In how many cells a dark thing on a light ground differs from the nearest marker."""
-    import cv2
-
     dark = texture.values < 0.5 * (BLACK + WHITE)
     if texture.smooth or not dark.any():
         return float("inf")
