@@ -2,7 +2,7 @@
 
     python -m tools.demo_package
 
-Run it after `images/e` has changed; a test holds both against each other.
+Run it after `images/e` has changed; a test compares the two.
 """
 
 from __future__ import annotations

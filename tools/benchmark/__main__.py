@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import sys
 import tempfile
 import time
@@ -198,10 +199,7 @@ def measure_runs(
 def this_machine() -> str:
     """Processor, cores, system and versions, on one line."""
     file = Path("/proc/cpuinfo")
-    rows = (
-        line.partition(":") for line in (file.read_text() if file.is_file() else "").split("\n")
-    )
-    names = [value.strip() for key, _, value in rows if key.strip() == "model name"]
+    names = re.findall(r"model name\s*: (.*)", file.read_text() if file.is_file() else "")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = [f"{name} {version(name)}" for name in _PACKAGES]
     return ", ".join(

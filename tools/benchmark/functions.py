@@ -1,4 +1,4 @@
-"""What is measured: decoding, the detectors whole and in part, peers, and whole runs."""
+"""The measured functions: decoding, detectors and their parts, peers, and whole runs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture
 
-#: What everything else is compared with.
+#: The function with which all others are compared.
 DECODING = "decoding"
 KERNEL, RESPONSE = "quality map (report)", "response (dense)"
 CIRCLES, LINES, ALL = "circles (default)", "lines (default)", "lines, tilt and discs"

@@ -27,9 +27,9 @@ _WORDS = (
 
 
 def _bag(path: Path) -> object:
-    """All that `detect` asks of a bag.
+    """All that `detect` reads from a bag.
 
-    The calibration that it begins with is none, so that no camera is fitted to it, which takes
+    The calibration of the seeds is all zeros, so that no camera is fitted to it, which takes
     seconds.
     """
     bag = Bag(path)

@@ -1,4 +1,4 @@
-"""Readers of what a run is made of: images, times, heads of files, journals, cached tables."""
+"""Readers of the parts of a run: images, poses, heads of files, journals, cached tables."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader, npz
 
 #: Images are read for a calibration of this size.
 _SIZE = (8, 8)
-#: Without a calibration, images that claim more are left alone here: they only take time.
+#: Without a calibration, images that claim more pixels are skipped: they only take time.
 _MOST_PIXELS = 1 << 16
 
 _JPEG = b"\xff\xd8\xff\xe0\0\x04AB\xff\xc0\0\x0b\x08\0\x08\0\x08\x01\x01\x11\0\xff\xd9"
@@ -85,7 +85,7 @@ def _encoded() -> tuple[bytes, ...]:
 
 
 class _Message:
-    """An image message whose fields stand at the beginning of a file."""
+    """An image message whose fields are at the beginning of a file."""
 
     def __init__(self, content: bytes) -> None:
         fields = struct.unpack("<IIIB", content[:13].ljust(13, b"\0"))
@@ -121,7 +121,7 @@ def _journal(path: Path) -> object:
 
 
 def _journal_of(*records: bytes) -> bytes:
-    """Records, each behind the digest of it and all before it."""
+    """Records, each after the digest of itself and all earlier ones."""
     lines, digest = [], hashlib.sha256()
     for record in records:
         digest.update(record)
@@ -137,7 +137,7 @@ _TABLE_CAMERA = parse_camera(
 
 
 def _table(path: Path) -> object:
-    """A cached table with the hash that it should have; whatever it holds, the true one comes."""
+    """A cached table with a valid hash: whatever it holds, the true table is returned."""
     folder = path.parent / "cache"
     if not folder.is_dir():
         folder.mkdir(mode=0o700)

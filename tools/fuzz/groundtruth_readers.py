@@ -1,4 +1,4 @@
-"""Readers of where a robot really was: poses, scans, clocks, scanners, surveys, calibrations."""
+"""Readers of ground truth: poses, scans, clocks, scanners, surveys, calibrations."""
 
 from __future__ import annotations
 

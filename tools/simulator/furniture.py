@@ -1,4 +1,4 @@
-"""What stands in rooms and corridors, hangs on walls and ceilings, and lies on the floor."""
+"""Furniture of rooms and corridors, things on walls and ceilings, and discs on the floor."""
 
 from __future__ import annotations
 
@@ -322,7 +322,7 @@ DISC_RADIUS_M = 0.10
 _ALONG_SIDE_M = (0.15, 2.2)
 _APART_M = 0.34
 _FROM_FURNITURE_M = 0.17
-#: Shape, radius, second radius (or half sides) and albedo of what is laid down by turns.
+#: Shape, radius and second radius (or half sides), albedo; one of each kind in turn.
 _LOOKALIKES = {
     "ring": (Mark.RING, 0.10, 0.055, 0.85),
     "ellipse": (Mark.ELLIPSE, 0.16, 0.06, 0.8),

@@ -39,11 +39,11 @@ def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
     return float(0.25 * difference * difference / total)
 
 
-#: A row's centre lies at least so many pixels inside the image, as in the data set.
+#: The centre of a row lies at least this many pixels inside the image, as in the data set.
 BORDER_PX = 12
-#: And the floor moves at most so far from one pixel to the next (m), as in the data set.
+#: And adjacent pixels there are at most this far apart on the floor (m), as in the data set.
 FAR_LIMIT_M = 0.05
-#: A row's disc has at least this share of its area in view.
+#: At least this share of the area of a row's disc is in view.
 LEAST_SHARE = 0.8
 
 _DISC_POINTS = 60
@@ -86,8 +86,8 @@ class SeenEdge:
     true bearing from the camera's centre in the level robot frame; `contrast` the median step in
     grey values across it, `rows` the number of image rows that show it, `peak_px` its distance from
     the nearest peak of the image's gradient; `crosses`: it is seen where it crosses the horizon,
-    `BORDER_PX` inside the image. A detector of verticals begins there: the foot of a shelf below
-    the horizon leans as any furrow of the floor may.
+    `BORDER_PX` inside the image. A detector of verticals begins there: below the horizon, the foot
+    of a shelf may lean like any line on the floor.
     """
 
     edge_id: int

@@ -1,4 +1,4 @@
-"""Frames worked on by several processes; what comes back is the same as from one."""
+"""Frames processed by several processes, with the same results as from one."""
 
 from __future__ import annotations
 

@@ -27,10 +27,10 @@ _SKY_M = 1e4
 
 
 class Light(NamedTuple):
-    """Light on the full, interlaced frame and what it comes from."""
+    """Light on the full, interlaced frame, and its sources."""
 
     radiance: Float32Array  # (2 H, W) light on each pixel; 1 is white paper in good light.
-    seen: NDArray[np.int32]  # (2 H, W) a number for what each pixel's centre sees.
+    seen: NDArray[np.int32]  # (2 H, W) number of what each pixel's centre sees.
     depth: Float32Array  # (2 H, W) depth along the optical axis (m).
 
 
@@ -82,7 +82,7 @@ def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
         weight = reflecting.astype(np.float32)
         image = np.zeros_like(weight)
         image[reflecting] = light_along(scene, floor, down * [1.0, 1.0, -1.0], 8.0 * angle)[0]
-        # A floor mirrors blurred; where it ends, nothing of the wall may be mixed in.
+        # A floor reflects blurred; at its end, the wall must not be mixed in.
         blur = (_MIRROR_BLUR[1], _MIRROR_BLUR[0])
         share = np.maximum(gaussian_filter(weight, blur), 1e-6)
         image = gaussian_filter(image, blur) / share
@@ -115,7 +115,7 @@ def smeared(
     points = (rays * depth[..., None]) @ now[:, :3].T + now[:, 3]
     ends = camera.project((points - later[:, 3]) @ later[:, :3])
     places = np.indices(depth.shape).reshape(2, -1)
-    # What leaves the sight stays where it is.
+    # What leaves the field of view stays where it is.
     way = np.nan_to_num((ends[..., ::-1] * [2.0, 1.0]).reshape(-1, 2).T - places)
     steps = np.ceil(2.0 * np.hypot(*way)).astype(np.int64)
     total = light.radiance.ravel().astype(np.float64)

@@ -2,7 +2,7 @@
 
 The disc's outline goes forward through the camera as a fine polygon; the area that it covers of the
 cells of a supersampled grid is exact; the optics' blur and the pixel's aperture follow. Nothing
-here knows a detector's tables or models.
+here uses a detector's tables or models.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -46,13 +46,7 @@ from tools.simulator.markers.things import (
     shapes_background,
     thing,
 )
-from tools.simulator.markers.truth import (
-    MarkerTruth,
-    marker_corners,
-    mean_side_px,
-    slant_deg,
-    visible_shares,
-)
+from tools.simulator.markers.truth import MarkerTruth, marker_corners, marker_truth, mean_side_px
 from tools.simulator.parallel import in_order
 
 _TRIES = 12
@@ -253,9 +247,7 @@ def sample_frame(settings: SampleSettings, seed: int, index: int) -> SampleFrame
     light = render_light(camera, exposures, background, fine=imaging.fine, samples=settings.samples)
     image = grey_image(light, illumination, imaging, rng)
     arrays = surface_arrays(camera, scene.surfaces)
-    markers = tuple(
-        _truth(scene, card, arrays, illumination, imaging.gain, name) for card in scene.cards
-    )
+    markers = tuple(_truth(scene, card, arrays, illumination, imaging.gain) for card in scene.cards)
     return SampleFrame(
         seed, index, image, camera, name, markers, tuple(scene.things), imaging, motion_px
     )
@@ -378,25 +370,15 @@ def _occluder(rng: np.random.Generator, card: Surface) -> Surface:
 
 
 def _truth(
-    scene: _Scene,
-    card: tuple[int, int],
-    arrays: SurfaceArrays,
-    illumination: Any,
-    gain: float,
-    dictionary: str,
+    scene: _Scene, card: tuple[int, int], arrays: SurfaceArrays, illumination: Any, gain: float
 ) -> MarkerTruth:
     which, marker_id = card
-    pose = scene.surfaces[which].pose
-    camera = scene.camera
-    visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M, arrays)
-    corners = marker_corners(camera, pose, _MARKER_M)
-    middle = np.rint(camera.project(pose[:3, 3])).astype(int)
+    camera, known = scene.camera, (scene.dictionary.name, marker_id, _MARKER_M)
+    truth = marker_truth(camera, scene.surfaces, which, known, arrays)
+    middle = np.rint(camera.project(truth.camera_from_marker[:3, 3])).astype(int)
     u, v = np.clip(middle, 0, [camera.width - 1, camera.height - 1])
     light = float(illumination[v, u]) if np.ndim(illumination) == 2 else 1.0
-    return MarkerTruth(
-        dictionary, marker_id, corners, pose, _MARKER_M, mean_side_px(corners), slant_deg(pose),
-        gain * light * (WHITE - BLACK), visible, rim,
-    )  # fmt: skip
+    return replace(truth, contrast_grey=gain * light * (WHITE - BLACK))
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:

@@ -37,13 +37,7 @@ from tools.simulator.markers.room import (
     room_surfaces,
 )
 from tools.simulator.markers.surface import BLACK, WHITE, Surface
-from tools.simulator.markers.truth import (
-    MarkerTruth,
-    marker_corners,
-    mean_side_px,
-    slant_deg,
-    visible_shares,
-)
+from tools.simulator.markers.truth import MarkerTruth, marker_truth
 from tools.simulator.parallel import in_order
 
 
@@ -328,23 +322,15 @@ def seen_markers(plan: SessionPlan, camera: int, pose: FloatArray) -> tuple[Mark
     result = []
     arrays = surface_arrays(model, surfaces)
     for which, (marker, width) in enumerate(zip(plan.rig.ids, plan.rig.widths_m)):
-        card = surfaces[which]
-        visible, rim = visible_shares(model, surfaces, which, float(width), arrays)
-        corners = marker_corners(model, card.pose, float(width))
-        if visible == 0.0 or np.isnan(corners).any():
+        known = plan.rig.dictionary, int(marker), float(width)
+        truth = marker_truth(model, surfaces, which, known, arrays)
+        if truth.visible == 0.0 or np.isnan(truth.corners).any():
             continue
-        u, v = np.clip(
-            np.rint(corners.mean(axis=0)).astype(int), 0, [model.width - 1, model.height - 1]
-        )
-        lightest = float(np.nanmax(card.texture.values)) / WHITE
+        middle = np.rint(truth.corners.mean(axis=0)).astype(int)
+        u, v = np.clip(middle, 0, [model.width - 1, model.height - 1])
+        lightest = float(np.nanmax(surfaces[which].texture.values)) / WHITE
         light = plan.settings.imaging.gain * float(illumination[v, u])
-        contrast = light * (WHITE - BLACK) * lightest
-        result.append(
-            MarkerTruth(
-                plan.rig.dictionary, int(marker), corners, card.pose, float(width),
-                mean_side_px(corners), slant_deg(card.pose), contrast, visible, rim,
-            )
-        )  # fmt: skip
+        result.append(replace(truth, contrast_grey=light * (WHITE - BLACK) * lightest))
     return tuple(result)
 
 

@@ -107,3 +107,19 @@ def visible_shares(
         x, y = np.ascontiguousarray((seen[:, :2] / seen[:, 2:]).T)
         shares.append(count_visible(x, y, int(number[0]), arrays) / len(points))
     return shares[0], shares[1]
+
+
+def marker_truth(
+    camera: Camera, surfaces: Sequence[Surface], which: int, marker: tuple[str, int, float],
+    arrays: SurfaceArrays,
+) -> MarkerTruth:  # fmt: skip
+    """The truth of a marker (dictionary, number, width), but for its contrast, which is 0.
+
+    The other parameters are those of `visible_shares`.
+    """
+    pose, width_m = surfaces[which].pose, marker[2]
+    corners = marker_corners(camera, pose, width_m)
+    return MarkerTruth(
+        *marker[:2], corners, pose, width_m, mean_side_px(corners), slant_deg(pose), 0.0,
+        *visible_shares(camera, surfaces, which, width_m, arrays),
+    )  # fmt: skip
