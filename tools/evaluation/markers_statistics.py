@@ -22,8 +22,8 @@ from tools.simulator.markers.truth import MarkerTruth
 
 OURS = "redetect"
 
-#: OpenCV's refinements of corners, by the names under which they are shown, and what is taken off
-#: their corners: the AprilTag code puts (0, 0) at the upper left pixel's corner, not at its centre.
+#: OpenCV's refinements of corners, by the names in the tables, and what is subtracted from their
+#: corners: the AprilTag code puts (0, 0) at the upper left pixel's corner, not at its centre.
 _REFINEMENTS = {
     "aruco": ("CORNER_REFINE_NONE", 0.0),
     "aruco subpix": ("CORNER_REFINE_SUBPIX", 0.0),
@@ -85,12 +85,12 @@ def _aruco_detector(name: str, dictionary: str):  # type: ignore[no-untyped-def]
 
 MISSED, FOUND, MISIDENTIFIED = 0, 1, 2
 
-# A detection is of a marker if its corners, in any order, are as near as this in its widths.
+# A detection belongs to a marker if its corners, in any order, are this near (in its widths).
 _NEAR_WIDTHS = 0.25
 
 
 class Outcome(NamedTuple):
-    """What a detector made of the markers of one frame."""
+    """Result of a detector for the markers of one frame."""
 
     status: IntArray
     """(M,) `MISSED`, `FOUND` or `MISIDENTIFIED` (wrong number, or turned) for each true marker."""
@@ -103,7 +103,7 @@ class Outcome(NamedTuple):
 
 
 def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
-    """Hold what was found against the truth."""
+    """Compare detections with the truth."""
     count = len(markers)
     status = np.full(count, MISSED, dtype=np.int64)
     errors, normalised = np.full((count, 4, 2), np.nan), np.full((count, 4), np.nan)
@@ -126,7 +126,7 @@ def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
 
 
 def _nearest(markers: Sequence[MarkerTruth], corners: FloatArray) -> tuple[int, int]:
-    """The true marker that lies where the corners are, and by how many quarters it is turned."""
+    """The true marker at the corners, and the number of quarter turns between them."""
     best = (-1, 0)
     least = _NEAR_WIDTHS
     for which, marker in enumerate(markers):
@@ -145,7 +145,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class ScoredFrame:
-    """A frame's truth, without its image, and what became of it."""
+    """The truth of a frame, without its image, and the results of the detectors."""
 
     seed: int
     index: int
@@ -155,7 +155,7 @@ class ScoredFrame:
 
 
 def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
-    """What is kept of a frame: what became of its markers, by detector."""
+    """The results of all detectors for a frame."""
     imaging = frame.imaging
     outcomes = {name: score_frame(frame.markers, of) for name, of in found.items()}
     rows = [
@@ -169,7 +169,7 @@ def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """All markers of many frames, and what each detector made of them."""
+    """All markers of many frames, and the result of each detector."""
 
     frames: int
     columns: dict[str, FloatArray]  # (M,) each of `COLUMNS`; clear is 0 or 1.
@@ -191,7 +191,7 @@ def table_of(frames: Sequence[ScoredFrame]) -> Table:
     return Table(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
 
 
-#: What each quantity is called, and the limits of its bins.
+#: Title of each quantity, and the limits of its bins.
 BINS: dict[str, tuple[str, tuple[float, ...]]] = {
     "width_px": ("width / px", (12, 16, 20, 28, 40, 60, 90, 130, 200)),
     "slant_deg": ("slant / deg", (0, 15, 30, 45, 60, 70)),
@@ -199,12 +199,12 @@ BINS: dict[str, tuple[str, tuple[float, ...]]] = {
     "contrast_grey": ("contrast / grey levels", (10, 20, 35, 60, 100, 200)),
 }
 
-# A bin in which fewer markers were found says nothing of their errors.
+# With fewer markers found in a bin, no errors are given.
 _FEWEST = 5
 
 
 class Figures(NamedTuple):
-    """What a detector did with the clear markers of a bin; errors NaN where it found too few."""
+    """Figures of a detector for the clear markers of a bin; errors NaN if it found too few."""
 
     rate: float  # Share of the markers that were found.
     median_px: float  # Of the distances of corners from the truth.
@@ -273,7 +273,7 @@ def _figures(outcome: Outcome, found: BoolArray, rate: float) -> Figures:
 
 
 def counts_lines(table: Table) -> list[str]:
-    """What each detector found, took for another and saw where there is nothing."""
+    """Numbers of misidentified, false and repeated detections of each detector."""
     markers = len(table.columns["clear"])
     clear = int(table.columns["clear"].sum())
     lines = [f"{table.frames} frames, {markers} markers, {clear} of them clearly in view"]

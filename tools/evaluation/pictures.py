@@ -1,4 +1,4 @@
-"""The pictures of the documentation, but for the schematic ones, which are drawn by hand (SVG)."""
+"""The pictures of the documentation, except the schematic ones, which are drawn by hand (SVG)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _OWN, _OTHER = "#1f4e9c", "#e67e22"
 
 
 def draw_discs(figure: Any, run: Path, frame: int) -> None:
-    """Quality of every pixel; candidates; what the fit makes of them."""
+    """Quality of every pixel; candidates; fitted discs."""
     camera, image = _frame(run, frame)
     settings = CircleSettings()
     table = disc_table(camera, settings)
@@ -94,7 +94,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
 
 
 def draw_tables(figure: Any, run: Path) -> None:
-    """What is known of every pixel before the first image."""
+    """The tables: outlines and verticals of some pixels."""
     camera, image = _frame(run, 0)
     settings = CircleSettings(refine=False)
     radii = settings.inner_radius_m, settings.outer_radius_m
@@ -171,7 +171,7 @@ def _panels(figure: Any, shape: tuple[int, int], image: Any, titles: tuple[str, 
 
 
 def draw_association(figure: Any, run: Path) -> None:
-    """Rows of a run where odometry and where the map puts them, coloured by what was found."""
+    """Rows of a run as placed by odometry and by the map, coloured by their identifiers."""
     frames = list(read_frames(run / "found.circles"))
     summed = summed_steps(frame.step for frame in frames)
     mapped = read_path(run / "slam" / "path.csv").poses
@@ -190,7 +190,7 @@ def draw_association(figure: Any, run: Path) -> None:
 
 
 def draw_filter(figure: Any, run: Path) -> None:
-    """Errors of EKF-SLAM's poses, as they were at the time, within three standard deviations."""
+    """Errors of EKF-SLAM's poses at the time of each, and three standard deviations."""
     path = read_path(run / "ekf" / "path.csv")
     assert path.covariance is not None
     errors = path.poses - read_truth(run).poses
@@ -207,7 +207,7 @@ def draw_filter(figure: Any, run: Path) -> None:
 
 
 def draw_laser(figure: Any, session: Path, time_s: float) -> None:
-    """One set of scans: background, what is new, and the outline fitted to it."""
+    """One set of scans: background, new points, and the outline fitted to these."""
     laser = read_planar_poses(session / "laser.csv")
     nearest = np.argmin(np.abs(laser.times_s - laser.times_s[0] - time_s))
     at_s, pose = laser.times_s[nearest], laser.poses[nearest]
@@ -238,7 +238,7 @@ def draw_laser(figure: Any, session: Path, time_s: float) -> None:
 
 
 def draw_clock(figure: Any, session: Path) -> None:
-    """Rates of turn by both clocks, and the fused path with what it is sure of."""
+    """Rates of turn by both clocks, and the fused path with its standard deviations."""
     odometry, laser, fused = (
         read_planar_poses(session / f"{name}.csv") for name in ("odometry", "laser", "fused")
     )
@@ -280,7 +280,7 @@ def _turning(times_s: Any, theta_rad: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Pictures(Study):
-    """Draw the pictures of the documentation again, as far as their inputs are given.
+    """Draw the pictures of the documentation whose inputs are given.
 
     The run of `--rows` R and the session of `--session` S are made by
 

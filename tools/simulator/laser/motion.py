@@ -1,4 +1,4 @@
-"""Where the robot drives, and what its odometry and its clock show."""
+"""The robot's path, and the readings of its odometry and clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GRID_M = 0.002
 
 @dataclass(frozen=True)
 class Stop:
-    """A place on the way where the robot stands."""
+    """A place on the way where the robot stops."""
 
     way_m: float
     length_s: float
@@ -44,7 +44,7 @@ class Route:
         self._arrive, self._leave = leave - waits, leave
         self._curve, self._speed = curve, speed
         self.start_s, self.end_s = float(start_s), float(leave[-1])
-        #: From and to when it stands at each stop.
+        #: Begin and end of each stop.
         at = [int(np.searchsorted(curve.way, stop.way_m)) for stop in stops]
         self.stands = [(float(self._arrive[i]), float(self._leave[i])) for i in at]
 
@@ -80,7 +80,7 @@ class Curve:
         self._heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
 
     def way_of_waypoint(self, index: int) -> float:
-        """How far it is from the start to a waypoint (m)."""
+        """Length of the way from the start to a waypoint (m)."""
         return float(np.interp(self._chords[index], self._u, self.way))
 
     def poses(self, way_m: FloatArray) -> FloatArray:
@@ -94,7 +94,7 @@ class Curve:
 
 
 def _reachable(speed: FloatArray, steps: FloatArray, acceleration: float) -> FloatArray:
-    """Lower speeds until none is gained or lost faster than allowed."""
+    """Reduce speeds until no acceleration is larger than allowed."""
     square = speed**2
     gain = 2.0 * acceleration * np.concatenate([[0.0], np.cumsum(steps)])
     # v_j^2 <= v_i^2 + 2 a |s_j - s_i| for all i: running minima from both sides.
@@ -104,7 +104,7 @@ def _reachable(speed: FloatArray, steps: FloatArray, acceleration: float) -> Flo
 
 
 def measured_path(poses: FloatArray, errors: WheelErrors, rng: np.random.Generator) -> FloatArray:
-    """What odometry says, beginning at 0, 0, 0. `poses` (N, 3); returns (N, 3)."""
+    """The path by odometry, beginning at 0, 0, 0. `poses` (N, 3); returns (N, 3)."""
     turn = np.diff(poses[:, 2])
     step = np.diff(poses[:, :2], axis=0)
     middle = poses[:-1, 2] + 0.5 * turn
@@ -138,13 +138,13 @@ class RobotClock:
     jump_s: float = 0.0
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
-        """What the clock shows at times of the ground truth's clock."""
+        """Readings of the clock at times of the ground truth's clock."""
         times = np.asarray(times_s, dtype=np.float64)
         shown = times + self.offset_s + self.drift * (times - self.reference_s)
         return np.asarray(shown + np.where(times >= self.jump_at_s, self.jump_s, 0.0))
 
     def ticks(self, from_s: float, to_s: float, period_s: float, phase: float) -> FloatArray:
-        """Times, on the ground truth's clock, of what the robot does in regular intervals."""
+        """Times, on the ground truth's clock, of regular intervals of the robot's clock."""
         period = period_s / (1.0 + self.drift)
         count = max(int(np.floor((to_s - from_s) / period - phase)) + 1, 0)
         return np.asarray(from_s + period * (phase + np.arange(count)))

@@ -1,4 +1,4 @@
-"""Random frames for statistics of detection: markers and what might be taken for one."""
+"""Random frames for statistics of detection: markers and things that resemble them."""
 
 from __future__ import annotations
 
@@ -147,8 +147,8 @@ _MOST_EXPOSURES = 8
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """What random frames are to be like. Ranges of widths, blurs and contrasts are filled evenly
-    in their logarithms, the others evenly.
+    """Settings of random frames. Widths, blurs and contrasts are uniform in their logarithms, all
+    others are uniform.
     """
 
     dictionaries: tuple[str, ...] = ("rawseeds",)
@@ -181,7 +181,7 @@ class SampleSettings:
 
 @dataclass(frozen=True, eq=False)
 class SampleFrame:
-    """A random frame and what is true of it."""
+    """A random frame and its truth."""
 
     seed: int
     index: int
@@ -194,7 +194,7 @@ class SampleFrame:
     motion_px: float
 
     def as_json(self) -> dict[str, Any]:
-        """All but the image, in plain numbers."""
+        """Everything except the image, as JSON."""
         return {
             "seed": self.seed,
             "index": self.index,

@@ -43,7 +43,7 @@ from tools.simulator.parallel import in_order
 
 @dataclass(frozen=True)
 class CalibrationErrors:
-    """Standard deviations of the errors in what a session's files say of cameras and robot."""
+    """Standard deviations of the errors of cameras and robot in a session's files."""
 
     network_m: float = 0.0  # Of each camera's place along each axis (m).
     network_deg: float = 0.0  # Of each camera's rotation about each axis (degrees).
@@ -101,7 +101,7 @@ _SHADOW = 0.45
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What a session is to be like."""
+    """Settings of a session."""
 
     name: str = "session"  # Its name; those of the images begin with it.
     seed: int = 1  # Everything about it follows from this.
@@ -137,7 +137,7 @@ def random_for(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class SessionPlan:
-    """A session that needs only be rendered, everything exactly true."""
+    """A session that only has to be rendered, without errors."""
 
     settings: SessionSettings
     rig: Rig  # The robot's markers.
@@ -161,7 +161,7 @@ class SessionPlan:
         return f"{self.settings.name}.{frame:04d}"
 
     def background(self, camera: int) -> Float32Array:
-        """(H, W) float32 what a camera sees of the room without robot; worked out once."""
+        """(H, W) float32 view of the room without robot; rendered once per camera."""
         if camera not in self._backgrounds:
             model = self.network.cameras[camera]
             seen = [lit(s).moved(self.camera_from_world[camera]) for s in self.room]
@@ -276,7 +276,7 @@ def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray
 
 
 def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray) -> FloatArray:
-    """When the robot is looked at, in shares of the exposure from its middle: every pixel."""
+    """Instants of an exposure, as shares from its middle: one for each pixel of motion."""
     points = plan.rig.robot_from_marker[:, :3, 3]
     ends = []
     for offset in (-0.5, 0.5):
@@ -408,7 +408,7 @@ class SessionWriter:
         self, path: Path, plan: SessionPlan, seen: Sequence[SeenFrame],
         extra: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
-        """Write all that is known: true calibrations, and markers image by image."""
+        """Write the truth: true calibrations, and markers image by image."""
         network, rig = plan.network, plan.rig
         head: dict[str, Any] = {
             "note": NOTE,

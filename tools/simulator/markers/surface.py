@@ -1,4 +1,4 @@
-"""Textured rectangles in space, of which scenes with markers consist, and what is printed on them.
+"""Textured rectangles in space, of which scenes with markers consist, and their textures.
 
 Frame of a surface, as of a marker: origin at its centre, x right, y up, z out of the printed face
 towards a viewer; metres.
@@ -119,11 +119,11 @@ def box_against(origin: ArrayLike) -> FloatArray:
 #: Reflectance of printer's black and of paper.
 BLACK, WHITE = 0.05, 0.88
 
-#: What differs in fewer cells from a marker could rightly be taken for it.
+#: A pattern that differs from a marker in fewer cells could rightly be identified as it.
 LEAST_DIFFERENCE = 3
 _TRIES = 64
 
-# Points along a cell by which a texture is looked at, and again for what is between them.
+# Units per cell in which a texture is compared, and samples per unit.
 _FINE = 4
 
 

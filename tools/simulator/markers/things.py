@@ -1,4 +1,4 @@
-"""Things that are no markers but look as if they might be, and backgrounds."""
+"""Things that resemble markers, and backgrounds."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ THINGS: tuple[Callable[[np.random.Generator], Texture], ...] = (
 
 
 def thing(rng: np.random.Generator, dictionary: MarkerDictionary) -> tuple[str, Texture]:
-    """One of `THINGS` that is no marker of a dictionary even by chance: its name and texture."""
+    """A random one of `THINGS` that does not happen to be a marker: its name and texture."""
     for _ in range(_TRIES):
         kind = THINGS[rng.integers(len(THINGS))]
         texture = kind(rng)

@@ -1,6 +1,6 @@
-"""What is true of the markers in an image: where their corners are, and how much of them is seen.
+"""Truth of the markers in an image: their corners, and the shares of them that are visible.
 
-Corners are projected through the calibration; nothing here looks at the rendered image.
+Corners are projected through the calibration; the rendered image is not used.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tools.simulator.files import rounded
 from tools.simulator.markers.kernels import SurfaceArrays, count_visible
 from tools.simulator.markers.surface import Surface, square_corners
 
-# Of the grid of points by which it is told how much of a marker is seen.
+# Points along a side of the grid that determines how much of a marker is visible.
 _POINTS = 24
 #: Width of the white rim that must be seen for the marker's outline to be clear, in its widths.
 RIM = 0.06
@@ -45,7 +45,7 @@ class MarkerTruth:
         return self.visible == 1.0 and self.rim_visible == 1.0
 
     def as_json(self) -> dict[str, Any]:
-        """The same in plain numbers."""
+        """All of it as JSON."""
         return {
             "dictionary": self.dictionary,
             "id": self.id,
