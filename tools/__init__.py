@@ -1,1 +1,1 @@
-"""Scripts that make, fetch, measure or time things."""
+"""Scripts that generate data, measure or time things."""

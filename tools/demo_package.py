@@ -2,7 +2,7 @@
 
     python -m tools.demo_package
 
-Run it after `images/e` has changed; a test holds both against each other.
+Run it after `images/e` has changed; a test compares the two.
 """
 
 from __future__ import annotations
@@ -13,28 +13,20 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 DEMO, PACKAGE = ROOT / "images" / "e", ROOT / "redetect" / "demo"
 FRAMES = 24
-_ROWS = (
-    "e.txt",
-    "map.circles",
-    "map.lines",
-    "unlisted.circles",
-    "unlisted.lines",
-    "lookalikes.circles",
-)
 
 
-def first_frames(text: str, frames: int = FRAMES) -> str:
+def first_frames(text: str) -> str:
     """The head of a file of rows, and the rows of its first frames."""
     parts = text.split("\nSTEP ")
-    return "\nSTEP ".join(parts[: frames + 1]).rstrip("\n") + "\n"
+    return "\nSTEP ".join(parts[: FRAMES + 1]).rstrip("\n") + "\n"
 
 
 def main() -> None:
     """Copy images, calibration and rows."""
     (PACKAGE / "images").mkdir(parents=True, exist_ok=True)
-    for name in _ROWS:
-        place = "demo.txt" if name == "e.txt" else name
-        (PACKAGE / place).write_text(first_frames((DEMO / name).read_text()))
+    for rows in (DEMO / "e.txt", *DEMO.glob("*.circles"), *DEMO.glob("*.lines")):
+        place = "demo.txt" if rows.name == "e.txt" else rows.name
+        (PACKAGE / place).write_text(first_frames(rows.read_text()))
     shutil.copy(DEMO / "e.cam", PACKAGE / "demo.cam")
     for image in sorted((DEMO / "images").iterdir())[:FRAMES]:
         shutil.copy(image, PACKAGE / "images")

@@ -1,6 +1,6 @@
-"""Make the project's virtual environment, unless it already stands and fits.
+"""Make the project's virtual environment, unless it exists and is up to date.
 
-Where `requirements/lock.txt` was made for this kind of machine, exactly the packages that it names
+If `requirements/lock.txt` was made for this kind of machine, exactly the packages that it names
 are installed, each checked against its hash; elsewhere, what `pyproject.toml` allows. Uses nothing
 but the standard library, so that any Python 3.11 or newer can run it:
 
@@ -25,7 +25,7 @@ _WRONG_HASH = "DO NOT MATCH THE HASHES"
 
 def main() -> int:
     """Make the environment named on the command line; 0 when it is ready."""
-    # Spoken by whatever python3 is there: it may be older than the project's code.
+    # Whatever python3 is installed runs this: it may be older than the project's code.
     if sys.version_info < (3, 11):  # noqa: UP036
         found = ".".join(str(part) for part in sys.version_info[:3])
         print(
@@ -54,16 +54,12 @@ def main() -> int:
 
 
 def _installed(environment: Path) -> bool:
-    """Install the locked packages or, where that cannot be, what the project allows."""
+    """Install the locked packages or, if that is impossible, what the project allows."""
     here = (platform.system(), platform.machine(), sys.version_info[:2])
     if not LOCK.is_file() or here != LOCKED_FOR:
-        system, machine, version = LOCKED_FOR
-        print(
-            f"the lock file is for Python {version[0]}.{version[1]} on {system} {machine}: "
-            "installing what pyproject.toml allows, without hashes",
-            flush=True,
-        )
-        return _installed_unlocked(environment)
+        system, machine, (major, minor) = LOCKED_FOR
+        why = f"the lock file is for Python {major}.{minor} on {system} {machine}"
+        return _installed_unlocked(environment, why)
     pip = _new_environment(environment)
     # Compiled below, by all cores.
     locked = subprocess.run(
@@ -74,7 +70,7 @@ def _installed(environment: Path) -> bool:
         check=False, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     if locked.returncode == 0:
-        # All that it needs is there, setuptools too: nothing is fetched to build with.
+        # All that it needs is there, including setuptools: nothing is fetched for the build.
         own = [*pip, "install", "--quiet", "--no-build-isolation", "--editable", f"{ROOT}[dev]"]
         if subprocess.run(own, check=False).returncode != 0:
             return False
@@ -82,20 +78,15 @@ def _installed(environment: Path) -> bool:
         return True
     sys.stderr.write(locked.stderr)
     if _WRONG_HASH in locked.stderr:
-        # Somebody gives out other files under the same names: nothing is to be had from there.
+        # Somebody distributes other files under the same names: nothing from there is installed.
         return False
-    print(
-        "the locked packages cannot all be had here: installing what pyproject.toml allows, "
-        "without hashes",
-        flush=True,
-    )
-    return _installed_unlocked(environment)
+    return _installed_unlocked(environment, "some of the locked packages are not available here")
 
 
 def _compile_modules(environment: Path) -> None:
-    """Compile what is installed, also where Python is told not to keep what it compiles.
+    """Compile what is installed, even if Python is set not to keep what it compiles.
 
-    Else every process there would compile all of its imports again: a third of a second for
+    Otherwise every process would compile all of its imports again: a third of a second for
     `detect`, and for each of its workers. The packages' own tests, a quarter of it, are left out.
     """
     command = [str(environment / "bin" / "python"), "-m", "compileall", "-qq", "-j", "0"]
@@ -104,21 +95,22 @@ def _compile_modules(environment: Path) -> None:
     subprocess.run([*command, str(environment)], check=False)
 
 
-def _installed_unlocked(environment: Path) -> bool:
+def _installed_unlocked(environment: Path, why: str) -> bool:
+    print(f"{why}: installing what pyproject.toml allows, without hashes", flush=True)
     pip = _new_environment(environment)
     command = [*pip, "install", "--quiet", "--editable", f"{ROOT}[dev]"]
     return subprocess.run(command, check=False).returncode == 0
 
 
 def _new_environment(environment: Path) -> list[str]:
-    """Make it anew, with nothing in it; returns how its pip is called."""
+    """Make a new, empty environment; returns the command of its pip."""
     shutil.rmtree(environment, ignore_errors=True)
     subprocess.run([_interpreter(), "-m", "venv", str(environment)], check=True)
     return [str(environment / "bin" / "python"), "-m", "pip", "--disable-pip-version-check"]
 
 
 def _interpreter() -> str:
-    """The interpreter outside of environments: one that is active may be the one made anew."""
+    """The interpreter outside of environments: the active one may be the one that is replaced."""
     if sys.prefix == sys.base_prefix:
         return str(Path(sys.executable).resolve())
     found = Path(sys.base_prefix) / "bin" / f"python{sys.version_info[0]}.{sys.version_info[1]}"

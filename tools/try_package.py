@@ -3,7 +3,7 @@
     make package
 
 The commands of both are tried on the demo images from outside of the checkout. Prints sizes and
-times; ends with 1 if anything fails. What is needed is fetched as `pip` is set up to.
+times; ends with 1 if anything fails. Dependencies are fetched as `pip` is configured.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-#: What is tried, in a folder with copies of `images/e` and `images/m`.
+#: Commands that are tried, in a folder with copies of `images/e` and `images/m`.
 COMMANDS = (
     "redetect --help",
     "redetect demo -o demo",
@@ -65,7 +65,7 @@ def _try(archive: Path, folder: Path) -> None:
     _run([*pip, "install", "--quiet", str(archive)], folder)
     print(f"  installed in {time.perf_counter() - started:.0f} s")
     shutil.copytree(ROOT / "images", folder / "images")
-    # Kernels are compiled anew, as for somebody who has just installed it.
+    # Kernels are compiled again, as after a new installation.
     here = {**os.environ, "REDETECT_CACHE": str(folder / "tables")}
     for command in COMMANDS:
         program, *words = command.split()
@@ -75,18 +75,18 @@ def _try(archive: Path, folder: Path) -> None:
 
 
 def _try_tests(work: Path) -> None:
-    """Some tests of the source distribution pass, in this environment, out of its own folder."""
+    """Run some tests of the source distribution in its own folder, in this environment."""
     (archive,) = (work / "dist").glob("*.tar.gz")
     with tarfile.open(archive) as opened:
         opened.extractall(work / "source", filter="data")
     (folder,) = (work / "source").iterdir()
-    rooms = [f"tests/{room}" for room in ("camera", "landmarks", "lut", "storage")]
-    _run([sys.executable, "-m", "pytest", "-q", "-m", "not long", *rooms], folder)
-    print(f"  {', '.join(rooms)} pass from the source distribution")
+    tests = [f"tests/{name}" for name in ("camera", "landmarks", "lut", "storage")]
+    _run([sys.executable, "-m", "pytest", "-q", "-m", "not long", *tests], folder)
+    print(f"  {', '.join(tests)} pass from the source distribution")
 
 
 def _run(command: Sequence[str], folder: Path, environment: dict[str, str] | None = None) -> None:
-    """Run it quietly; if it fails, show what it said and end."""
+    """Run a command quietly; if it fails, print its output and end."""
     done = subprocess.run(
         command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True, check=False,

@@ -1,1 +1,1 @@
-"""How fast the detectors are: side by side with decoding and with peers, on the same images."""
+"""The speed of the detectors compared with decoding and with peers, on the same images."""

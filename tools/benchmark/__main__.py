@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import sys
 import tempfile
 import time
@@ -13,6 +14,8 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
+import numba
 import numpy as np
 
 from detect import __version__
@@ -72,9 +75,6 @@ class Benchmark(Study):
     seed: int = 0  # Of noise and positions.
 
     def measured(self) -> Figures:
-        import cv2
-        import numba
-
         # All are measured on one core; only the jobs of whole runs may use more.
         cv2.setNumThreads(1)
         numba.set_num_threads(1)
@@ -199,10 +199,7 @@ def measure_runs(
 def this_machine() -> str:
     """Processor, cores, system and versions, on one line."""
     file = Path("/proc/cpuinfo")
-    rows = (
-        line.partition(":") for line in (file.read_text() if file.is_file() else "").split("\n")
-    )
-    names = [value.strip() for key, _, value in rows if key.strip() == "model name"]
+    names = re.findall(r"model name\s*: (.*)", file.read_text() if file.is_file() else "")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = [f"{name} {version(name)}" for name in _PACKAGES]
     return ", ".join(

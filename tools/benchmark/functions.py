@@ -1,8 +1,9 @@
-"""What is measured: decoding, the detectors whole and in part, peers, and whole runs."""
+"""The measured functions: decoding, detectors and their parts, peers, and whole runs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture
 
-#: What everything else is compared with.
+#: The function with which all others are compared.
 DECODING = "decoding"
 KERNEL, RESPONSE = "quality map (report)", "response (dense)"
 CIRCLES, LINES, ALL = "circles (default)", "lines (default)", "lines, tilt and discs"
@@ -99,15 +100,11 @@ def peers() -> dict[str, Function]:
 
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
     """The commands that are measured on a run, by name; their files go into a folder."""
+    circles = Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs)
+    published = replace(circles, output=output / "published.circles", parameters=PUBLISHED)
     return {
-        "detect circles --preset published": Circles(
-            run=run,
-            output=output / "published.circles",
-            force=True,
-            jobs=jobs,
-            parameters=PUBLISHED,
-        ),
-        "detect circles": Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs),
+        "detect circles --preset published": published,
+        "detect circles": circles,
         "detect lines": Lines(run=run, output=output / "verticals.lines", force=True, jobs=jobs),
         "detect all": All(run=run, output=output, force=True, jobs=jobs),
     }

@@ -1,4 +1,4 @@
-"""The images that are measured on: of runs, noise, photographs, and with painted landmarks."""
+"""The images of the benchmark: of runs, noise, photographs, and with painted landmarks."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from camera import Camera, write_camera
@@ -20,16 +21,16 @@ from tools.simulator.single_disc import render_disc
 
 _JPEG_QUALITY = 90
 
-#: A long run has so many files of its own: more than a processor's caches hold.
+#: Number of distinct files in a long run: more than a processor's caches hold.
 _MOST_COPIES = 1600
 
-#: Noise that scaled images get (grey levels): enlarged ones have none of their own.
+#: Noise that is added to scaled images (grey levels): enlarging removes theirs.
 _SENSOR_NOISE = 2.0
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image as a file holds it and as a detector gets it."""
+    """An image as the content of a file, and decoded."""
 
     encoded: ByteArray  # (N,) Content of an image file.
     grey: ByteArray  # (H, W) What it decodes to.
@@ -37,8 +38,6 @@ class Picture:
 
 def decode(encoded: ByteArray) -> ByteArray:
     """(H, W) grey values of an image file's content."""
-    import cv2
-
     grey = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
     if grey is None:
         raise StudyError("an image file's content cannot be decoded: expected an image")
@@ -47,8 +46,6 @@ def decode(encoded: ByteArray) -> ByteArray:
 
 def jpeg_picture(grey: ByteArray) -> Picture:
     """An image through a JPEG of quality 90."""
-    import cv2
-
     _, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return Picture(encoded.ravel(), decode(encoded))
 
@@ -71,8 +68,6 @@ def noise_pictures(camera: Camera, count: int, seed: int) -> list[Picture]:
 
 def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Picture]:
     """Photographs found anywhere below a folder, scaled to the camera's size."""
-    import cv2
-
     pictures = []
     for path in _spread_out(list(photograph_files(folder)), count):
         size = camera.width, camera.height
@@ -82,9 +77,9 @@ def photograph_pictures(folder: Path, camera: Camera, count: int) -> list[Pictur
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:
-    """The camera whose image is the same one with `factor` times as many pixels on each side.
+    """The camera whose image is the same with `factor` times as many pixels on each side.
 
-    Pixel (0, 0) is a pixel's centre: the image's corner, at (-0.5, -0.5), stays what it is.
+    Pixel (0, 0) is a pixel's centre: the image's corner, at (-0.5, -0.5), remains where it is.
     """
     width, height = round(camera.width * factor), round(camera.height * factor)
     along, down = width / camera.width, height / camera.height
@@ -101,8 +96,6 @@ def scaled_camera(camera: Camera, factor: float) -> Camera:
 
 def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
     """A picture enlarged to a scaled camera's size, with a sensor's noise."""
-    import cv2
-
     size = (camera.width, camera.height)
     grey = np.asarray(cv2.resize(picture.grey, size, interpolation=cv2.INTER_CUBIC), np.float64)
     noisy = grey + np.random.default_rng(seed).normal(0.0, _SENSOR_NOISE, grey.shape)
@@ -110,10 +103,10 @@ def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
 
 
 def repeated_run(run: Run, folder: Path, frames: int, most_copies: int | None = None) -> Path:
-    """A run folder of any number of frames: those of a run over and over.
+    """A run folder of any number of frames: those of a run, repeated.
 
-    So many images at most (by default `_MOST_COPIES`, and those of the run at least) are copies,
-    the others are further names of these.
+    At most `most_copies` images (by default `_MOST_COPIES`, and at least those of the run) are
+    copies; the others are hard links to them.
     """
     sources = [(frame.image, frame.step) for frame in run.frames if frame.image is not None]
     if not sources:
@@ -147,12 +140,12 @@ _BLUR_PX = 0.7
 _NOISE = 1.5
 _RADIUS_M = 0.10
 
-#: Discs lie this far apart at least, this far away at most, and this far inside the image.
+#: Discs are at least this far apart, at most this far away, and this far inside the image.
 _APART_M = 0.35
 _FARTHEST_M = 4.0
 _MARGIN_PX = 30
 
-#: Attempts to place a disc.
+#: Largest number of attempts to place discs.
 _ATTEMPTS = 10_000
 
 #: Samples per pixel and axis of a wall, and the wall's stripes' part of the view.
@@ -161,9 +154,9 @@ _WALL_SHARE = 0.8
 
 
 def disc_places(camera: Camera, count: int, seed: int) -> FloatArray:
-    """Floor positions of discs that the camera sees whole, none near another.
+    """Floor positions of discs that the camera sees whole, with space between them.
 
-    The first of more are the same as fewer.
+    A larger count only adds places to those of a smaller one.
 
     Returns (count, 2).
     """
@@ -192,7 +185,7 @@ def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray
 
 
 def wall_with_edges(camera: Camera, count: int, seed: int) -> ByteArray:
-    """A wall all round, striped so that the camera sees a number of vertical edges.
+    """A wall all around, striped so that the camera sees a number of vertical edges.
     Returns (H, W).
     """
     fine = (np.arange(_FINE) + 0.5) / _FINE - 0.5
@@ -216,7 +209,7 @@ def _taken(grey: FloatArray, seed: int) -> ByteArray:
 
 
 def contents_of(paths: Sequence[Path]) -> list[ByteArray]:
-    """What files hold; files that are one under several names are held once."""
+    """Contents of files; a file that has several names is read once."""
     held: dict[tuple[int, int], ByteArray] = {}
     contents = []
     for path in paths:

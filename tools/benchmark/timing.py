@@ -1,8 +1,8 @@
-"""Times of several functions on several images, taken in turn, and what sums them up.
+"""Times of several functions on several images, measured in turn, and their summaries.
 
 A machine's load changes within seconds. All functions are called in turn on the same image, round
-after round, so that load falls on all of them alike; ratios are taken between calls of the same
-round on the same image, and the median of those is what counts.
+after round, so that the load affects all of them alike; ratios are taken between calls of the same
+round on the same image, and their median is reported.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 
-#: However slow a function is, it is called this often (as far as there are images and rounds).
+#: Even a slow function is called this many times (if there are as many images and rounds).
 LEAST_CALLS = 3
 
 
@@ -31,7 +31,7 @@ def measure_in_turn(
     """Time functions in turn: round by round, image by image, one call of each.
 
     With `warm_up` every function is called once beforehand on the first image, so that compiling
-    and first touches are not measured. Which function goes first changes from image to image.
+    and first memory accesses are not measured. The first function changes from image to image.
     A function is left out once it has taken `budget_s`.
 
     Returns
@@ -57,7 +57,7 @@ def measure_in_turn(
 
 
 def decodings(seconds: Mapping[str, FloatArray], reference: str) -> dict[str, str]:
-    """By function: its time in those of a reference on the same image in the same round.
+    """By function: its time over that of a reference on the same image in the same round.
 
     Median (quartiles) of these ratios, and the median time in milliseconds.
     """
@@ -68,7 +68,7 @@ def decodings(seconds: Mapping[str, FloatArray], reference: str) -> dict[str, st
 
 
 def spread(values: FloatArray) -> str:
-    """Median and quartiles of some values; NaN are none."""
+    """Median and quartiles of some values; NaN are ignored."""
     lower, median, upper = map(number, np.nanpercentile(values, [25.0, 50.0, 75.0]).tolist())
     return f"{median} ({lower} - {upper})"
 

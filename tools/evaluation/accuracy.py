@@ -2,7 +2,7 @@
 
 Discs are drawn at random over all pixels that the detector's table covers, at random sub-pixel
 places, rendered by exact supersampling (`tools.simulator.single_disc`, which knows nothing of the
-detector), and detected. Errors are held against the covariances that the detector states.
+detector), and detected. Errors are compared with the covariances that the detector states.
 """
 
 from __future__ import annotations

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from camera.boards.board import Board
+from camera.boards.board import Board, charuco_of
 from camera.calibration.model import project_points
 from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import intrinsics_of, pixel_grid
@@ -54,8 +55,6 @@ def render_board(
     seed: int = 0,
 ) -> ByteArray:
     """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
-    import cv2
-
     fine: FloatArray = np.empty(rays.xy.shape[:2])
     for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
         fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
@@ -98,16 +97,8 @@ def _greys(xy: FloatArray, board: Board, rotation: FloatArray, place: FloatArray
 
 @lru_cache(maxsize=4)
 def _charuco(board: Board) -> ByteArray:
-    import cv2
-
-    pattern = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_m,
-        board.marker_m,
-        cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)),
-    )
     size = (_DOTS * board.columns, _DOTS * board.rows)
-    return np.asarray(pattern.generateImage(size), dtype=np.uint8)
+    return np.asarray(charuco_of(board).generateImage(size), dtype=np.uint8)
 
 
 def board_poses(
@@ -206,8 +197,6 @@ class TutorialPhotographs(Study):
     seed: int = 3  # Of the board's positions and the noise.
 
     def measured(self) -> Figures:
-        import cv2
-
         camera = read_camera(self.camera)
         boards = self.output / "boards"
         if boards.exists():

@@ -1,4 +1,4 @@
-"""What calibrating cameras is worth: rendered boards, photographs."""
+"""Accuracy of camera calibrations: from rendered boards and from photographs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tyro.conf import Positional
 
@@ -73,7 +74,7 @@ def calibrate_rendered(
     )
     if board.circle_m > 0.0:
         expected = expected + circle_shifts(truth, points, 0.5 * board.circle_m)
-    # Without those that the calibration leaves out as wrong, too.
+    # Without the points that the calibration leaves out as wrong.
     error = points.pixels - expected
     right = np.all(np.abs(error) < 8.0 * calibration.adjusted.sigma_px, axis=1)
     found = with_intrinsics(camera, calibration.intrinsics)
@@ -85,7 +86,7 @@ DISC_RADIUS_M = 0.1
 
 
 class FixedBoard(Board):
-    """Discs at places that were measured: all of all photographs, one after the other."""
+    """Discs at measured places: those of all photographs, one after the other."""
 
     def __init__(self, places: FloatArray) -> None:
         super().__init__("circles", 3, 3, 1.0, circle_m=2.0 * DISC_RADIUS_M)
@@ -112,7 +113,7 @@ def read_group(
         image = read_grey(next((path.parent / "images").iterdir()))
         size = (image.shape[1], image.shape[0])
         dark = image if truth["polarity"] == "dark" else 255 - image
-        # The truth says where to look; what is measured is the image's.
+        # The truth only says where to search; the points are measured in the image.
         seen = circle_centroids(dark, uv[None])[0]
         near = np.any(seen != uv, axis=1) & (np.linalg.norm(seen - uv, axis=1) < 3.0)
         uv, xy = seen[near], xy[near]
@@ -125,7 +126,7 @@ def read_group(
 
 
 def splits(views: int) -> dict[str, list[IntArray]]:
-    """Ways to leave photographs out, by name: which ones together."""
+    """Ways to hold out photographs, by name: groups that are held out together."""
     every = np.arange(views)
     return {
         "each": [every[v : v + 1] for v in every],
@@ -135,9 +136,7 @@ def splits(views: int) -> dict[str, list[IntArray]]:
 
 
 def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -> float:
-    """RMS error (px) in photographs left out, whose poses alone are fitted, by OpenCV's model."""
-    import cv2
-
+    """RMS error (px) of OpenCV's model in held-out photographs, of which only poses are fitted."""
     every = np.arange(len(points.counts))
     flags = cv2.CALIB_RATIONAL_MODEL | (0 if tangential else cv2.CALIB_ZERO_TANGENT_DIST)
     squares = 0.0
@@ -159,7 +158,7 @@ def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -
 
 @dataclass(frozen=True)
 class Comparison:
-    """Errors (px) in what was held out of a camera's photographs, all on the same points."""
+    """Errors (px) in held-out photographs of a camera, all on the same points."""
 
     views: int  # Photographs; points in all of them.
     points: int
@@ -189,7 +188,7 @@ def compare(
         keep_outliers=True,
     )  # fmt: skip
     result = calibrate(views, board, size, settings)
-    # The same corrected points for both: OpenCV knows nothing of circles.
+    # The same corrected points for both: OpenCV has no correction for circles.
     points, lens = result.points, result.lens
     estimate = result.adjusted.estimate
     errors = {

@@ -27,9 +27,9 @@ from tools.evaluation.figures import Figures, Study, StudyError, compared, print
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
-#: Rows this near a disc of a photograph have found it; the scorer has the same limit.
+#: Rows at most this far from a disc of a photograph have found it, as in the scorer.
 _MATCH_M = 0.05
-#: A line of that scorer, and what its numbers are.
+#: A line of the scorer's output, and the names of its numbers.
 _LINE = re.compile(
     r"(\S+) +images +(\d+) discs +(\d+) recall +([\d.]+) +FP/img +([\d.]+) +err mm med +([\d.]+)"
 )
@@ -54,8 +54,8 @@ def _detect_lines(run: Path, settings: LineSettings, output: Path) -> dict[str, 
 
 
 def _scored(script: Path, *arguments: object, folder: str | None = None) -> str:
-    """What a scorer prints, which is printed, too."""
-    # A scorer may bring a module named camera: in a folder of its own it does not find ours.
+    """The output of a scorer, which is also printed."""
+    # A scorer may have a module named camera: in another folder it does not find ours.
     words = [sys.executable, str(script.resolve()), *map(str, arguments)]
     done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False, cwd=folder)
     print(done.stdout, end="", flush=True)

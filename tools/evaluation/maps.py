@@ -29,7 +29,7 @@ from tools.simulator.driving import step_covariance
 
 
 class Truth(NamedTuple):
-    """Where everything really is, in the frame of the start."""
+    """True poses and places of discs, in the frame of the start."""
 
     poses: FloatArray  # (N + 1, 3)
     discs: dict[int, FloatArray]  # (2,) by number
@@ -63,7 +63,7 @@ def disc_errors(mapped: MappedRun, truth: Truth) -> tuple[float, float]:
 
 
 def with_right_odometry(recording: Recording, truth: Truth, seed: int) -> Recording:
-    """A run whose wrong steps are measured anew, with errors as their covariances say."""
+    """A run whose wrong steps are measured again, with errors that agree with the covariances."""
     rng = np.random.default_rng(seed)
     true = between(truth.poses[:-1], truth.poses[1:])
     root = np.linalg.cholesky(step_covariance(true))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from detect.markers.candidates import closing
+from detect.markers.detect import detect_markers
+from detect.settings import MarkerSettings
 from tools.benchmark.material import decode, jpeg_picture
 from tools.benchmark.timing import measure_in_turn
 from tools.evaluation.figures import WRONG, Figures, Study
@@ -64,11 +68,12 @@ def score_frames(
     settings: SampleSettings, detectors: tuple[str, ...], frames: int, seed: int, jobs: int = 1
 ) -> list[ScoredFrame]:
     """Render frames and let detectors search them."""
-    return list(in_order(_score, (settings, detectors, seed), range(frames), jobs))
+    return list(in_order(partial(_score, settings, detectors, seed), range(frames), jobs))
 
 
-def _score(state: tuple[SampleSettings, tuple[str, ...], int], index: int) -> ScoredFrame:
-    settings, detectors, seed = state
+def _score(
+    settings: SampleSettings, detectors: tuple[str, ...], seed: int, index: int
+) -> ScoredFrame:
     frame = sample_frame(settings, seed, index)
     found = {name: detector_of(name)(frame.image, frame.camera, frame.dictionary)
              for name in detectors}  # fmt: skip
@@ -102,12 +107,12 @@ def search_photographs(
         If a folder holds no images, or one cannot be read.
     """
     files = [file for folder in folders for file in photograph_files(folder)]
-    found = in_order(_search, (detector, dictionaries), files, jobs)
+    found = in_order(partial(_search, detector, dictionaries), files, jobs)
     return len(files), [offence for of_one in found for offence in of_one]
 
 
-def _search(state: tuple[str, tuple[str, ...]], path: Path) -> list[Offence]:
-    (name, dictionaries), image = state, photograph_of(path)
+def _search(name: str, dictionaries: tuple[str, ...], path: Path) -> list[Offence]:
+    image = photograph_of(path)
     return [
         Offence(name, "false", f"{path.name} {dictionary} id {i}")
         for dictionary in dictionaries
@@ -124,10 +129,6 @@ def time_searches(
     timed twice: with no width given, and with the median width of the frame's markers. Prints, and
     returns, medians and quartiles of the times in those of decoding, and milliseconds.
     """
-    from detect.markers.candidates import closing
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     cv2.setNumThreads(1)
     (dictionary,) = settings.dictionaries
     sampled: list[SampleFrame] = []
@@ -141,19 +142,19 @@ def time_searches(
         widths = [marker.width_px for marker in frame.markers] or [_WIDTH_WITHOUT_MARKER_PX]
         given.append(replace(plain, width_px=float(np.median(widths))))
 
-    def peer(name: str) -> Callable[[int], object]:
-        detect = detector_of(name)
-        return lambda i: detect(sampled[i].image, sampled[i].camera, dictionary)
+    def peer(name: str, i: int) -> object:
+        return detector_of(name)(sampled[i].image, sampled[i].camera, dictionary)
 
-    def close(radius: int) -> Callable[[int], object]:
-        return lambda i: closing(sampled[i].image, radius)
+    def close(radius: int, i: int) -> object:
+        return closing(sampled[i].image, radius)
 
+    peers = _TIMED_PEERS if known_to_opencv(dictionary) else ()
     functions: dict[str, Callable[[int], object]] = {
         DECODING: lambda i: decode(encoded[i]),
         SEARCH: lambda i: detect_markers(sampled[i].image, plain, sampled[i].camera),
         GIVEN_WIDTH: lambda i: detect_markers(sampled[i].image, given[i], sampled[i].camera),
-        **{f"closing, radius {radius} px": close(radius) for radius in _RADII_PX},
-        **{name: peer(name) for name in (_TIMED_PEERS if known_to_opencv(dictionary) else ())},
+        **{f"closing, radius {radius} px": partial(close, radius) for radius in _RADII_PX},
+        **{name: partial(peer, name) for name in peers},
     }
     seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
     columns = ("decodings", "lower", "upper", "ms")

@@ -9,8 +9,11 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from cv2 import aruco
 
 from camera import Camera
+from detect.markers.detect import detect_markers
+from detect.settings import MarkerSettings
 from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
 from tools.evaluation import tables
@@ -19,8 +22,8 @@ from tools.simulator.markers.truth import MarkerTruth
 
 OURS = "redetect"
 
-#: OpenCV's refinements of corners, by the names under which they are shown, and what is taken off
-#: their corners: the AprilTag code puts (0, 0) at the upper left pixel's corner, not at its centre.
+#: OpenCV's refinements of corners, by the names in the tables, and what is subtracted from their
+#: corners: the AprilTag code puts (0, 0) at the upper left pixel's corner, not at its centre.
 _REFINEMENTS = {
     "aruco": ("CORNER_REFINE_NONE", 0.0),
     "aruco subpix": ("CORNER_REFINE_SUBPIX", 0.0),
@@ -56,13 +59,10 @@ def detector_of(name: str) -> Detector:
 
 def known_to_opencv(dictionary: str) -> bool:
     """Whether OpenCV has a dictionary of that name."""
-    return dictionary in _opencv_dictionaries()
+    return hasattr(aruco, f"DICT_{dictionary.upper()}")
 
 
 def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
     return Found(found.ids, found.corners, found.covariance)
 
@@ -77,30 +77,20 @@ def _aruco(name: str, image: ByteArray, dictionary: str) -> Found:
 
 @cache
 def _aruco_detector(name: str, dictionary: str):  # type: ignore[no-untyped-def]
-    from cv2 import aruco
-
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = getattr(aruco, _REFINEMENTS[name][0])
-    known = aruco.getPredefinedDictionary(_opencv_dictionaries()[dictionary])
+    known = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{dictionary.upper()}"))
     return aruco.ArucoDetector(known, parameters)
-
-
-@cache
-def _opencv_dictionaries() -> dict[str, int]:
-    from cv2 import aruco
-
-    names = [name for name in dir(aruco) if name.startswith("DICT_")]
-    return {name.removeprefix("DICT_").lower(): getattr(aruco, name) for name in names}
 
 
 MISSED, FOUND, MISIDENTIFIED = 0, 1, 2
 
-# A detection is of a marker if its corners, in any order, are as near as this in its widths.
+# A detection belongs to a marker if its corners, in any order, are this near (in its widths).
 _NEAR_WIDTHS = 0.25
 
 
 class Outcome(NamedTuple):
-    """What a detector made of the markers of one frame."""
+    """Result of a detector for the markers of one frame."""
 
     status: IntArray
     """(M,) `MISSED`, `FOUND` or `MISIDENTIFIED` (wrong number, or turned) for each true marker."""
@@ -113,7 +103,7 @@ class Outcome(NamedTuple):
 
 
 def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
-    """Hold what was found against the truth."""
+    """Compare detections with the truth."""
     count = len(markers)
     status = np.full(count, MISSED, dtype=np.int64)
     errors, normalised = np.full((count, 4, 2), np.nan), np.full((count, 4), np.nan)
@@ -136,7 +126,7 @@ def score_frame(markers: Sequence[MarkerTruth], found: Found) -> Outcome:
 
 
 def _nearest(markers: Sequence[MarkerTruth], corners: FloatArray) -> tuple[int, int]:
-    """The true marker that lies where the corners are, and by how many quarters it is turned."""
+    """The true marker at the corners, and the number of quarter turns between them."""
     best = (-1, 0)
     least = _NEAR_WIDTHS
     for which, marker in enumerate(markers):
@@ -155,7 +145,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class ScoredFrame:
-    """A frame's truth, without its image, and what became of it."""
+    """The truth of a frame, without its image, and the results of the detectors."""
 
     seed: int
     index: int
@@ -165,7 +155,7 @@ class ScoredFrame:
 
 
 def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
-    """What is kept of a frame: what became of its markers, by detector."""
+    """The results of all detectors for a frame."""
     imaging = frame.imaging
     outcomes = {name: score_frame(frame.markers, of) for name, of in found.items()}
     rows = [
@@ -179,7 +169,7 @@ def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """All markers of many frames, and what each detector made of them."""
+    """All markers of many frames, and the result of each detector."""
 
     frames: int
     columns: dict[str, FloatArray]  # (M,) each of `COLUMNS`; clear is 0 or 1.
@@ -201,7 +191,7 @@ def table_of(frames: Sequence[ScoredFrame]) -> Table:
     return Table(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
 
 
-#: What each quantity is called, and the limits of its bins.
+#: Title of each quantity, and the limits of its bins.
 BINS: dict[str, tuple[str, tuple[float, ...]]] = {
     "width_px": ("width / px", (12, 16, 20, 28, 40, 60, 90, 130, 200)),
     "slant_deg": ("slant / deg", (0, 15, 30, 45, 60, 70)),
@@ -209,12 +199,12 @@ BINS: dict[str, tuple[str, tuple[float, ...]]] = {
     "contrast_grey": ("contrast / grey levels", (10, 20, 35, 60, 100, 200)),
 }
 
-# A bin in which fewer markers were found says nothing of their errors.
+# With fewer markers found in a bin, no errors are given.
 _FEWEST = 5
 
 
 class Figures(NamedTuple):
-    """What a detector did with the clear markers of a bin; errors NaN where it found too few."""
+    """Figures of a detector for the clear markers of a bin; errors NaN if it found too few."""
 
     rate: float  # Share of the markers that were found.
     median_px: float  # Of the distances of corners from the truth.
@@ -283,7 +273,7 @@ def _figures(outcome: Outcome, found: BoolArray, rate: float) -> Figures:
 
 
 def counts_lines(table: Table) -> list[str]:
-    """What each detector found, took for another and saw where there is nothing."""
+    """Numbers of misidentified, false and repeated detections of each detector."""
     markers = len(table.columns["clear"])
     clear = int(table.columns["clear"].sum())
     lines = [f"{table.frames} frames, {markers} markers, {clear} of them clearly in view"]

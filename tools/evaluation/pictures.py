@@ -1,4 +1,4 @@
-"""The pictures of the documentation, but for the schematic ones, which are drawn by hand (SVG)."""
+"""The pictures of the documentation, except the schematic ones, which are drawn by hand (SVG)."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import matplotlib as mpl
 import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
+from detect.discs.quality import quality_of_centres
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
+from detect.markers.candidates import closing, dark_pixels
+from detect.markers.detect import detect_markers
 from detect.seen import circle_on_floor, summed_steps
-from detect.settings import CircleSettings
+from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from detect.verticals.response import line_response
@@ -37,26 +42,22 @@ _OWN, _OTHER = "#1f4e9c", "#e67e22"
 
 
 def draw_discs(figure: Any, run: Path, frame: int) -> None:
-    """Quality of every pixel; candidates; what the fit makes of them."""
+    """Quality of every pixel; candidates; fitted discs."""
     camera, image = _frame(run, frame)
     settings = CircleSettings()
     table = disc_table(camera, settings)
-    from detect.discs.quality import quality_of_centres
-
     without_fit = CircleSettings(refine=False)
     every = cached_disc_table(camera, disc_shape(without_fit))
     quality, _ = quality_of_centres(image, every)
     found = detect_circles(image, camera, table, settings)
     loose = detect_circles(image, camera, every, without_fit)
-    panels = figure.subplots(3, 1)
     titles = (
         "quality of the outlines round every pixel: between-class over total variance",
         f"candidates: {len(loose)} local maxima above {settings.threshold:g}, one per "
         f"{settings.separation_m:g} m",
         f"fitted through the lens, and weighed: {len(found)} discs (edge, and the two outlines)",
     )
-    for axes, title in zip(panels, titles, strict=True):
-        _image(axes, image, title)
+    panels = _panels(figure, (3, 1), image, titles)
     panels[0].imshow(np.where(quality > 0.0, quality, np.nan), cmap="magma", vmin=0, vmax=1)
     panels[1].plot(*loose.pixels.T, "+", color=_RINGS, markersize=7)
     radii = settings.radius_m, settings.inner_radius_m, settings.outer_radius_m
@@ -74,7 +75,6 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
     response = line_response(image, table, settings)
     found = detect_lines(image, table, settings)
     tilt = found.tilt
-    panels = figure.subplots(3, 1)
     said = "" if tilt is None else (
         f"; pitch {np.degrees(tilt.pitch_rad):.2f}°, roll {np.degrees(tilt.roll_rad):.2f}°"
     )  # fmt: skip
@@ -83,8 +83,7 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
         f"{len(found.fate)} tracks from the horizon (dashed) up and down",
         f"{len(found)} verticals{said}, on which {0 if tilt is None else tilt.lines} tracks agree",
     )
-    for axes, title in zip(panels, titles, strict=True):
-        _image(axes, image, title)
+    panels = _panels(figure, (3, 1), image, titles)
     panels[0].imshow(response, cmap="RdBu", vmin=-0.7, vmax=0.7)
     for t, fate in enumerate(found.fate):
         place = track_pixels(found.tracks, table, t)
@@ -95,16 +94,18 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
 
 
 def draw_tables(figure: Any, run: Path) -> None:
-    """What is known of every pixel before the first image."""
+    """The tables: outlines and verticals of some pixels."""
     camera, image = _frame(run, 0)
     settings = CircleSettings(refine=False)
     radii = settings.inner_radius_m, settings.outer_radius_m
     table = cached_disc_table(camera, disc_shape(settings))
     verticals = cached_vertical_table(camera)
-    panels = figure.subplots(2, 1)
     said = " and ".join(f"{radius:.3g}" for radius in radii)
-    _image(panels[0], image, f"the two outlines (radius {said} m) about some pixels")
-    _image(panels[1], image, "horizon, and the verticals through some of its columns")
+    titles = (
+        f"the two outlines (radius {said} m) about some pixels",
+        "horizon, and the verticals through some of its columns",
+    )
+    panels = _panels(figure, (2, 1), image, titles)
     panels[0].imshow(np.where(table.usable, np.nan, 0.35), cmap="gray", vmin=0, vmax=1, alpha=0.5)
     for u in range(60, camera.width, 108):
         for v in (140, 180, 225, 265):
@@ -122,26 +123,18 @@ def draw_tables(figure: Any, run: Path) -> None:
 
 def draw_markers(figure: Any, run: Path, frame: int) -> None:
     """The three phases: dark regions, corners and edges, identities."""
-    from detect.markers.candidates import closing, dark_pixels
-    from detect.markers.detect import detect_markers
-    from detect.settings import MarkerSettings
-
     camera, image = _frame(run, frame)
     settings = MarkerSettings()
     found = detect_markers(image, settings, camera)
-    panels = figure.subplots(1, 3)
+    titles = (
+        "1. dark against the closing (one of the thresholds)",
+        f"2. corners of {len(found.candidates)} candidates",
+        f"3. {len(found)} markers, fitted and identified",
+    )
+    panels = _panels(figure, (1, 3), image, titles)
     middles = found.corners.mean(axis=1)
     low, high = middles.min(axis=0) - 70, middles.max(axis=0) + 70
-    for axes, title in zip(
-        panels,
-        (
-            "1. dark against the closing (one of the thresholds)",
-            f"2. corners of {len(found.candidates)} candidates",
-            f"3. {len(found)} markers, fitted and identified",
-        ),
-        strict=True,
-    ):
-        _image(axes, image, title)
+    for axes in panels:
         axes.set(
             xlim=(max(low[0], 0), min(high[0], camera.width)),
             ylim=(min(high[1], camera.height), max(low[1], 0)),
@@ -166,17 +159,19 @@ def _frame(run: Path, number: int) -> tuple[Camera, Any]:
     return opened.camera, read_image(frame, opened.camera)
 
 
-def _image(axes: Any, image: Any, title: str) -> None:
-    axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-    axes.autoscale(False)
-    axes.set_title(title, fontsize=9)
-    axes.axis("off")
+def _panels(figure: Any, shape: tuple[int, int], image: Any, titles: tuple[str, ...]) -> Any:
+    """Axes that show an image, by their titles."""
+    panels = figure.subplots(*shape)
+    for axes, title in zip(panels, titles, strict=True):
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+        axes.autoscale(False)
+        axes.set_title(title, fontsize=9)
+        axes.axis("off")
+    return panels
 
 
 def draw_association(figure: Any, run: Path) -> None:
-    """Rows of a run where odometry and where the map puts them, coloured by what was found."""
-    import matplotlib as mpl
-
+    """Rows of a run as placed by odometry and by the map, coloured by their identifiers."""
     frames = list(read_frames(run / "found.circles"))
     summed = summed_steps(frame.step for frame in frames)
     mapped = read_path(run / "slam" / "path.csv").poses
@@ -195,7 +190,7 @@ def draw_association(figure: Any, run: Path) -> None:
 
 
 def draw_filter(figure: Any, run: Path) -> None:
-    """Errors of EKF-SLAM's poses, as they were at the time, within three standard deviations."""
+    """Errors of EKF-SLAM's poses at the time of each, and three standard deviations."""
     path = read_path(run / "ekf" / "path.csv")
     assert path.covariance is not None
     errors = path.poses - read_truth(run).poses
@@ -212,7 +207,7 @@ def draw_filter(figure: Any, run: Path) -> None:
 
 
 def draw_laser(figure: Any, session: Path, time_s: float) -> None:
-    """One set of scans: background, what is new, and the outline fitted to it."""
+    """One set of scans: background, new points, and the outline fitted to these."""
     laser = read_planar_poses(session / "laser.csv")
     nearest = np.argmin(np.abs(laser.times_s - laser.times_s[0] - time_s))
     at_s, pose = laser.times_s[nearest], laser.poses[nearest]
@@ -243,7 +238,7 @@ def draw_laser(figure: Any, session: Path, time_s: float) -> None:
 
 
 def draw_clock(figure: Any, session: Path) -> None:
-    """Rates of turn by both clocks, and the fused path with what it is sure of."""
+    """Rates of turn by both clocks, and the fused path with its standard deviations."""
     odometry, laser, fused = (
         read_planar_poses(session / f"{name}.csv") for name in ("odometry", "laser", "fused")
     )
@@ -285,7 +280,7 @@ def _turning(times_s: Any, theta_rad: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Pictures(Study):
-    """Draw the pictures of the documentation again, as far as their inputs are given.
+    """Draw the pictures of the documentation whose inputs are given.
 
     The run of `--rows` R and the session of `--session` S are made by
 
@@ -333,8 +328,6 @@ class Pictures(Study):
 
 
 def _photographs(figure: Any, folder: Path) -> None:
-    import cv2
-
     files = [*sorted((folder / "boards").glob("*.png"))[1:3], folder / "floor.png"]
     for axes, file in zip(figure.subplots(1, 3), files, strict=True):
         axes.imshow(np.asarray(cv2.imread(str(file), 0)), cmap="gray", vmin=0, vmax=255)

@@ -1,4 +1,4 @@
-"""A recorded run with shipped rows: what the presets make of it, from the images to the map.
+"""A recorded run with shipped rows: results of the presets, from the images to the map.
 
 Everything goes through the command line, as a user would do it.
 """

@@ -232,28 +232,22 @@ def errors_of_session(session: Path) -> dict[str, float]:
     truth = read_planar_poses(session / "truth.csv")
     laser, camera, fused = (read_planar_poses(at[name]) for name in ("laser", "camera", "fused"))
     seen = _seen_by(laser, fused.times_s)
-    alone = score_poses(*matched_streams(laser, truth))
-    inside = score_poses(*matched_streams(fused.only(seen), truth))
-    bridged = score_poses(*matched_streams(fused.only(~seen), truth))
-    instant = fused.only(np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3])
+    instant = np.arange(len(fused)) == np.flatnonzero(seen)[np.sum(seen) // 3]
+    parts = (fused.only(which) for which in (seen, ~seen, instant))
+    names = ("laser", "camera", "seen", "bridged", "instant")
     account = json.loads((session / "fused.json").read_text())
-    return {
+    errors = {
         **_clock_errors(session, list(read_clock(clock).segments)),
-        "laser_mm": 1e3 * alone.position_mean_m,
-        "laser_rms_mm": 1e3 * alone.position_rmse_m,
-        "laser_deg": float(np.degrees(alone.angle_sigma_rad)),
-        "laser_nees": alone.normalised_error,
-        "camera_rms_mm": 1e3 * score_poses(*matched_streams(camera, truth)).position_rmse_m,
-        "seen_mm": 1e3 * inside.position_mean_m,
-        "seen_rms_mm": 1e3 * inside.position_rmse_m,
-        "seen_deg": float(np.degrees(inside.angle_sigma_rad)),
-        "seen_nees": inside.normalised_error,
-        "bridged_mm": 1e3 * bridged.position_mean_m,
-        "bridged_nees": bridged.normalised_error,
-        "instant_nees": score_poses(*matched_streams(instant, truth)).normalised_error,
         "rejected": float(len(account["rejected"])),
         "restarts": float(len(account["restarts_s"])),
     }
+    for name, poses in zip(names, (laser, camera, *parts), strict=True):
+        score = score_poses(*matched_streams(poses, truth))
+        errors[f"{name}_mm"] = 1e3 * score.position_mean_m
+        errors[f"{name}_rms_mm"] = 1e3 * score.position_rmse_m
+        errors[f"{name}_deg"] = math.degrees(score.angle_sigma_rad)
+        errors[f"{name}_nees"] = score.normalised_error
+    return errors
 
 
 def _seen_by(laser: PlanarPoses, times_s: FloatArray) -> BoolArray:

@@ -1,4 +1,4 @@
-"""One way to write what studies find: tables in Markdown, pictures."""
+"""Output of all studies: tables in Markdown, pictures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Table:
 
 
 def picture(size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int) -> bytes:
-    """A PNG of what is drawn into a matplotlib figure: the same figures give the same bytes."""
+    """A PNG of a matplotlib figure; the same figure always gives the same bytes."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -20,10 +20,10 @@ from redetect.slam.models import disc_in_robot
 from tools.evaluation.figures import Figures, Study, print_figures
 from tools.evaluation.tables import Table
 
-#: An error of the image smaller than this is not believed, pixels along u.
+#: Least standard deviation of positions in the image, pixels along u.
 _LEAST_SIGMA_PX = 0.3
-#: Standard deviation of the tilt of a frame about the run's median: discs that stand close together
-#: tell no tilt, and one mistaken identifier among five would tell any (rad).
+#: Standard deviation of the tilt of a frame about the run's median: discs close together do not
+#: determine it, and one wrong identifier among five could give any tilt (rad).
 _SPREAD_RAD = np.radians(0.5)
 _UNKNOWNS = 5
 #: Lines and discs that a frame needs, and how many of the frames that differ most are listed.
@@ -88,7 +88,7 @@ def tilt_of_discs(
 def compare_tilts(
     camera: Camera, rows: Path, tilts: Path, map_path: Path, path_path: Path, raised_m: float = 0.0
 ) -> TiltComparison:
-    """Hold the tilts of a `.tilt` file against those of the discs of a map."""
+    """Compare the tilts of a `.tilt` file with those of the discs of a map."""
     discs = read_map(map_path).discs
     place = dict(zip(discs.ids.tolist(), discs.xy, strict=True))
     path = read_path(path_path)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from redetect.storage.command_line import exit_code_of
 
-#: Files are at most twice as long as the longest that a reader accepts, but at least this long.
+#: Files may be twice as long as the longest seed, and at least this long.
 _SHORT_BYTES = 2048
 _INSTRUMENTED = (
     "camera", "detect.drawing.inputs", "detect.runs.stream", "detect.sources", "redetect",

@@ -1,8 +1,8 @@
-"""SQLite bags with some of their cells changed: what a file's bytes alone hardly ever become.
+"""SQLite bags with some of their cells changed, which random changes of bytes hardly ever give.
 
-Random bytes of a database are damaged pages, and refused before a message is looked at. Here a
-recipe says which cells of a recorded bag have what in them, so that whatever is put together is a
-sound database. That of the empty recipe is the bag itself.
+Random changes of a database's bytes damage its pages, and it is refused before any message is read.
+Here a recipe says which cells of a recorded bag are changed, and how, so that the result is always
+a sound database. The empty recipe gives the bag itself.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sqlite3
 from contextlib import closing, suppress
 from functools import cache
 
-#: Edits that a recipe has at most.
+#: Largest number of edits in a recipe.
 _MOST_EDITS = 16
 _HEAD_BYTES = 4
 
@@ -19,7 +19,7 @@ Cell = tuple[str, int, str]
 
 
 def bag_with_edits(recorded: bytes, recipe: bytes) -> bytes:
-    """A database whose cells were changed."""
+    """A database with changed cells."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
         database.deserialize(recorded)
         cells = _cells(recorded)
@@ -32,7 +32,7 @@ def bag_with_edits(recorded: bytes, recipe: bytes) -> bytes:
             at += _HEAD_BYTES
             content = recipe[at : at + length]
             at += length
-            # What the tables' own conditions refuse is no bag that anybody could write.
+            # What the tables' own constraints refuse, nobody could write either.
             with suppress(sqlite3.Error, OverflowError):
                 _edit(database, kind % 8, cells[which % len(cells)], place, content)
         return database.serialize()
@@ -53,7 +53,7 @@ def _edit(database: sqlite3.Connection, kind: int, cell: Cell, place: int, conte
     if found is None:
         return
     new = _changed(found[0], kind, place, content)
-    # Text that is no text, too.
+    # Including text that is not valid UTF-8.
     value = "CAST(? AS TEXT)" if isinstance(found[0], str) and isinstance(new, bytes) else "?"
     database.execute(f'UPDATE "{table}" SET "{column}" = {value} WHERE rowid = {row}', (new,))
 
@@ -66,7 +66,7 @@ def _changed(value: object, kind: int, place: int, content: bytes) -> object:
     if isinstance(value, int | float | None):
         return content
     old = value.encode() if isinstance(value, str) else bytes(value)  # type: ignore[call-overload]
-    # Of what is longer than 256 bytes every place can be meant all the same.
+    # Any place can be chosen near the beginning or the end, even if there are over 256 bytes.
     first = place * len(old) // 256 if place < 128 else max(0, len(old) - 256 + place)
     if kind == 4:
         return content

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import replace
-from functools import cache, partial
-from itertools import pairwise
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,9 @@ import numpy as np
 from camera import CameraError
 from detect.errors import DetectError
 from detect.sources.bag import Bag
-from detect.sources.poses import step_between
 from tests.detect.recordings import BagKind, Ros, Said
 from tools.fuzz.bag_cells import bag_with_edits
+from tools.fuzz.detect_readers import steps_of
 from tools.fuzz.reader import Reader
 
 _WORDS = (
@@ -28,9 +27,9 @@ _WORDS = (
 
 
 def _bag(path: Path) -> object:
-    """All that `detect` asks of a bag.
+    """All that `detect` reads from a bag.
 
-    The calibration that it begins with is none, so that no camera is fitted to it, which takes
+    The calibration of the seeds is all zeros, so that no camera is fitted to it, which takes
     seconds.
     """
     bag = Bag(path)
@@ -39,9 +38,7 @@ def _bag(path: Path) -> object:
         assert (image.content is None) != (image.failure is None)
     bag.calibration(posed=False)
     odometry = bag.poses(None)
-    poses = [] if odometry is None else list(odometry.read())
-    steps = [step_between("e", *pair) for pair in pairwise(poses)]
-    return images, steps
+    return images, steps_of([] if odometry is None else odometry.read())
 
 
 @cache
@@ -60,13 +57,10 @@ def _recorded(kind: BagKind) -> bytes:
         return (bag / "b.db3" if kind == "sqlite" else bag).read_bytes()
 
 
-def _seeds(kind: BagKind) -> tuple[bytes, ...]:
-    return (_recorded(kind),)
-
-
 def _reader(name: str, file: str, kind: BagKind) -> Reader:
     errors = (DetectError, CameraError)
-    return Reader(name, file, _bag, errors, (), _WORDS, made_seeds=partial(_seeds, kind), files=5)
+    return Reader(name, file, _bag, errors, (), _WORDS, made_seeds=lambda: (_recorded(kind),),
+                  files=5)  # fmt: skip
 
 
 BAG_READERS: tuple[Reader, ...] = (

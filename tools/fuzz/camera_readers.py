@@ -1,4 +1,4 @@
-"""Readers of calibrations: the data set's, other programs', and what a calibration is made of."""
+"""Readers of calibrations: the data set's, other programs', and the inputs of a calibration."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def _camera(path: Path) -> object:
 def _foreign(
     parse: Callable[[str, str], ForeignCamera], write: Callable[[ForeignCamera], str], path: Path
 ) -> object:
-    """A camera of another program, as `camera convert` reads it; written and read it is the same.
+    """A camera of another program, as `camera convert` reads it; writing and reading keep it.
 
-    But for COLMAP's half pixel, which rounds, and its models that are written as a larger one.
+    Except for COLMAP's half pixel, which rounds, and models that are written as a larger one.
     """
     camera = parse(read_text(path), str(path))
     try:
         text = write(camera)
-    except CameraError:  # one that this format reads, and has no words for
+    except CameraError:  # this format can be read but not written
         return camera
     again = parse(text, str(path))
     assert (again.width, again.height) == (camera.width, camera.height), "another size"

@@ -1,15 +1,16 @@
-"""Readers of what a run is made of: images, times, heads of files, journals, cached tables."""
+"""Readers of the parts of a run: images, poses, heads of files, journals, cached tables."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import struct
+from collections.abc import Iterable
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from camera import CameraError, parse_camera
@@ -19,16 +20,17 @@ from detect.errors import DetectError, FrameError
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
-from detect.sources.poses import step_between, tick_poses, tum_poses
+from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses
+from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
-from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader
+from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader, npz
 
 #: Images are read for a calibration of this size.
 _SIZE = (8, 8)
-#: Without a calibration, images that claim more are left alone here: they only take time.
+#: Without a calibration, images that claim more pixels are skipped: they only take time.
 _MOST_PIXELS = 1 << 16
 
 _JPEG = b"\xff\xd8\xff\xe0\0\x04AB\xff\xc0\0\x0b\x08\0\x08\0\x08\x01\x01\x11\0\xff\xd9"
@@ -57,30 +59,20 @@ def _image(path: Path) -> object:
     return image
 
 
-def _small(path: Path) -> bool:
-    size = claimed_size(path.read_bytes()) if path.is_file() else None
-    return size is None or size[0] * size[1] <= _MOST_PIXELS
-
-
 def _calibration_image(path: Path) -> object:
-    return read_grey(path) if _small(path) else None
+    size = claimed_size(path.read_bytes()) if path.is_file() else None
+    small = size is None or size[0] * size[1] <= _MOST_PIXELS
+    return read_grey(path) if small else None
 
 
-def _trajectory(path: Path) -> object:
-    poses = list(tum_poses(path))
-    return [step_between("e", *pair) for pair in pairwise(poses)]
-
-
-def _ticks(path: Path) -> object:
-    poses = list(tick_poses(path, 0.5, 0.001))
+def steps_of(poses: Iterable[TimedPose]) -> object:
+    """Steps between poses, as runs have them."""
     return [step_between("e", *pair) for pair in pairwise(poses)]
 
 
 @cache
 def _encoded() -> tuple[bytes, ...]:
     """Images as OpenCV writes them, of 8 and 16 bits, grey and coloured."""
-    import cv2
-
     grey = (np.arange(64, dtype=np.uint8) * 3).reshape(8, 8)
     deep = grey.astype(np.uint16) * 16
     colour = np.dstack([grey, grey.T, 255 - grey])
@@ -93,7 +85,7 @@ def _encoded() -> tuple[bytes, ...]:
 
 
 class _Message:
-    """An image message whose fields stand at the beginning of a file."""
+    """An image message whose fields are at the beginning of a file."""
 
     def __init__(self, content: bytes) -> None:
         fields = struct.unpack("<IIIB", content[:13].ljust(13, b"\0"))
@@ -129,7 +121,7 @@ def _journal(path: Path) -> object:
 
 
 def _journal_of(*records: bytes) -> bytes:
-    """Records, each behind the digest of it and all before it."""
+    """Records, each after the digest of itself and all earlier ones."""
     lines, digest = [], hashlib.sha256()
     for record in records:
         digest.update(record)
@@ -145,7 +137,7 @@ _TABLE_CAMERA = parse_camera(
 
 
 def _table(path: Path) -> object:
-    """A cached table with the hash that it should have; whatever it holds, the true one comes."""
+    """A cached table with a valid hash: whatever it holds, the true table is returned."""
     folder = path.parent / "cache"
     if not folder.is_dir():
         folder.mkdir(mode=0o700)
@@ -161,15 +153,7 @@ def _table(path: Path) -> object:
 
 @cache
 def _table_content() -> tuple[bytes, ...]:
-    import dataclasses
-
-    from lut import build_vertical_table
-
-    stream = io.BytesIO()
-    table = build_vertical_table(_TABLE_CAMERA)
-    fields = {f.name: getattr(table, f.name) for f in dataclasses.fields(table)}
-    np.savez(stream, **fields)
-    return (stream.getvalue(),)
+    return (npz(**vars(build_vertical_table(_TABLE_CAMERA))),)
 
 
 _HEADERS = (
@@ -207,10 +191,10 @@ DETECT_READERS: tuple[Reader, ...] = (
     Reader("calibration image", "e.png", _calibration_image, (CameraError,), (), _IMAGE_WORDS,
            made_seeds=_encoded),
     Reader("image message", "message", _image_message, _FRAME, _MESSAGES, _ENCODINGS, needed=False),
-    Reader("trajectory", "e.tum", _trajectory, _DETECT,
+    Reader("trajectory", "e.tum", lambda p: steps_of(tum_poses(p)), _DETECT,
            (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
-    Reader("wheel ticks", "e.ticks", _ticks, _DETECT, (b"# t left right\n0 0 0\n1 500 510\n",),
-           NUMBERS),
+    Reader("wheel ticks", "e.ticks", lambda p: steps_of(tick_poses(p, 0.5, 0.001)), _DETECT,
+           (b"# t left right\n0 0 0\n1 500 510\n",), NUMBERS),
     Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
     Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,

@@ -1,9 +1,8 @@
-"""Readers of where a robot really was: poses, scans, clocks, scanners, surveys, calibrations."""
+"""Readers of ground truth: poses, scans, clocks, scanners, surveys, calibrations."""
 
 from __future__ import annotations
 
 import gzip
-import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,20 +18,10 @@ from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.groundtruth.validation.reference_poses import Survey, read_distances, read_survey
 from redetect.groundtruth.validation.scoring import read_relations
-from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NPZ_WORDS, NUMBERS, Reader
+from tools.fuzz.reader import CAMERA_TEXT, JSON_WORDS, NPZ_WORDS, NUMBERS, Reader, npz
 
-
-def _survey() -> Survey:
-    points = {"p": np.array([0.0, 1.0]), "q": np.array([1.0, 1.0])}
-    return Survey(points, points, 0.01)
-
-
-def _npz(**arrays: object) -> bytes:
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)  # type: ignore[arg-type]
-    return stream.getvalue()
-
-
+_POINTS = {"p": np.array([0.0, 1.0]), "q": np.array([1.0, 1.0])}
+_SURVEY = Survey(_POINTS, _POINTS, 0.01)
 _POSE_JSON = '"translation_m": [0, 0, 1], "quaternion_xyzw": [0, 0, 0, 1]'
 _RIG_JSON = (
     f'{{"dictionary": "rawseeds", "markers": {{"3": {{"width_m": 0.1, {_POSE_JSON},'
@@ -81,7 +70,7 @@ _DXF_WORDS = (
     )),
     b"1e999", b"\n70\n", b"\n2\n", b"BLOCKS",
 )  # fmt: skip
-_SCAN_ARRAYS = _npz(times_s=np.arange(2.0), ranges_mm=np.ones((2, 3), np.uint16))
+_SCAN_ARRAYS = npz(times_s=np.arange(2.0), ranges_mm=np.ones((2, 3), np.uint16))
 _SCANNERS_JSON = f'{{"version": 1, "scanners": [{_SCANNER_JSON}]}}'
 _ROBOT_JSON = (
     '{"version": 1, "outline": [[0, 0], [1, 0], [0, 1]], "largest_speed_m_s": 1,'
@@ -108,7 +97,7 @@ GROUNDTRUTH_READERS: tuple[Reader, ...] = (
     _reader("building", "building.csv", read_building, b"x1_m,y1_m,x2_m,y2_m\n0,0,1,1\n"),
     _reader("drawing", "building.dxf", read_building, _DXF, words=_DXF_WORDS),
     _reader("survey", "fiducials.json", read_survey, _SURVEY_JSON.encode(), words=JSON_WORDS),
-    _reader("distances", "distances.csv", lambda p: read_distances(p, _survey()),
+    _reader("distances", "distances.csv", lambda p: read_distances(p, _SURVEY),
             b"pose,t,point,fiducial,distance_m\n0,0.5,p,q,1.25\n"),
     _reader("rig", "rig.json", read_rig, _RIG_JSON.encode(), words=JSON_WORDS),
     _reader("network", "network.json", read_network, _NETWORK_JSON.encode(), words=JSON_WORDS,

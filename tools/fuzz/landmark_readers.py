@@ -1,4 +1,4 @@
-"""Readers of landmarks and of what is made of them: rows, tilts, maps, graphs, paths."""
+"""Readers of landmarks and of results made from them: rows, tilts, maps, graphs, paths."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect.landmarks import LandmarkError, frames_of_rows, read_rows
+from redetect.landmarks import LandmarkError, frames_of_rows, parse_rows, read_rows
+from redetect.landmarks.files import format_record
 from redetect.landmarks.map_file import covariance_file, read_map, read_path, with_joint_covariance
 from redetect.landmarks.tilts import read_tilts
 from redetect.landmarks.times import read_times
@@ -18,14 +19,11 @@ from tools.fuzz.reader import NUMBERS, Reader
 
 
 def _landmarks(path: Path) -> object:
-    """Frames of a file; what was accepted is given back byte by byte, and its records too."""
-    from redetect.landmarks import parse_rows
-    from redetect.landmarks.files import format_record
-
+    """Frames of a file; rows and records that were accepted can be written again unchanged."""
     rows = list(read_rows(path))
     assert b"".join(row.source or b"" for row in rows) == path.read_bytes(), "round trip"
     frames = list(frames_of_rows(rows))
-    # Only a file's first row may begin with a byte order mark that is none of its words.
+    # Only a file's first row may begin with a byte order mark, which is not part of it.
     again = "#\n" + "".join(f"{format_record(r.record)}\n" for r in rows if r.record is not None)
     encoded = again.encode("utf-8", "surrogateescape")
     once = [row.record for row in parse_rows(io.BytesIO(encoded)) if row.record is not None]

@@ -1,14 +1,18 @@
-"""What fuzzing knows of a reader, and what it demands of it.
+"""Readers as fuzzing sees them, and the check that one behaves.
 
-What a reader may do with a file is give a result, or raise a typed error whose message names the
-file, fits on one line, is of bounded length and shows nothing that a terminal would act upon.
+A reader has to return a result or raise a typed error whose message names the file, fits on one
+line, has a bounded length and contains nothing that a terminal would act upon.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from tools.published_camera import PUBLISHED_CAM
 
@@ -21,37 +25,45 @@ NPZ_WORDS = (b"PK\x03\x04", b"PK\x01\x02", b"'descr': '|O'", b".npy", b"\xff\xff
 
 CAMERA_TEXT = PUBLISHED_CAM.encode()
 
+
+def npz(**arrays: Any) -> bytes:
+    """The content of a ``.npz`` of some arrays."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
 #: Characters of a message beside the file's name.
 LONGEST_MESSAGE = 500
 
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader and what fuzzing it begins with."""
+    """A reader, and the files and words with which its fuzzing begins."""
 
     name: str
-    file: str  # What the file is called; it may lie in a folder.
-    read: Callable[[Path], object]  # Reads a file; what else it demands of the result it asserts.
+    file: str  # Name of the file, which may include a folder.
+    read: Callable[[Path], object]  # Reads a file, and asserts what the result must satisfy.
     errors: tuple[type[Exception], ...]  # What it may raise.
     seeds: tuple[bytes, ...] = ()  # Files that it accepts.
-    words: tuple[bytes, ...] = ()  # Words of its language, for those who put files together.
+    words: tuple[bytes, ...] = ()  # Words of its language, from which files are composed.
     beside: Mapping[str, bytes] = field(default_factory=dict)
     """Other files that it needs in the same folder."""
     made_seeds: Callable[[], tuple[bytes, ...]] = tuple
-    """Makes further files that it accepts, where that takes a while."""
+    """Makes further files that it accepts, if that takes some time."""
     files: int = 150
-    """So many damaged files are read by the tests: fewer where each takes milliseconds."""
+    """Number of damaged files that the tests read: fewer if each takes milliseconds."""
     needed: bool = True  # Whether it is an error that there is no file.
     content: Callable[[bytes], bytes] = bytes
-    """Makes a file's content of bytes, where damage to the file's own would not lead far; seeds are
-    then such bytes."""
+    """Makes the content of a file from bytes, if damaging the file itself would not lead far; seeds
+    are then such bytes."""
 
     def all_seeds(self) -> tuple[bytes, ...]:
         """All files that it accepts."""
         return (*self.seeds, *self.made_seeds())
 
     def prepare(self, folder: Path) -> Path:
-        """Put what stands beside its file into a folder; gives back the file's place."""
+        """Write the other files that it needs into a folder; returns the path of its own file."""
         for name, content in self.beside.items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(content)
@@ -61,7 +73,7 @@ class Reader:
 
 
 def attempt(reader: Reader, path: Path) -> Exception | None:
-    """Let a reader read a file: its typed error, if any; whatever else it raises escapes."""
+    """Let a reader read a file: its typed error, if any; other exceptions pass through."""
     try:
         reader.read(path)
     except reader.errors as error:

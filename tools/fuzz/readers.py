@@ -1,4 +1,4 @@
-"""Every reader of files that strangers make, with files that it accepts, for fuzzing."""
+"""All readers of files from unknown sources, with files that they accept, for fuzzing."""
 
 from __future__ import annotations
 

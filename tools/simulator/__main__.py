@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, arg
 
+from camera import format_camera, read_camera
 from redetect.storage.command_line import exit_code_of
+from tools.simulator import runs
 from tools.simulator.driving import DriveStyle
+from tools.simulator.laser import session_files as laser
 from tools.simulator.laser.settings import LaserSettings
-from tools.simulator.markers.samples import SampleSettings
-from tools.simulator.markers.session import CalibrationErrors, ImageFormat, SessionSettings
+from tools.simulator.markers import session as markers
+from tools.simulator.markers.calibration_set import write_calibration_set
+from tools.simulator.markers.samples import SampleSettings, write_samples
 from tools.simulator.renderer import Sensor
-from tools.simulator.runs import RunSettings
 
 # Numbers of frames, discs and look-alikes in a run of the data set.
 _FULL_FRAMES, _FULL_DISCS, _FULL_LOOKALIKES = 3297, 576, 140
@@ -32,10 +35,8 @@ class Demo:
     force: bool = False  # Replace existing files.
 
     def __call__(self) -> str:
-        from tools.simulator.runs import DEMO, write_run
-
-        rows = write_run(DEMO, self.output, jobs=self.jobs, overwrite=self.force)
-        return f"{DEMO.frames} frames, {rows} disc rows"
+        rows = runs.write_run(runs.DEMO, self.output, jobs=self.jobs, overwrite=self.force)
+        return f"{runs.DEMO.frames} frames, {rows} disc rows"
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,9 @@ class _Drive:
     force: bool = False  # Replace existing files.
     style: DriveStyle = field(default_factory=DriveStyle)
 
-    def settings(self) -> RunSettings:
+    def settings(self) -> runs.RunSettings:
         """Settings of the run, without look-alikes."""
-        from camera import format_camera, read_camera
-
-        settings = RunSettings(
+        settings = runs.RunSettings(
             name=self.output.resolve().name, frames=self.frames, seed=self.seed, lookalikes=0,
             discs=self.by_length(self.discs, _FULL_DISCS), visits=self.visits,
             unlabelled=self.unlabelled, style=self.style,
@@ -80,13 +79,11 @@ class Run(_Drive):
     sensor: Sensor = field(default_factory=Sensor)
 
     def __call__(self) -> str:
-        from tools.simulator.runs import write_run
-
         lookalikes = self.by_length(self.lookalikes, _FULL_LOOKALIKES)
         settings = replace(
             self.settings(), lookalikes=lookalikes, skip=self.skip, sensor=self.sensor
         )
-        rows = write_run(settings, self.output, jobs=self.jobs, overwrite=self.force)
+        rows = runs.write_run(settings, self.output, jobs=self.jobs, overwrite=self.force)
         return f"{self.frames} frames, {rows} disc rows"
 
 
@@ -98,9 +95,7 @@ class Rows(_Drive):
     miss: float = 0.0  # Probability that a row is missing.
 
     def __call__(self) -> str:
-        from tools.simulator.runs import write_rows
-
-        rows = write_rows(
+        rows = runs.write_rows(
             self.settings(), self.output, noisy=not self.exact, miss=self.miss, overwrite=self.force
         )
         return f"{self.frames} steps, {rows} disc rows"
@@ -118,13 +113,11 @@ class MarkerFrames:
     sample: SampleSettings = field(default_factory=SampleSettings)
 
     def __call__(self) -> str:
-        from tools.simulator.markers.samples import write_samples
-
-        markers = write_samples(
+        shown = write_samples(
             self.sample, self.output, count=self.count, seed=self.seed, jobs=self.jobs,
             overwrite=self.force,
         )  # fmt: skip
-        return f"{self.count} frames, {markers} markers"
+        return f"{self.count} frames, {shown} markers"
 
 
 @dataclass(frozen=True)
@@ -136,23 +129,21 @@ class MarkerSession:
 
     output: Positional[Path]  # Folder of the session; its name is the session's.
     calibration: bool = True  # Also render the images for calibrations.
-    image_format: ImageFormat = "jpg"  # Of the images.
+    image_format: markers.ImageFormat = "jpg"  # Of the images.
     quality: int = 92  # Of the jpg images.
     jobs: int = 1  # Number of processes.
     force: bool = False  # Replace existing files.
-    session: SessionSettings = field(default_factory=SessionSettings)
-    errors: CalibrationErrors = field(default_factory=CalibrationErrors)
+    session: markers.SessionSettings = field(default_factory=markers.SessionSettings)
+    errors: markers.CalibrationErrors = field(default_factory=markers.CalibrationErrors)
 
     def __call__(self) -> str:
-        from tools.simulator.markers.calibration_set import write_calibration_set
-        from tools.simulator.markers.session import SessionWriter, plan_session, write_session
-
         settings = replace(self.session, name=self.output.resolve().name)
-        writer = SessionWriter(self.errors, self.image_format, self.quality, self.force)
-        images = write_session(settings, self.output, writer, self.jobs)
+        writer = markers.SessionWriter(self.errors, self.image_format, self.quality, self.force)
+        images = markers.write_session(settings, self.output, writer, self.jobs)
         if not self.calibration:
             return f"{images} images"
-        more = write_calibration_set(plan_session(settings), self.output / "calibration", writer)
+        plan = markers.plan_session(settings)
+        more = write_calibration_set(plan, self.output / "calibration", writer)
         return f"{images} images, {more} for calibrations"
 
 
@@ -164,10 +155,8 @@ class MarkerDemo:
     force: bool = False  # Replace existing files.
 
     def __call__(self) -> str:
-        from tools.simulator.markers.session import DEMO, DEMO_QUALITY, SessionWriter, write_session
-
-        writer = SessionWriter(quality=DEMO_QUALITY, overwrite=self.force)
-        return f"{write_session(DEMO, self.output, writer)} images"
+        writer = markers.SessionWriter(quality=markers.DEMO_QUALITY, overwrite=self.force)
+        return f"{markers.write_session(markers.DEMO, self.output, writer)} images"
 
 
 @dataclass(frozen=True)
@@ -183,9 +172,7 @@ class LaserSession:
     session: Annotated[LaserSettings, arg(name="")] = field(default_factory=LaserSettings)
 
     def __call__(self) -> str:
-        from tools.simulator.laser.session_files import write_session
-
-        plan = write_session(self.session, self.output, seed=self.seed, overwrite=self.force)
+        plan = laser.write_session(self.session, self.output, seed=self.seed, overwrite=self.force)
         inside = sum(end - begin for begin, end in plan.visits)
         away = plan.route.end_s - plan.route.start_s - inside
         return f"{len(plan.visits)} visits, {inside:.0f} s in the room and {away:.0f} s outside"
@@ -194,13 +181,7 @@ class LaserSession:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     command = tyro.cli(
-        Annotated[Demo, subcommand("demo")]
-        | Annotated[Run, subcommand("run")]
-        | Annotated[Rows, subcommand("rows")]
-        | Annotated[MarkerFrames, subcommand("marker-frames")]
-        | Annotated[MarkerSession, subcommand("marker-session")]
-        | Annotated[MarkerDemo, subcommand("marker-demo")]
-        | Annotated[LaserSession, subcommand("laser-session")],
+        Demo | Run | Rows | MarkerFrames | MarkerSession | MarkerDemo | LaserSession,
         prog="python -m tools.simulator",
         description="Rendered runs and sessions with known truth.",
         args=arguments,

@@ -75,7 +75,7 @@ _INWARD = {"south": (0.0, 1.0), "north": (0.0, -1.0), "west": (1.0, 0.0), "east"
 
 @dataclass
 class Office:
-    """The building, its rooms and where there is a roof or which floor."""
+    """The building, its rooms, and rasters of roofs and kinds of floor."""
 
     building: Construction
     rooms: list[Room]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
@@ -36,7 +37,7 @@ def tilted_camera(camera: Camera, tilt_rad: ArrayLike) -> Camera:
 
 _DENSE_M = 0.01
 _DENSE_RAD = 0.01
-_TURNING_COST_M = 0.6  # a radian of turning takes as long as so many metres
+_TURNING_COST_M = 0.6  # a radian of turning takes as long as this many metres
 _REVERSAL_RAD = np.radians(150.0)
 
 
@@ -79,8 +80,6 @@ def robot_tilt(frames: int, style: DriveStyle, rng: np.random.Generator) -> Floa
 
 def smooth_noise(count: int, length: float, rng: np.random.Generator) -> FloatArray:
     """(count,) Gaussian noise of unit variance that stays similar over `length` samples."""
-    from scipy.ndimage import gaussian_filter1d
-
     margin = int(np.ceil(4.0 * length))
     white = rng.standard_normal(count + 2 * margin)
     smooth = gaussian_filter1d(white, length, mode="constant")[margin : margin + count]
@@ -90,12 +89,10 @@ def smooth_noise(count: int, length: float, rng: np.random.Generator) -> FloatAr
 
 def _rounded(route: FloatArray, radius: float) -> FloatArray:
     """Dense poses along the route with rounded corners and turns on the spot."""
+    apart = np.hypot(*np.diff(route, axis=0).T) > 1e-9
+    route = route[np.concatenate([[True], apart])]
     leg = np.diff(route, axis=0)
-    length = np.hypot(leg[:, 0], leg[:, 1])
-    keep = np.concatenate([[True], length > 1e-9])
-    route = route[keep]
-    leg = np.diff(route, axis=0)
-    length = np.hypot(leg[:, 0], leg[:, 1])
+    length = np.hypot(*leg.T)
     unit = leg / length[:, None]
     # Heading h looks along (sin h, -cos h).
     heading = np.arctan2(unit[:, 0], -unit[:, 1])
@@ -146,7 +143,7 @@ def _weaving(dense: FloatArray, style: DriveStyle, rng: np.random.Generator) -> 
     off = style.weave_m * smooth_noise(len(dense), length, rng)
     slope = np.gradient(off) / _DENSE_M
     left = np.column_stack([np.cos(dense[:, 2]), np.sin(dense[:, 2])])
-    # On the spot nothing shifts: the same slope would be driven in no time.
+    # While the robot turns on the spot nothing is shifted: it does not move along the slope.
     moving = np.concatenate([[0.0], np.hypot(*np.diff(dense[:, :2], axis=0).T)]) > 1e-9
     woven = dense.copy()
     woven[:, :2] += off[:, None] * left
@@ -173,7 +170,7 @@ def step_covariance(steps: ArrayLike) -> FloatArray:
     covariance[..., 0, 0] = covariance[..., 1, 1] = position
     nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     for node, weight in zip(0.5 * (nodes + 1.0), 0.5 * weights):
-        # A heading error at this share of the way turns what is left of the step.
+        # A heading error at this share of the way turns the rest of the step.
         rest_x, rest_y = _rest_of_arc(step, float(node))
         lever = np.stack([-rest_y, rest_x, np.ones_like(rest_x)], axis=-1)
         outer = lever[..., :, None] * lever[..., None, :]
@@ -182,7 +179,7 @@ def step_covariance(steps: ArrayLike) -> FloatArray:
 
 
 def _rest_of_arc(step: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-    """What is left of steps after a share of their way (an arc), in the frame before them."""
+    """The rest of steps after a share of their way (an arc), in the frame before them."""
     dphi = step[..., 2]
     # Chord of the first `share` of an arc: its direction turns back by half of what is missing.
     small = np.abs(dphi) < 1e-9

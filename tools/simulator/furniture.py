@@ -1,6 +1,8 @@
-"""What stands in rooms and corridors, hangs on walls and ceilings, and lies on the floor."""
+"""Furniture of rooms and corridors, things on walls and ceilings, and discs on the floor."""
 
 from __future__ import annotations
+
+from itertools import cycle
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from tools.simulator.building import (
     Office,
     Room,
 )
+from tools.simulator.laser.site import clearance
 from tools.simulator.scene import Construction, Face, FloorMark, Look, Mark, Texture
 
 _DARK = Look(albedo=0.06)
@@ -319,8 +322,20 @@ DISC_RADIUS_M = 0.10
 _ALONG_SIDE_M = (0.15, 2.2)
 _APART_M = 0.34
 _FROM_FURNITURE_M = 0.17
-_LOOKALIKES = ("ring", "ellipse", "large disc", "dark disc", "plate", "paper", "sheet",
-               "light spot", "small disc", "square", "cable")  # fmt: skip
+#: Shape, radius and second radius (or half sides), albedo; one of each kind in turn.
+_LOOKALIKES = {
+    "ring": (Mark.RING, 0.10, 0.055, 0.85),
+    "ellipse": (Mark.ELLIPSE, 0.16, 0.06, 0.8),
+    "large disc": (Mark.DISC, 0.16, 0.0, 0.8),
+    "dark disc": (Mark.DISC, 0.10, 0.0, 0.05),
+    "plate": (Mark.PLATE, 0.125, 0.085, 0.8),
+    "paper": (Mark.RECTANGLE, 0.149, 0.105, 0.85),
+    "sheet": (Mark.PRINTED, 0.149, 0.105, 0.85),
+    "light spot": (Mark.LIGHT_SPOT, 0.11, 0.0, 1.2),
+    "small disc": (Mark.DISC, 0.055, 0.0, 0.8),
+    "square": (Mark.RECTANGLE, 0.09, 0.09, 0.8),
+    "cable": (Mark.RECTANGLE, 0.6, 0.012, 0.05),
+}
 
 
 def lay_discs(
@@ -359,28 +374,11 @@ def lay_discs(
     for number, (x, y, _) in enumerate(discs, start=1):
         albedo = float(rng.uniform(0.78, 0.92))
         building.marks.append(FloorMark(Mark.DISC, x, y, DISC_RADIUS_M, albedo, disc_id=number))
-    for k, index in enumerate(order[count:]):
+    for index, label in zip(order[count:], cycle(_LOOKALIKES)):
         x, y, _ = chosen[index]
-        building.marks.append(_lookalike(_LOOKALIKES[k % len(_LOOKALIKES)], x, y, rng))
-
-
-def _lookalike(label: str, x: float, y: float, rng: np.random.Generator) -> FloorMark:
-    angle = float(rng.uniform(0.0, np.pi))
-    shapes = {
-        "ring": (Mark.RING, 0.10, 0.055, 0.85),
-        "ellipse": (Mark.ELLIPSE, 0.16, 0.06, 0.8),
-        "large disc": (Mark.DISC, 0.16, 0.0, 0.8),
-        "dark disc": (Mark.DISC, 0.10, 0.0, 0.05),
-        "plate": (Mark.PLATE, 0.125, 0.085, 0.8),
-        "paper": (Mark.RECTANGLE, 0.149, 0.105, 0.85),
-        "sheet": (Mark.PRINTED, 0.149, 0.105, 0.85),
-        "light spot": (Mark.LIGHT_SPOT, 0.11, 0.0, 1.2),
-        "small disc": (Mark.DISC, 0.055, 0.0, 0.8),
-        "square": (Mark.RECTANGLE, 0.09, 0.09, 0.8),
-        "cable": (Mark.RECTANGLE, 0.6, 0.012, 0.05),
-    }
-    shape, radius, second, albedo = shapes[label]
-    return FloorMark(shape, x, y, radius, albedo, second, angle, label=label)
+        shape, radius, second, albedo = _LOOKALIKES[label]
+        angle = float(rng.uniform(0.0, np.pi))
+        building.marks.append(FloorMark(shape, x, y, radius, albedo, second, angle, label=label))
 
 
 def _low_segments(building: Construction) -> FloatArray:
@@ -399,12 +397,9 @@ def _crowded(
     low, high = boxes[:, 0] - _FROM_FURNITURE_M, boxes[:, 1] + _FROM_FURNITURE_M
     if np.any(np.all((place > low) & (place < high), axis=1)):
         return True
-    a, b = walls[:, :2], walls[:, 2:]
-    along = b - a
-    squared = np.maximum((along**2).sum(axis=1), 1e-12)
-    share = np.clip(((place - a) * along).sum(axis=1) / squared, 0.0, 1.0)
-    if np.hypot(*(place - a - share[:, None] * along).T).min() < _FROM_FURNITURE_M:
+    if clearance(place[None], walls)[0] < _FROM_FURNITURE_M:
         return True
+    a, along = walls[:, :2], walls[:, 2:] - walls[:, :2]
     way = place - seen_from
     cross = way[0] * along[:, 1] - way[1] * along[:, 0]
     safe = np.where(np.abs(cross) < 1e-12, np.inf, cross)

@@ -12,6 +12,7 @@ from redetect.array_types import BoolArray, ByteArray, FloatArray, IntArray
 from redetect.landmarks import CircleLandmark, LineLandmark
 from redetect.slam.models import disc_in_robot
 from tools.simulator.driving import planar_transform
+from tools.simulator.ray_kernels import points_visible
 from tools.simulator.renderer import camera_in_world
 from tools.simulator.scene import Scene, UprightEdge
 
@@ -38,11 +39,11 @@ def disc_quality(grey: ByteArray, camera: Camera, pixel: ArrayLike) -> float:
     return float(0.25 * difference * difference / total)
 
 
-#: A row's centre lies at least so many pixels inside the image, as in the data set.
+#: The centre of a row lies at least this many pixels inside the image, as in the data set.
 BORDER_PX = 12
-#: And the floor moves at most so far from one pixel to the next (m), as in the data set.
+#: And adjacent pixels there are at most this far apart on the floor (m), as in the data set.
 FAR_LIMIT_M = 0.05
-#: A row's disc has at least this share of its area in view.
+#: At least this share of the area of a row's disc is in view.
 LEAST_SHARE = 0.8
 
 _DISC_POINTS = 60
@@ -85,8 +86,8 @@ class SeenEdge:
     true bearing from the camera's centre in the level robot frame; `contrast` the median step in
     grey values across it, `rows` the number of image rows that show it, `peak_px` its distance from
     the nearest peak of the image's gradient; `crosses`: it is seen where it crosses the horizon,
-    `BORDER_PX` inside the image. A detector of verticals begins there: the foot of a shelf below
-    the horizon leans as any furrow of the floor may.
+    `BORDER_PX` inside the image. A detector of verticals begins there: below the horizon, the foot
+    of a shelf may lean like any line on the floor.
     """
 
     edge_id: int
@@ -119,8 +120,6 @@ def see_discs(
     radius_m: float,
 ) -> list[SeenDisc]:
     """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
-    from tools.simulator.ray_kernels import points_visible
-
     robot_xy = disc_in_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
     inside = _in_image(true, pixels)
@@ -129,9 +128,10 @@ def see_discs(
     seen: list[SeenDisc] = []
     near = np.hypot(robot_xy[:, 0], robot_xy[:, 1]) < _DISC_REACH_M
     for k in np.flatnonzero(inside & near):
-        world = np.column_stack([disc_xy[k] + spots, np.full(len(spots), 1e-3)])
+        world_xy = disc_xy[k] + spots
+        world = np.column_stack([world_xy, np.full(len(spots), 1e-3)])
         free = points_visible(scene, eye, world, _SLACK_M)
-        uv = true.project_floor(robot_xy[k] + _rotated(spots, -pose[2]))
+        uv = true.project_floor(disc_in_robot(pose, world_xy))
         within = _in_image(true, uv)
         share = float((free & within).mean())
         if share <= 0.0:
@@ -171,8 +171,6 @@ def see_edges(
     scene: Scene, true: Camera, pose: FloatArray, edges: list[UprightEdge], grey: ByteArray
 ) -> list[SeenEdge]:
     """Which vertical edges within 12 m are in view from a pose. `grey` (H, W)."""
-    from tools.simulator.ray_kernels import points_visible
-
     eye = camera_in_world(true, pose)[:, 3]
     place = np.array([[e.x, e.y] for e in edges]).reshape(-1, 2)
     heights = np.array([[e.z0, e.z1] for e in edges]).reshape(-1, 2)
@@ -229,13 +227,10 @@ def line_row(edge: SeenEdge, nominal: Camera) -> LineLandmark:
     middle = edge.ends.mean(axis=0)
     aside = nominal.directions_robot(middle + np.array([[-0.5, 0.0], [0.5, 0.0]]))
     bearing = np.arctan2(aside[:, 0], -aside[:, 1])
-    top, bottom = edge.normalised
+    beta = float(np.arcsin(np.clip(normal[2], -1.0, 1.0)))
+    (x0, y0), (x1, y1) = edge.normalised.tolist()
     return LineLandmark(
-        float(top[0]),
-        float(top[1]),
-        float(bottom[0]),
-        float(bottom[1]),
-        alpha=edge.bearing_rad, beta=float(np.arcsin(np.clip(normal[2], -1.0, 1.0))),
+        x0, y0, x1, y1, alpha=edge.bearing_rad, beta=beta,
         quality=0.0, sigma=float(abs(bearing[0] - bearing[1])), ids=(edge.edge_id,),
     )  # fmt: skip
 
@@ -266,18 +261,10 @@ def _sunflower(count: int) -> FloatArray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
-def _rotated(points: FloatArray, angle: float) -> FloatArray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]))
-
-
 def _longest_run(flags: BoolArray) -> tuple[int, int]:
-    """First and last index of the longest run of true values; (0, -1) if there is none."""
-    padded = np.concatenate([[False], flags, [False]]).astype(np.int8)
-    steps = np.diff(padded)
+    """First and last index of the longest run of true values; there is at least one."""
+    steps = np.diff(flags.astype(np.int8), prepend=0, append=0)
     begin, end = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
-    if not len(begin):
-        return 0, -1
     best = int(np.argmax(end - begin))
     return int(begin[best]), int(end[best])
 

@@ -1,4 +1,4 @@
-"""An office building with all that is in it, and ways through it."""
+"""An office building with its contents, and routes through it."""
 
 from __future__ import annotations
 

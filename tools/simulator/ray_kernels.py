@@ -1,7 +1,7 @@
 """Numba kernels that cast rays through a scene, shade what they meet, and bake a scene's light.
 
 Rays go through a grid of upright and level parallelograms; textures, marks on the floor and baked
-light decide what comes back.
+light determine the radiance.
 """
 
 # Arithmetic on array elements has no static type; Numba finds the types itself.
@@ -157,7 +157,7 @@ _CEILING_ALBEDO = 0.80
 
 @nb.njit(cache=True, error_model="numpy")
 def _hashed(ix: int, iy: int, seed: float) -> float:
-    """A number in [0, 1) that looks random and depends on nothing but the arguments."""
+    """A number in [0, 1) that looks random and depends on the arguments only."""
     h = (ix * 374761393 + iy * 668265263 + int(seed) * 974634777) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     h = ((h ^ (h >> 16)) * 2246822519) & 0xFFFFFFFF

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from camera import Camera
 from camera.uncertainty import IDENTITY
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from tools.simulator.driving import planar_transform
+from tools.simulator.ray_kernels import SKY, light_along
 from tools.simulator.scene import Scene
 
 _RAYS_ACROSS_EDGES = 12
@@ -24,10 +27,10 @@ _SKY_M = 1e4
 
 
 class Light(NamedTuple):
-    """Light on the full, interlaced frame and what it comes from."""
+    """Light on the full, interlaced frame, and its sources."""
 
     radiance: Float32Array  # (2 H, W) light on each pixel; 1 is white paper in good light.
-    seen: NDArray[np.int32]  # (2 H, W) a number for what each pixel's centre sees.
+    seen: NDArray[np.int32]  # (2 H, W) number of what each pixel's centre sees.
     depth: Float32Array  # (2 H, W) depth along the optical axis (m).
 
 
@@ -53,10 +56,6 @@ def camera_in_world(camera: Camera, pose: FloatArray) -> FloatArray:
 
 def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
     """Cast the rays of one frame, more of them through pixels across an edge. `pose` (3,)."""
-    from scipy.ndimage import gaussian_filter
-
-    from tools.simulator.ray_kernels import light_along
-
     world_from_camera = camera_in_world(camera, pose)
     eye, angle = world_from_camera[:, 3], 1.0 / camera.scale_x
 
@@ -83,7 +82,7 @@ def render_light(scene: Scene, camera: Camera, pose: FloatArray) -> Light:
         weight = reflecting.astype(np.float32)
         image = np.zeros_like(weight)
         image[reflecting] = light_along(scene, floor, down * [1.0, 1.0, -1.0], 8.0 * angle)[0]
-        # A floor mirrors blurred; where it ends, nothing of the wall may be mixed in.
+        # A floor reflects blurred; at its end, the wall must not be mixed in.
         blur = (_MIRROR_BLUR[1], _MIRROR_BLUR[0])
         share = np.maximum(gaussian_filter(weight, blur), 1e-6)
         image = gaussian_filter(image, blur) / share
@@ -110,17 +109,13 @@ def smeared(
 
     Both are robot poses (x, y, heading) in the world.
     """
-    from scipy.ndimage import map_coordinates
-
-    from tools.simulator.ray_kernels import SKY
-
     now, later = camera_in_world(camera, pose), camera_in_world(camera, pose_at_end)
     rays = _pixel_rays(replace(camera, robot_from_camera=IDENTITY))
     depth = np.where(light.seen == SKY, _SKY_M, light.depth)
     points = (rays * depth[..., None]) @ now[:, :3].T + now[:, 3]
     ends = camera.project((points - later[:, 3]) @ later[:, :3])
     places = np.indices(depth.shape).reshape(2, -1)
-    # What leaves the sight stays where it is.
+    # What leaves the field of view stays where it is.
     way = np.nan_to_num((ends[..., ::-1] * [2.0, 1.0]).reshape(-1, 2).T - places)
     steps = np.ceil(2.0 * np.hypot(*way)).astype(np.int64)
     total = light.radiance.ravel().astype(np.float64)
@@ -143,8 +138,6 @@ def _ray_offsets(count: int) -> FloatArray:
 
 def _enlarged(image: Float32Array, shape: tuple[int, ...]) -> Float32Array:
     """Bilinear enlargement of a raster of every `_MIRROR_STRIDE`-th pixel."""
-    from scipy.ndimage import map_coordinates
-
     rows = np.arange(shape[0]) / _MIRROR_STRIDE
     columns = np.arange(shape[1]) / _MIRROR_STRIDE
     grid = np.meshgrid(rows, columns, indexing="ij")
@@ -194,8 +187,6 @@ def grey_values(radiance: Float32Array, sensor: Sensor, rng: np.random.Generator
 
 
 def _through_lens(radiance: Float32Array, sensor: Sensor) -> FloatArray:
-    import cv2
-
     light: NDArray[Any] = radiance.astype(np.float64)
     across = float(np.hypot(sensor.blur_px, sensor.video_blur_px))
     if across > 0.0:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import cv2
 import numpy as np
 
 from camera import Camera, parse_camera, write_camera
@@ -46,16 +48,16 @@ _SKY = 3.0
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What a simulated run is to be like."""
+    """Settings of a simulated run."""
 
     name: str = "sim"
     frames: int = 3297
     seed: int = 1
     discs: int = 576
     lookalikes: int = 140
-    visits: float = 0.6  # Probability that a room with an open door is visited in passing.
-    skip: int = 0  # Steps of the drive that go by before the first frame.
-    unlabelled: float = 0.03  # Share of rows whose ID is not known (-1).
+    visits: float = 0.6  # Probability that a room with an open door is visited.
+    skip: int = 0  # Number of steps of the drive before the first frame.
+    unlabelled: float = 0.03  # Share of rows with unknown ID (-1).
     camera_text: str = PUBLISHED_CAM
     """Text of the calibration (.cam) through which the run is seen."""
     style: DriveStyle = field(default_factory=DriveStyle)
@@ -64,7 +66,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """A run that needs only be rendered."""
+    """A run that only has to be rendered."""
 
     settings: RunSettings
     camera: Camera
@@ -215,16 +217,14 @@ class FrameTruth:
 
 
 def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
-    """Render one frame of a run and say what is in it."""
-    import cv2
-
+    """Render one frame of a run, with its truth."""
     # Its own random numbers, whatever was rendered before it.
     seed = np.random.SeedSequence([plan.settings.seed, len(_PURPOSES), frame])
     rng = np.random.default_rng(seed)
     camera = plan.true_camera(frame)
     pose = plan.poses[frame + 1]
     light = render_light(plan.scene, camera, pose)
-    # The robot goes on as it came; half of the exposure lies after its middle.
+    # The robot keeps its motion; half of the exposure is after its middle.
     onward = pose + 0.5 * plan.settings.sensor.exposure * (pose - plan.poses[frame])
     radiance = smeared(light, camera, pose, onward)
     grey = grey_values(radiance, plan.settings.sensor, rng)
@@ -282,7 +282,7 @@ def write_run(
         what += f" after {settings.skip} skipped"
     (folder / "images").mkdir(parents=True, exist_ok=True)
     truths: list[FrameTruth] = []
-    for truth in in_order(render_frame, plan, range(settings.frames), jobs):
+    for truth in in_order(partial(render_frame, plan), range(settings.frames), jobs):
         assert truth.jpeg is not None
         image = folder / "images" / f"{plan.prefix(truth.frame)}.jpg"
         write_bytes(image, truth.jpeg, overwrite=overwrite)
@@ -300,7 +300,7 @@ def _write_seen(
     plan: RunPlan, folder: Path, what: str, circles: tuple[str, Sequence[tuple[Landmark, ...]]],
     truths: list[FrameTruth], overwrite: bool,
 ) -> None:  # fmt: skip
-    """Write calibration, odometry, the rows of discs (and what is said of them) and the truth."""
+    """Write calibration, odometry, the rows of discs (below their description) and the truth."""
     name = plan.settings.name
     exact = with_covariance(plan.camera, np.zeros((PARAMETERS, PARAMETERS)))
     write_camera(exact, folder / f"{name}.cam", overwrite=overwrite)
@@ -382,7 +382,7 @@ def _write_landmarks(
 def _truth_of(
     plan: RunPlan, truths: list[FrameTruth], what: str
 ) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """All that is known about the run: a head, and lists of objects and frames."""
+    """The truth of a run: a head, and lists of objects and frames."""
     head: dict[str, Any] = {
         "note": SIMULATED.format(what=what).split("\n"),
         "conventions": {

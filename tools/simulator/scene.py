@@ -1,4 +1,4 @@
-"""Scenes as the ray caster takes them, and how they are put together: walls, boxes, marks.
+"""Scenes for the ray caster, and their construction from walls, boxes and marks.
 
 World frame: the building's floor plan in x and y, z up, the floor at z = 0; metres. The robot frame
 turns into it by a rotation about z and a shift: a robot at heading 0 looks along -y.
@@ -12,8 +12,10 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
@@ -66,7 +68,7 @@ FLOORING = _record("kind albedo contrast gloss pitch")
 
 
 class Scene(NamedTuple):
-    """A world made ready for rays."""
+    """A world prepared for ray casting."""
 
     quads: FloatArray
     """(Q, 12) parallelograms: normal, offset; dual vector and offset of the first edge; the same of
@@ -117,14 +119,14 @@ class Look:
 
 
 class Face(NamedTuple):
-    """A place on an upright face, metres: where things are set against it."""
+    """A place on an upright face, metres: things are placed against it."""
 
     at: FloatArray  # (2,)
     along: FloatArray  # (2,) unit vector along the face.
     out: FloatArray  # (2,) unit vector out of it, into the room.
 
     def point(self, along: float, out: float = 0.0) -> FloatArray:
-        """(2,) the place so far along the face and out of it."""
+        """(2,) the place at these distances along the face and out of it."""
         return np.asarray(self.at + along * self.along + out * self.out)
 
     def moved(self, along: float, out: float = 0.0) -> Face:
@@ -212,7 +214,7 @@ class Construction:
         self, face: Face, along: tuple[float, float], z: tuple[float, float], look: Look,
         label: str = "",
     ) -> None:  # fmt: skip
-        """Add an upright rectangle on a face, from and to so far along it and up."""
+        """Add an upright rectangle on a face: its ends along the face, and heights."""
         self.upright(face.point(along[0]), face.point(along[1]), *z, look, label)
 
     def block(
@@ -307,13 +309,11 @@ def make_scene(
     *,
     lit: bool = True,
 ) -> Scene:
-    """Make a world ready for rays: sort it into a grid and bake its light.
+    """Prepare a world for ray casting: sort it into a grid and bake its light.
 
     `extent` (x0, y0, x1, y1); `floor_kind` (Ny, Nx); `floorings` (F, 5); `indoors` (Ny, Nx); `sun`
     (x, y, z, light).
     """
-    from scipy.ndimage import gaussian_filter
-
     from tools.simulator.ray_kernels import bake_light
 
     x0, y0, x1, y1 = extent
@@ -445,10 +445,9 @@ def _cosine_directions(count: int) -> FloatArray:
 @lru_cache(maxsize=1)
 def _photographs() -> Float32Array:
     """Photographs that come with scikit-image, each with its halved versions."""
-    import cv2
     from skimage import data
 
-    # Only those that lie in the package itself: nothing is fetched.
+    # Only those in the package itself: nothing is fetched.
     images = [data.camera(), data.astronaut(), data.coffee(), data.chelsea(), data.coins(),
               data.text(), data.page(), data.clock(), data.moon(), data.brick(), data.grass(),
               data.hubble_deep_field()]  # fmt: skip

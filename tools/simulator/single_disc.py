@@ -2,7 +2,7 @@
 
 The disc's outline goes forward through the camera as a fine polygon; the area that it covers of the
 cells of a supersampled grid is exact; the optics' blur and the pixel's aperture follow. Nothing
-here knows a detector's tables or models.
+here uses a detector's tables or models.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
 
 from camera import Camera
 from redetect.array_types import FloatArray
@@ -147,11 +148,13 @@ def render_disc(
     right = max(u1 + pad_u, int(np.ceil(outline[:, 0].max())) + 1)
     bottom = max(v1 + pad_v, int(np.ceil(outline[:, 1].max())) + 1)
 
-    covered = _supersampled_coverage(
-        outline - (left, top), right - left + 1, bottom - top + 1, supersampling
-    )
-    covered = _blurred(covered, blur_u * supersampling, blur_v * supersampling)
-    share = _integrated(covered, supersampling, row_aperture)
+    # Pixel centres are integers, cell corners are the kernel's: half a pixel between them.
+    x, y = np.ascontiguousarray(((outline - (left, top) + 0.5) * supersampling).T)
+    columns, rows = (right - left + 1) * supersampling, (bottom - top + 1) * supersampling
+    covered = np.abs(polygon_coverage(x, y, columns, rows))
+    sigmas = blur_u * supersampling, blur_v * supersampling
+    blurred = gaussian_filter(covered.T, sigmas, mode="nearest", truncate=_BLUR_REACH)
+    share = _integrated(np.ascontiguousarray(blurred.T), supersampling, row_aperture)
     share = share[v0 - top : v1 - top + 1, u0 - left : u1 - left + 1]
 
     grey = dark + (light - dark) * share
@@ -187,27 +190,6 @@ def _crop_bounds(
     if u0 > u1 or v0 > v1:
         raise ValueError(f"the disc at {floor_xy!r} is not in the image")
     return int(u0), int(v0), int(u1), int(v1)
-
-
-def _supersampled_coverage(
-    outline: FloatArray, width: int, height: int, supersampling: int
-) -> FloatArray:
-    # Pixel centres are integers, cell corners are the kernel's: half a pixel between them.
-    x, y = np.ascontiguousarray(((outline + 0.5) * supersampling).T)
-    signed = polygon_coverage(x, y, width * supersampling, height * supersampling)
-    return np.asarray(np.abs(signed))
-
-
-def _blurred(covered: FloatArray, sigma_u: float, sigma_v: float) -> FloatArray:
-    """Gaussian blur; standard deviations in cells."""
-    from scipy.ndimage import gaussian_filter1d
-
-    for axis, sigma in ((1, sigma_u), (0, sigma_v)):
-        if sigma > 0.0:
-            covered = gaussian_filter1d(
-                covered, sigma, axis=axis, mode="nearest", truncate=_BLUR_REACH
-            )
-    return covered
 
 
 def _integrated(covered: FloatArray, supersampling: int, row_aperture: float) -> FloatArray:

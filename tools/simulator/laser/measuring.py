@@ -1,4 +1,4 @@
-"""What a scanner measures: rays cast in the plane, and errors of the readings."""
+"""Readings of a scanner: rays cast in the plane, and their errors."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def cast_on_walls(rays: FloatArray, walls: FloatArray, ranges: FloatArray) -> No
             rx, ry = walls[s, 0] - rays[b, 0], walls[s, 1] - rays[b, 1]
             across = dx * ey - dy * ex
             beside = rx * dy - ry * dx
-            # Both ends on the same side of the ray, or a wall along it, whose end its neighbour
-            # shows.
+            # Both ends are on the same side of the ray, or the wall is along it: then the ray
+            # meets the neighbouring wall.
             if beside * (beside - across) > 0.0 or across == 0.0:
                 continue
             distance = (rx * ey - ry * ex) / across
@@ -39,7 +39,7 @@ def cast_on_walls(rays: FloatArray, walls: FloatArray, ranges: FloatArray) -> No
 def cast_on_discs(
     rays: FloatArray, discs: FloatArray, of_ray: IntArray, ranges: FloatArray
 ) -> None:
-    """Shorten the ranges (B,) of rays (B, 3) to discs that stand elsewhere from scan to scan.
+    """Shorten the ranges (B,) of rays (B, 3) to discs that move from scan to scan.
     `discs` (N, D, 3) are x, y, radius; `of_ray` (B,) is each ray's scan.
     """
     for b in range(ranges.size):
@@ -65,11 +65,11 @@ _EDGE_M = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What there is to be hit."""
+    """Everything that a ray may meet."""
 
-    walls: FloatArray  # (S, 4) What stands still: x1, y1, x2, y2 (m).
+    walls: FloatArray  # (S, 4) Things at rest: x1, y1, x2, y2 (m).
     robot_poses: Callable[[FloatArray], FloatArray] | None
-    """(N, 3) poses at times (s); None if the robot is not there, or not to be seen."""
+    """(N, 3) poses at times (s); None if the robot is absent or invisible."""
     sides: FloatArray  # (K, 4) Sides of the robot in its frame (m).
     legs: Callable[[FloatArray], FloatArray]  # (N, D, 3) x, y, radius of discs at times (m).
 

@@ -1,4 +1,4 @@
-"""Where the robot drives, and what its odometry and its clock show."""
+"""The robot's path, and the readings of its odometry and clock."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from redetect.array_types import FloatArray
 from tools.simulator.laser.settings import DrivingLimits, WheelErrors
@@ -15,7 +16,7 @@ _GRID_M = 0.002
 
 @dataclass(frozen=True)
 class Stop:
-    """A place on the way where the robot stands."""
+    """A place on the way where the robot stops."""
 
     way_m: float
     length_s: float
@@ -43,7 +44,7 @@ class Route:
         self._arrive, self._leave = leave - waits, leave
         self._curve, self._speed = curve, speed
         self.start_s, self.end_s = float(start_s), float(leave[-1])
-        #: From and to when it stands at each stop.
+        #: Begin and end of each stop.
         at = [int(np.searchsorted(curve.way, stop.way_m)) for stop in stops]
         self.stands = [(float(self._arrive[i]), float(self._leave[i])) for i in at]
 
@@ -65,8 +66,6 @@ class Curve:
     """A cubic spline through waypoints by its length; `way` (M,) and `bend` (M,) on a fine grid."""
 
     def __init__(self, waypoints: FloatArray, grid_m: float = _GRID_M) -> None:
-        from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
         chords = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints, axis=0).T))])
         self._spline = CubicSpline(chords, waypoints, bc_type="natural")
         u = np.linspace(0.0, chords[-1], int(np.ceil(chords[-1] / grid_m)) + 1)
@@ -81,7 +80,7 @@ class Curve:
         self._heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
 
     def way_of_waypoint(self, index: int) -> float:
-        """How far it is from the start to a waypoint (m)."""
+        """Length of the way from the start to a waypoint (m)."""
         return float(np.interp(self._chords[index], self._u, self.way))
 
     def poses(self, way_m: FloatArray) -> FloatArray:
@@ -95,7 +94,7 @@ class Curve:
 
 
 def _reachable(speed: FloatArray, steps: FloatArray, acceleration: float) -> FloatArray:
-    """Lower speeds until none is gained or lost faster than allowed."""
+    """Reduce speeds until no acceleration is larger than allowed."""
     square = speed**2
     gain = 2.0 * acceleration * np.concatenate([[0.0], np.cumsum(steps)])
     # v_j^2 <= v_i^2 + 2 a |s_j - s_i| for all i: running minima from both sides.
@@ -105,7 +104,7 @@ def _reachable(speed: FloatArray, steps: FloatArray, acceleration: float) -> Flo
 
 
 def measured_path(poses: FloatArray, errors: WheelErrors, rng: np.random.Generator) -> FloatArray:
-    """What odometry says, beginning at 0, 0, 0. `poses` (N, 3); returns (N, 3)."""
+    """The path by odometry, beginning at 0, 0, 0. `poses` (N, 3); returns (N, 3)."""
     turn = np.diff(poses[:, 2])
     step = np.diff(poses[:, :2], axis=0)
     middle = poses[:-1, 2] + 0.5 * turn
@@ -139,13 +138,13 @@ class RobotClock:
     jump_s: float = 0.0
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
-        """What the clock shows at times of the ground truth's clock."""
+        """Readings of the clock at times of the ground truth's clock."""
         times = np.asarray(times_s, dtype=np.float64)
         shown = times + self.offset_s + self.drift * (times - self.reference_s)
         return np.asarray(shown + np.where(times >= self.jump_at_s, self.jump_s, 0.0))
 
     def ticks(self, from_s: float, to_s: float, period_s: float, phase: float) -> FloatArray:
-        """Times, on the ground truth's clock, of what the robot does in regular intervals."""
+        """Times, on the ground truth's clock, of regular intervals of the robot's clock."""
         period = period_s / (1.0 + self.drift)
         count = max(int(np.floor((to_s - from_s) / period - phase)) + 1, 0)
         return np.asarray(from_s + period * (phase + np.arange(count)))
@@ -159,16 +158,11 @@ def ptpd_lines(
     drifts = 1e9 * clock.drift + rng.normal(0.0, 300.0, len(times_s))
     lines = []
     for time, offset, drift in zip(times_s, offsets, drifts):
-        nanoseconds = round(abs(offset) * 1e9)
-        sign = "-" if offset < 0.0 else ""
-        seconds, rest = divmod(nanoseconds, 10**9)
+        nanoseconds = round(offset * 1e9)
+        seconds = int(nanoseconds / 1e9)
         lines.append(
-            f"{time:.6f} (ptpd debug) offset from master: {_signed(sign, seconds):>10}s "
-            f"{_signed(sign, rest):>11}ns"
+            f"{time:.6f} (ptpd debug) offset from master: {seconds:>10}s "
+            f"{nanoseconds - seconds * 10**9:>11}ns"
         )
         lines.append(f"{time:.6f} (ptpd debug) observed drift: {round(drift):>10}")
     return lines
-
-
-def _signed(sign: str, number: int) -> str:
-    return f"{sign if number else ''}{number}"

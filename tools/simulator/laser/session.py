@@ -1,4 +1,4 @@
-"""A simulated session before anything is measured: who is where when, and what is to go wrong."""
+"""Plan of a simulated session: all motion over time, and the faults, before any measurement."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _ROUND_S = 62.0
 
 @dataclass(frozen=True, eq=False)
 class SessionPlan:
-    """What is true of a session."""
+    """The truth of a session."""
 
     seed: int
     settings: LaserSettings
@@ -66,7 +66,7 @@ def random_for(seed: int, what: str) -> np.random.Generator:
 
 
 def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
-    """Lay a session out."""
+    """Plan a session."""
     settings.check()
     site = make_site(settings.furniture)
     route, visits, references = _drive(settings, seed, site)
@@ -117,7 +117,7 @@ def _robot(settings: LaserSettings) -> Robot:
 
 
 def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:
-    """One at each wall, not quite where it was meant to be."""
+    """One at each wall, slightly off its intended pose."""
     rng = random_for(seed, "scanners")
     scanners = []
     for i, (x, y, degrees) in enumerate(_FIXED):
@@ -155,7 +155,7 @@ def _drive(
         ways = np.linspace(enter[visit] + 1.0, leave[visit] - 1.0, count + 2)[1:-1]
         stops += [Stop(float(way), settings.stand_s) for way in ways]
     references = [stop.way_m for stop in stops]
-    # It waits at the western door for as long as it comes too early.
+    # If it comes too early, it waits at the western door.
     route = Route(waypoints, stops, settings.driving, EPOCH_S)
     visits = _visits(route)
     for (_, left), (entered, _), park in zip(visits, visits[1:], parks):
@@ -188,14 +188,14 @@ _RING = ((-_OUT, _Y - 0.4), (-_OUT, DOOR_Y_M), (-_OUT, 0.4), (-0.9, -1.3), (0.5,
 
 
 def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) -> FloatArray:
-    """Waypoints of a visit, between the doors: random, but not through what stands there."""
+    """Waypoints of a visit, between the doors: random, but clear of the furniture."""
     if settings.straight:
         return np.array([[x, DOOR_Y_M] for x in (3.0, 5.0, 7.0)])
     driving = settings.driving
     stop = settings.stand_s + driving.speed_m_s / driving.acceleration_m_s2
     standing = stop * settings.references / settings.visits
     longest = driving.speed_m_s * max(settings.visit_s - standing, 0.0)
-    # Now and then no long way is found; a shorter one is better than none.
+    # Sometimes no long way is found: then a shorter one is searched.
     for share in _SHARES_OF_TIME:
         if (points := _random_way(share * longest, rng, site)) is not None:
             return points
@@ -203,7 +203,7 @@ def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) 
 
 
 def _random_way(wanted: float, rng: np.random.Generator, site: Site) -> FloatArray | None:
-    """Waypoints of a way at least so long (m), or None if none is found in many tries."""
+    """Waypoints of a way of at least this length (m), or None if many tries find none."""
     before, after = np.array(_WEST_DOOR[-2:]), np.array(_EAST_DOOR[:2])
     points, failed, dead_ends = [*before], 0, 0
     for _ in range(_TRIES):

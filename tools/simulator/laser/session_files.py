@@ -23,7 +23,7 @@ from redetect.groundtruth.validation.reference_poses import (
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
-from redetect.storage import write_bytes
+from tools.simulator.files import write_lines
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
 from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
@@ -56,7 +56,7 @@ def exact_poses(plan: SessionPlan, times_s: FloatArray) -> PlanarPoses:
 
 
 def in_visits(plan: SessionPlan, times_s: FloatArray, margin_s: float) -> BoolArray:
-    """Which times lie within a visit or a margin round it."""
+    """Which times lie within a visit or a margin around it."""
     begin, end = np.array(plan.visits).T[:, :, None]
     within = (times_s >= begin - margin_s) & (times_s <= end + margin_s)
     return np.asarray(np.any(within, axis=0))
@@ -109,7 +109,7 @@ def camera_covariances(poses: FloatArray) -> FloatArray:
     covariances = np.zeros((len(poses), 3, 3))
     covariances[:, :2, :2] = np.linalg.inv(information)
     covariances[:, 2, 2] = np.deg2rad(0.6) ** 2
-    # What turns the robot in the image also moves it aside.
+    # Errors of the heading also shift the position sideways.
     middle = poses[:, :2] - 0.5 * np.array(ROOM_M)
     joint = np.column_stack([0.001 * middle[:, 1], -0.001 * middle[:, 0],
                              np.full(len(poses), np.deg2rad(0.4))])  # fmt: skip
@@ -177,7 +177,7 @@ def write_session(
     _write_tape(plan, folder, overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
     lines = ptpd_lines(plan.clock, reports, _PTPD_SIGMA_S, plan.random("ptpd"))
-    _write_lines(folder / "ptpd.log", lines, overwrite)
+    write_lines(folder / "ptpd.log", lines, overwrite=overwrite)
     _write_truth(plan, folder, overwrite)
     return plan
 
@@ -191,16 +191,13 @@ def _write_tape(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
         f"wall{i},{','.join(f'{x:.4f}' for x in drawn[i])},{length[i] + rng.normal(0.0, sigma):.4f}"
         for i in np.argsort(-length, kind="stable")[:_DIMENSIONS]
     ]
-    _write_lines(folder / "dimensions.csv", [DIMENSIONS_HEAD, *rows], overwrite)
+    write_lines(folder / "dimensions.csv", [DIMENSIONS_HEAD, *rows], overwrite=overwrite)
     rows = [
         f"{a},{b},{math.dist(FIDUCIALS[a], FIDUCIALS[b]) + rng.normal(0.0, sigma):.4f}"
         for a, b in combinations(FIDUCIALS, 2)
     ]
-    _write_lines(folder / "fiducial_distances.csv", [FIDUCIAL_DISTANCES_HEAD, *rows], overwrite)
-
-
-def _write_lines(path: Path, lines: list[str], overwrite: bool) -> None:
-    write_bytes(path, ("\n".join(lines) + "\n").encode(), overwrite=overwrite)
+    path = folder / "fiducial_distances.csv"
+    write_lines(path, [FIDUCIAL_DISTANCES_HEAD, *rows], overwrite=overwrite)
 
 
 def _drawn(plan: SessionPlan) -> FloatArray:
@@ -247,7 +244,7 @@ def _measured_by_hand(plan: SessionPlan) -> list[Scanner]:
 
 
 def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
-    """The scanner looking at the room before anybody comes."""
+    """Scans of the room before anybody enters."""
     settings, rng = plan.settings, plan.random(f"empty {scanner.name}")
     count = max(1, round(settings.empty_s * settings.rate_hz))
     ticks = float(rng.random()) + np.arange(count, dtype=np.float64)
@@ -329,7 +326,7 @@ def _clock_entry(plan: SessionPlan) -> dict[str, Any]:
 
 
 def _nearest_m(plan: SessionPlan, passer: Passer) -> float:
-    """How near somebody comes to the robot's origin."""
+    """Least distance of somebody from the robot's origin."""
     times = np.arange(passer.from_s, passer.to_s, 0.02)
     gaps = passer.places(times)[0] - plan.route.poses(times)[:, :2]
     return round(float(np.nanmin(np.linalg.norm(gaps, axis=1))), 3)

@@ -1,4 +1,4 @@
-"""What can be set about a simulated laser session; nothing heavy imported."""
+"""Settings of a simulated laser session."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FIXED_SCANNERS = 4
 
 @dataclass(frozen=True)
 class ReadingErrors:
-    """What goes wrong with readings."""
+    """Errors of readings."""
 
     sigma_m: float = 0.01  # Standard deviation (m).
     quantum_m: float = 0.01
@@ -27,7 +27,7 @@ class ReadingErrors:
 
 @dataclass(frozen=True)
 class WheelErrors:
-    """How wrong odometry is."""
+    """Errors of odometry."""
 
     scale: float = 1.008  # Measured way per way.
     turn_scale: float = 1.01  # Measured turn per turn.
@@ -41,7 +41,7 @@ class WheelErrors:
 
 @dataclass(frozen=True)
 class DrivingLimits:
-    """How fast the robot drives: m/s, rad/s, m/s^2."""
+    """Limits of the robot's motion: m/s, rad/s, m/s^2."""
 
     speed_m_s: float = 0.8
     turn_rad_s: float = 0.8
@@ -50,7 +50,7 @@ class DrivingLimits:
 
 @dataclass(frozen=True)
 class Faults:
-    """What is made to go wrong on purpose; times count from the robot's first entering the room."""
+    """Deliberate faults; times count from when the robot first enters the room."""
 
     wrong_scanner: str = ""
     """This fixed scanner's pose measured by hand is wrong, far beyond its sigma."""
@@ -68,7 +68,7 @@ class Faults:
 
 @dataclass(frozen=True)
 class LaserSettings:
-    """Everything about a session but its seed."""
+    """All settings of a session except its seed."""
 
     visits: int = 3  # Visits to the covered room.
     visit_s: float = 60.0  # About how long each of them lasts.
@@ -105,7 +105,7 @@ class LaserSettings:
     faults: Faults = field(default_factory=Faults)
 
     def check(self) -> None:
-        """Refuse what cannot be."""
+        """Raise a GroundTruthError if a setting is out of its range."""
         demand(
             self, GroundTruthError, visits=ABOVE_0, visit_s=ABOVE_0, rate_hz=ABOVE_0,
             onboard_hz=ABOVE_0, odometry_hz=ABOVE_0, camera_hz=ABOVE_0, truth_hz=ABOVE_0,

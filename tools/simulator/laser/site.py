@@ -1,7 +1,7 @@
 """The place of the laser sessions, and passers-by: a covered room within a ring of corridors.
 
 World frame: x east, y north, the covered room spans x and y from 0. The robot enters it through the
-western door and leaves through the eastern one, and drives round it in the corridors.
+western door and leaves through the eastern one, and drives around it in the corridors.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ FIDUCIALS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """Walls, and what stands there without being in the map."""
+    """Walls, and furniture that is not in the map."""
 
     walls: FloatArray  # (S, 4) What the building map shows: x1, y1, x2, y2 (m).
     furniture: FloatArray  # (F, 4) What the scanners see as well.
 
     @property
     def solid(self) -> FloatArray:
-        """(S + F, 4) all that stands still."""
+        """(S + F, 4) everything at rest."""
         return np.vstack([self.walls, self.furniture])
 
 

@@ -14,6 +14,7 @@ from redetect.groundtruth.lasers.building import HEAD
 from redetect.groundtruth.lasers.scanners import Robot, Scans, scanner_entry
 from redetect.groundtruth.validation.reference_poses import DISTANCES_HEAD, Distance, Survey
 from redetect.storage import write_whole
+from tools.simulator.files import write_lines
 
 
 def write_scans(path: Path, scans: Scans, *, overwrite: bool = False) -> None:
@@ -39,23 +40,20 @@ def write_robot(
 
 def write_building(path: Path, walls: FloatArray, *, overwrite: bool = False) -> None:
     """Write walls (S, 4) as a ``building.csv``, in micrometres."""
-    rows = (",".join(f"{x:.6f}" for x in wall) + "\n" for wall in walls)
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write((HEAD + "\n" + "".join(rows)).encode())
+    rows = (",".join(f"{x:.6f}" for x in wall) for wall in walls)
+    write_lines(path, [HEAD, *rows], overwrite=overwrite)
 
 
 def write_drawing(path: Path, walls: FloatArray, *, overwrite: bool = False) -> None:
     """Write walls (S, 4) as lines on the layer WALLS of a drawing in metres (DXF R12)."""
-    lines = ["0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n9\n$INSUNITS\n70\n6\n0\nENDSEC\n"]
-    lines.append("0\nSECTION\n2\nENTITIES\n")
-    for x1, y1, x2, y2 in walls:
-        lines.append(
-            f"0\nLINE\n8\nWALLS\n10\n{x1:.6f}\n20\n{y1:.6f}\n30\n0.0\n"
-            f"11\n{x2:.6f}\n21\n{y2:.6f}\n31\n0.0\n"
-        )
-    lines.append("0\nENDSEC\n0\nEOF\n")
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write("".join(lines).encode())
+    head = "0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n9\n$INSUNITS\n70\n6\n0\nENDSEC"
+    rows = (
+        f"0\nLINE\n8\nWALLS\n10\n{x1:.6f}\n20\n{y1:.6f}\n30\n0.0\n"
+        f"11\n{x2:.6f}\n21\n{y2:.6f}\n31\n0.0"
+        for x1, y1, x2, y2 in walls
+    )
+    entities = ["0\nSECTION\n2\nENTITIES", *rows, "0\nENDSEC\n0\nEOF"]
+    write_lines(path, [head, *entities], overwrite=overwrite)
 
 
 def write_survey(
@@ -75,5 +73,4 @@ def write_survey(
 def write_distances(path: Path, distances: list[Distance], *, overwrite: bool = False) -> None:
     """Write a ``distances.csv``, in tenths of a millimetre."""
     rows = [f"{d.pose},{d.time_s:.6f},{d.point},{d.fiducial},{d.distance_m:.4f}" for d in distances]
-    with write_whole(path, overwrite=overwrite) as stream:
-        stream.write(("\n".join([DISTANCES_HEAD, *rows]) + "\n").encode())
+    write_lines(path, [DISTANCES_HEAD, *rows], overwrite=overwrite)

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from camera.boards.board import Board
-from redetect.array_types import ByteArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.session import pose_entries
 from redetect.groundtruth.trajectories.transforms import apply, inverse
 from tools.simulator.driving import planar_transform
-from tools.simulator.markers.rendering import grey_image, render_light
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (
     NOTE,
@@ -160,16 +159,6 @@ def _seen(
     return BoardView(camera, board, placement, pose, model.project(apply(to_camera, kind.points)))
 
 
-def _render(plan: SessionPlan, view: BoardView, boards: list[Surface], noise: int) -> ByteArray:
-    settings, model = plan.settings, plan.network.cameras[view.camera]
-    imaging = settings.imaging
-    seen = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
-    background = plan.background(view.camera)
-    light = render_light(model, [seen], background, fine=imaging.fine, samples=settings.samples)
-    rng = random_for(settings.seed, "frame", view.camera, noise)
-    return grey_image(light, plan.illumination(view.camera), imaging, rng)
-
-
 def write_calibration_set(
     plan: SessionPlan, folder: Path, writer: SessionWriter | None = None
 ) -> int:
@@ -237,7 +226,9 @@ def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter
         name = plan.network.names[view.camera]
         place = view.placement if view.placement >= 0 else after
         prefix = f"network.{place:04d}"
-        grey = _render(plan, view, boards, 2_000_000 + number)
+        in_view = [lit(b).moved(plan.camera_from_world[view.camera]) for b in boards]
+        background = plan.background(view.camera)
+        grey = plan.image(view.camera, [in_view], background, 2_000_000 + number)
         image = writer.image(folder, name, prefix, grey)
         seen.append(SeenFrame(name, prefix, _NETWORK_S + _PAUSE_S * place, ()))
         rows.append({"camera": name, "image": image, "placement": place, "board": view.board})

@@ -1,4 +1,4 @@
-"""Numba kernels of the marker renderer: where edges run, and the light of every pixel.
+"""Numba kernels of the marker renderer: pixels on edges, and the light of every pixel.
 
 A surface is a rectangle of R x C texels. Its row of `from_texel` (3x3) takes (column, row, 1), in
 texels from the upper left *corner* of the texture, to a point in the camera frame; the inverse
@@ -74,7 +74,7 @@ def _mark_segment(
         u1, v1 = _texel_point(numbers, from_texel, a0 + t * (a1 - a0), b0 + t * (b1 - b0))
         known0, known1 = not math.isnan(u0), not math.isnan(u1)
         if not (known0 and known1):
-            # Part of it is behind the camera: nothing is known of where the surface ends.
+            # Part of it is behind the camera: the outline in the image is unknown.
             box[0], box[1], box[2], box[3] = 0, 0, width - 1, height - 1
         if known0 and known1 and max(abs(u0), abs(v0), abs(u1), abs(v1)) < 1e5:
             # On the grid of half pixels the first one's centre is at -0.25.
@@ -255,7 +255,7 @@ def shade(
             if count == 0:
                 continue
             for row in range(top, bottom):
-                # Between two edges nothing changes, so that one ray is enough.
+                # Between two edges nothing changes: one ray is enough.
                 known = False
                 found, value = -1, 0.0
                 for column in range(left, right):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from camera import Camera
@@ -33,8 +34,7 @@ def pixel_rays(camera: Camera) -> FloatArray:
     pixels = np.stack([u, v], axis=-1)
     rays = np.empty((camera.height, camera.width, 6))
     rays[..., :2] = camera.undistort(pixels)
-    for axis in range(2):
-        step = np.array([0.5, 0.0]) if axis == 0 else np.array([0.0, 0.5])
+    for axis, step in enumerate(0.5 * np.eye(2)):
         change = camera.undistort(pixels + step) - camera.undistort(pixels - step)
         rays[..., 2 + axis], rays[..., 4 + axis] = change[..., 0], change[..., 1]
     rays.setflags(write=False)
@@ -138,8 +138,6 @@ def _reduced(texture: Texture, pixels: float) -> Texture:
     factor = max(texture.values.shape) / max(_TEXELS_PER_PIXEL * pixels, 1.0)
     if factor <= 1.0:
         return texture
-    import cv2
-
     rows, columns = texture.values.shape
     size = max(1, round(columns / factor)), max(1, round(rows / factor))
     values = cv2.resize(texture.values, size, interpolation=cv2.INTER_AREA)
@@ -183,8 +181,6 @@ def exact_grey(
     light: Float32Array, illumination: Float32Array | float, imaging: Imaging
 ) -> Float32Array:
     """(H, W) float32 grey values before noise and rounding; parameters as in `grey_image`."""
-    import cv2
-
     sigma = imaging.blur_px
     pixels = light
     if imaging.fine:
@@ -202,8 +198,6 @@ def exact_grey(
 
 
 def _blurred(image: Float32Array, sigma: float) -> Float32Array:
-    import cv2
-
     reach = int(np.ceil(4.5 * sigma))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     kernel /= kernel.sum()
@@ -218,8 +212,6 @@ def uneven_light(
     """Light that falls off over the image, with soft shadows and vignetting.
     Returns (height, width).
     """
-    import cv2
-
     rows, columns = -(-height // _COARSE), -(-width // _COARSE)
     y, x = np.mgrid[-1.0 : 1.0 : rows * 1j, -1.0 : 1.0 : columns * 1j].astype(np.float32)
     direction = rng.uniform(0.0, 2.0 * np.pi)

@@ -86,8 +86,7 @@ def robot_surfaces(rig: Rig, rng: np.random.Generator) -> list[Surface]:
         marker_surface(known, marker, float(width), pose, _QUIET_CELLS)
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
     ]
-    lifted = planar_transform(0.0, 0.0, 0.0)
-    lifted[2, 3] = _GROUND_M
+    lifted = transform(np.eye(3), [0.0, 0.0, _GROUND_M])
     paint = {side: _panel(rng) for side in ("front", "rear", "left", "right")}
     body = box_sides(_BODY_M, {**paint, "top": plain(0.3)}, lifted)
     wheels = [

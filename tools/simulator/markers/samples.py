@@ -1,14 +1,15 @@
-"""Random frames for statistics of detection: markers and what might be taken for one."""
+"""Random frames for statistics of detection: markers and things that resemble them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from camera import Camera, format_camera, write_camera
 from camera.uncertainty import IDENTITY
@@ -45,13 +46,7 @@ from tools.simulator.markers.things import (
     shapes_background,
     thing,
 )
-from tools.simulator.markers.truth import (
-    MarkerTruth,
-    marker_corners,
-    mean_side_px,
-    slant_deg,
-    visible_shares,
-)
+from tools.simulator.markers.truth import MarkerTruth, marker_corners, marker_truth, mean_side_px
 from tools.simulator.parallel import in_order
 
 _TRIES = 12
@@ -152,8 +147,8 @@ _MOST_EXPOSURES = 8
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """What random frames are to be like. Ranges of widths, blurs and contrasts are filled evenly
-    in their logarithms, the others evenly.
+    """Settings of random frames. Widths, blurs and contrasts are uniform in their logarithms, all
+    others are uniform.
     """
 
     dictionaries: tuple[str, ...] = ("rawseeds",)
@@ -186,7 +181,7 @@ class SampleSettings:
 
 @dataclass(frozen=True, eq=False)
 class SampleFrame:
-    """A random frame and what is true of it."""
+    """A random frame and its truth."""
 
     seed: int
     index: int
@@ -199,7 +194,7 @@ class SampleFrame:
     motion_px: float
 
     def as_json(self) -> dict[str, Any]:
-        """All but the image, in plain numbers."""
+        """Everything except the image, as JSON."""
         return {
             "seed": self.seed,
             "index": self.index,
@@ -252,9 +247,7 @@ def sample_frame(settings: SampleSettings, seed: int, index: int) -> SampleFrame
     light = render_light(camera, exposures, background, fine=imaging.fine, samples=settings.samples)
     image = grey_image(light, illumination, imaging, rng)
     arrays = surface_arrays(camera, scene.surfaces)
-    markers = tuple(
-        _truth(scene, card, arrays, illumination, imaging.gain, name) for card in scene.cards
-    )
+    markers = tuple(_truth(scene, card, arrays, illumination, imaging.gain) for card in scene.cards)
     return SampleFrame(
         seed, index, image, camera, name, markers, tuple(scene.things), imaging, motion_px
     )
@@ -351,8 +344,6 @@ def _motion(
     settings: SampleSettings, camera: Camera, cards: list[tuple[int, int]], rng: np.random.Generator
 ) -> tuple[list[FloatArray], float]:
     """How far everything has turned about the camera at each instant of the exposure."""
-    from scipy.spatial.transform import Rotation
-
     moving = rng.random() < settings.motion
     length = float(rng.uniform(*settings.motion_px))
     direction = rng.uniform(0.0, 2.0 * np.pi)
@@ -379,25 +370,15 @@ def _occluder(rng: np.random.Generator, card: Surface) -> Surface:
 
 
 def _truth(
-    scene: _Scene,
-    card: tuple[int, int],
-    arrays: SurfaceArrays,
-    illumination: Any,
-    gain: float,
-    dictionary: str,
+    scene: _Scene, card: tuple[int, int], arrays: SurfaceArrays, illumination: Any, gain: float
 ) -> MarkerTruth:
     which, marker_id = card
-    pose = scene.surfaces[which].pose
-    camera = scene.camera
-    visible, rim = visible_shares(camera, scene.surfaces, which, _MARKER_M, arrays)
-    corners = marker_corners(camera, pose, _MARKER_M)
-    middle = np.rint(camera.project(pose[:3, 3])).astype(int)
+    camera, known = scene.camera, (scene.dictionary.name, marker_id, _MARKER_M)
+    truth = marker_truth(camera, scene.surfaces, which, known, arrays)
+    middle = np.rint(camera.project(truth.camera_from_marker[:3, 3])).astype(int)
     u, v = np.clip(middle, 0, [camera.width - 1, camera.height - 1])
     light = float(illumination[v, u]) if np.ndim(illumination) == 2 else 1.0
-    return MarkerTruth(
-        dictionary, marker_id, corners, pose, _MARKER_M, mean_side_px(corners), slant_deg(pose),
-        gain * light * (WHITE - BLACK), visible, rim,
-    )  # fmt: skip
+    return replace(truth, contrast_grey=gain * light * (WHITE - BLACK))
 
 
 def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
@@ -430,8 +411,4 @@ def sample_frames(
     settings: SampleSettings, seed: int, indices: Sequence[int], jobs: int = 1
 ) -> Iterator[SampleFrame]:
     """Frames of a seed in order, rendered by one or more processes; the same either way."""
-    return in_order(_sample, (settings, seed), indices, jobs)
-
-
-def _sample(state: tuple[SampleSettings, int], index: int) -> SampleFrame:
-    return sample_frame(*state, index)
+    return in_order(partial(sample_frame, settings, seed), indices, jobs)

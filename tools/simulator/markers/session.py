@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +18,7 @@ from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_
 from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse
 from redetect.storage import write_bytes
 from tools.simulator.driving import planar_transform
-from tools.simulator.files import encoded, rounded, write_truth
+from tools.simulator.files import encoded, rounded, write_lines, write_truth
 from tools.simulator.markers.rendering import (
     Imaging,
     grey_image,
@@ -37,19 +37,13 @@ from tools.simulator.markers.room import (
     room_surfaces,
 )
 from tools.simulator.markers.surface import BLACK, WHITE, Surface
-from tools.simulator.markers.truth import (
-    MarkerTruth,
-    marker_corners,
-    mean_side_px,
-    slant_deg,
-    visible_shares,
-)
+from tools.simulator.markers.truth import MarkerTruth, marker_truth
 from tools.simulator.parallel import in_order
 
 
 @dataclass(frozen=True)
 class CalibrationErrors:
-    """Standard deviations of the errors in what a session's files say of cameras and robot."""
+    """Standard deviations of the errors of cameras and robot in a session's files."""
 
     network_m: float = 0.0  # Of each camera's place along each axis (m).
     network_deg: float = 0.0  # Of each camera's rotation about each axis (degrees).
@@ -107,7 +101,7 @@ _SHADOW = 0.45
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What a session is to be like."""
+    """Settings of a session."""
 
     name: str = "session"  # Its name; those of the images begin with it.
     seed: int = 1  # Everything about it follows from this.
@@ -143,7 +137,7 @@ def random_for(seed: int, purpose: Purpose, *which: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class SessionPlan:
-    """A session that needs only be rendered, everything exactly true."""
+    """A session that only has to be rendered, without errors."""
 
     settings: SessionSettings
     rig: Rig  # The robot's markers.
@@ -167,7 +161,7 @@ class SessionPlan:
         return f"{self.settings.name}.{frame:04d}"
 
     def background(self, camera: int) -> Float32Array:
-        """(H, W) float32 what a camera sees of the room without robot; worked out once."""
+        """(H, W) float32 view of the room without robot; rendered once per camera."""
         if camera not in self._backgrounds:
             model = self.network.cameras[camera]
             seen = [lit(s).moved(self.camera_from_world[camera]) for s in self.room]
@@ -180,6 +174,16 @@ class SessionPlan:
         model = self.network.cameras[camera]
         rng = random_for(self.settings.seed, "light", camera)
         return uneven_light(rng, model.width, model.height, 0.6, 0)
+
+    def image(
+        self, camera: int, exposures: list[list[Surface]], background: Float32Array, noise: int
+    ) -> ByteArray:
+        """(H, W) image that a camera takes of surfaces in its frame; `noise` seeds the noise."""
+        settings, model = self.settings, self.network.cameras[camera]
+        imaging, samples = settings.imaging, settings.samples
+        light = render_light(model, exposures, background, fine=imaging.fine, samples=samples)
+        rng = random_for(settings.seed, "frame", camera, noise)
+        return grey_image(light, self.illumination(camera), imaging, rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,17 +259,12 @@ def view_robot(
     plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray, noise: int
 ) -> View:
     """What a camera sees of the robot. `pose`, `speed` (3,)."""
-    settings, model = plan.settings, plan.network.cameras[camera]
     camera_from_world = plan.camera_from_world[camera]
     exposures = [
-        _surfaces(plan, camera_from_world, pose + offset * settings.exposure_s * speed)
+        _surfaces(plan, camera_from_world, pose + offset * plan.settings.exposure_s * speed)
         for offset in _instants(plan, camera, pose, speed)
     ]
-    imaging = settings.imaging
-    background = _shadowed(plan, camera, pose)
-    light = render_light(model, exposures, background, fine=imaging.fine, samples=settings.samples)
-    rng = random_for(settings.seed, "frame", camera, noise)
-    image = grey_image(light, plan.illumination(camera), imaging, rng)
+    image = plan.image(camera, exposures, _shadowed(plan, camera, pose), noise)
     return View(image, seen_markers(plan, camera, pose))
 
 
@@ -277,7 +276,7 @@ def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray
 
 
 def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray) -> FloatArray:
-    """When the robot is looked at, in shares of the exposure from its middle: every pixel."""
+    """Instants of an exposure, as shares from its middle: one for each pixel of motion."""
     points = plan.rig.robot_from_marker[:, :3, 3]
     ends = []
     for offset in (-0.5, 0.5):
@@ -323,23 +322,15 @@ def seen_markers(plan: SessionPlan, camera: int, pose: FloatArray) -> tuple[Mark
     result = []
     arrays = surface_arrays(model, surfaces)
     for which, (marker, width) in enumerate(zip(plan.rig.ids, plan.rig.widths_m)):
-        card = surfaces[which]
-        visible, rim = visible_shares(model, surfaces, which, float(width), arrays)
-        corners = marker_corners(model, card.pose, float(width))
-        if visible == 0.0 or np.isnan(corners).any():
+        known = plan.rig.dictionary, int(marker), float(width)
+        truth = marker_truth(model, surfaces, which, known, arrays)
+        if truth.visible == 0.0 or np.isnan(truth.corners).any():
             continue
-        u, v = np.clip(
-            np.rint(corners.mean(axis=0)).astype(int), 0, [model.width - 1, model.height - 1]
-        )
-        lightest = float(np.nanmax(card.texture.values)) / WHITE
+        middle = np.rint(truth.corners.mean(axis=0)).astype(int)
+        u, v = np.clip(middle, 0, [model.width - 1, model.height - 1])
+        lightest = float(np.nanmax(surfaces[which].texture.values)) / WHITE
         light = plan.settings.imaging.gain * float(illumination[v, u])
-        contrast = light * (WHITE - BLACK) * lightest
-        result.append(
-            MarkerTruth(
-                plan.rig.dictionary, int(marker), corners, card.pose, float(width),
-                mean_side_px(corners), slant_deg(card.pose), contrast, visible, rim,
-            )
-        )  # fmt: skip
+        result.append(replace(truth, contrast_grey=light * (WHITE - BLACK) * lightest))
     return tuple(result)
 
 
@@ -407,8 +398,7 @@ class SessionWriter:
         for name in plan.network.names:
             own = sorted((s for s in seen if s.camera == name), key=lambda s: s.time_s)
             rows = [f"# {NOTE}", "# image seconds", *(f"{s.prefix} {s.time_s:.6f}" for s in own)]
-            text = "\n".join([*rows, ""]).encode()
-            write_bytes(folder / name / f"{name}.times", text, overwrite=self.overwrite)
+            write_lines(folder / name / f"{name}.times", rows, overwrite=self.overwrite)
 
     def poses(self, path: Path, times_s: FloatArray, poses: FloatArray) -> None:
         """Write rows t, x, y, theta as RAWSEEDS' streams have them."""
@@ -418,7 +408,7 @@ class SessionWriter:
         self, path: Path, plan: SessionPlan, seen: Sequence[SeenFrame],
         extra: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
-        """Write all that is known: true calibrations, and markers image by image."""
+        """Write the truth: true calibrations, and markers image by image."""
         network, rig = plan.network, plan.rig
         head: dict[str, Any] = {
             "note": NOTE,
@@ -455,7 +445,7 @@ def write_session(
     writer.calibrations(plan, folder)
     work = [(c, f) for c in range(len(names)) for f in range(len(plan.times_s))]
     seen: list[SeenFrame] = []
-    for (camera, frame), view in zip(work, in_order(_view, plan, work, jobs)):
+    for (camera, frame), view in zip(work, in_order(partial(_view, plan), work, jobs)):
         prefix = plan.prefix(frame)
         writer.image(folder, names[camera], prefix, view.image)
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))

@@ -1,4 +1,4 @@
-"""Textured rectangles in space, of which scenes with markers consist, and what is printed on them.
+"""Textured rectangles in space, of which scenes with markers consist, and their textures.
 
 Frame of a surface, as of a marker: origin at its centre, x right, y up, z out of the printed face
 towards a viewer; metres.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -118,11 +119,11 @@ def box_against(origin: ArrayLike) -> FloatArray:
 #: Reflectance of printer's black and of paper.
 BLACK, WHITE = 0.05, 0.88
 
-#: What differs in fewer cells from a marker could rightly be taken for it.
+#: A pattern that differs from a marker in fewer cells could rightly be identified as it.
 LEAST_DIFFERENCE = 3
 _TRIES = 64
 
-# Points along a cell by which a texture is looked at, and again for what is between them.
+# Units per cell in which a texture is compared, and samples per unit.
 _FINE = 4
 
 
@@ -175,8 +176,6 @@ def pattern_distance(dictionary: MarkerDictionary, pattern: BoolArray) -> int:
 
 def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
     """In how many cells a dark thing on a light ground differs from the nearest marker."""
-    import cv2
-
     dark = texture.values < 0.5 * (BLACK + WHITE)
     if texture.smooth or not dark.any():
         return float("inf")

@@ -1,4 +1,4 @@
-"""Things that are no markers but look as if they might be, and backgrounds."""
+"""Things that resemble markers, and backgrounds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from detect.markers.dictionaries import MarkerDictionary
@@ -54,8 +55,6 @@ def window(rng: np.random.Generator) -> Texture:
 
 def text(rng: np.random.Generator) -> Texture:
     """Lines of letters."""
-    import cv2
-
     height, width = 160, int(rng.integers(160, 320))
     dark_on_light = rng.random() < 0.75
     page, ink = (225, 20) if dark_on_light else (20, 215)
@@ -75,17 +74,11 @@ def text(rng: np.random.Generator) -> Texture:
 
 def poster(rng: np.random.Generator) -> Texture:
     """A picture, a heading and columns of small print."""
-    import cv2
-
     height, width = 256, 192
     page = int(rng.integers(120, 245))
     image = np.full((height, width), page, dtype=np.uint8)
-    left, right, top, bottom = (
-        10,
-        width - 10,
-        int(rng.integers(34, 60)),
-        int(rng.integers(120, 190)),
-    )
+    left, right = 10, width - 10
+    top, bottom = int(rng.integers(34, 60)), int(rng.integers(120, 190))
     picture = blotches(rng, (bottom - top, right - left), octaves=3)
     image[top:bottom, left:right] = np.clip(255 * picture, 0, 255).astype(np.uint8)
     for _ in range(int(rng.integers(1, 6))):
@@ -177,7 +170,7 @@ THINGS: tuple[Callable[[np.random.Generator], Texture], ...] = (
 
 
 def thing(rng: np.random.Generator, dictionary: MarkerDictionary) -> tuple[str, Texture]:
-    """One of `THINGS` that is no marker of a dictionary even by chance: its name and texture."""
+    """A random one of `THINGS` that does not happen to be a marker: its name and texture."""
     for _ in range(_TRIES):
         kind = THINGS[rng.integers(len(THINGS))]
         texture = kind(rng)
@@ -188,8 +181,6 @@ def thing(rng: np.random.Generator, dictionary: MarkerDictionary) -> tuple[str, 
 
 def blotches(rng: np.random.Generator, shape: tuple[int, int], octaves: int = 4) -> Float32Array:
     """Smooth noise of several scales, some 0 to 1. `shape` (rows, columns)."""
-    import cv2
-
     rows, columns = shape
     result = np.full(shape, 0.5, dtype=np.float32)
     strength = 0.25
@@ -215,8 +206,6 @@ def shapes_background(rng: np.random.Generator, width: int, height: int) -> Floa
     """Noise with polygons, discs, bars and a grid or two on it, as a messy room has them.
     Returns (height, width).
     """
-    import cv2
-
     base = 0.15 + 0.6 * rng.random() + 0.35 * (blotches(rng, (height // 4, width // 4)) - 0.5)
     image = np.clip(255.0 * base, 8, 250).astype(np.uint8)
     image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR))
@@ -258,8 +247,6 @@ def shapes_background(rng: np.random.Generator, width: int, height: int) -> Floa
 
 
 def _fill(image: ByteArray, corners: FloatArray, shade: int) -> None:
-    import cv2
-
     points = np.rint(16.0 * corners).astype(np.int32)
     cv2.fillConvexPoly(image, cv2.convexHull(points), shade, cv2.LINE_AA, shift=4)
 
@@ -276,8 +263,6 @@ def photograph_background(
     rng: np.random.Generator, width: int, height: int, files: tuple[Path, ...]
 ) -> Float32Array:
     """A part of a photograph, enlarged or reduced; parameters as in `shapes_background`."""
-    import cv2
-
     photograph = photograph_of(files[rng.integers(len(files))])
     rows, columns = photograph.shape
     scale = rng.uniform(0.4, 1.0) * min(columns / width, rows / height)
@@ -293,8 +278,6 @@ def photograph_background(
 @lru_cache(maxsize=_CACHED_PHOTOGRAPHS)
 def photograph_of(path: Path) -> ByteArray:
     """Grey values of a photograph, (H, W)."""
-    import cv2
-
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise ValueError(f"{path}: cannot be decoded: expected an image")

@@ -1,6 +1,6 @@
-"""What is true of the markers in an image: where their corners are, and how much of them is seen.
+"""Truth of the markers in an image: their corners, and the shares of them that are visible.
 
-Corners are projected through the calibration; nothing here looks at the rendered image.
+Corners are projected through the calibration; the rendered image is not used.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import FloatArray
+from tools.simulator.files import rounded
 from tools.simulator.markers.kernels import SurfaceArrays, count_visible
 from tools.simulator.markers.surface import Surface, square_corners
 
-# Of the grid of points by which it is told how much of a marker is seen.
+# Points along a side of the grid that determines how much of a marker is visible.
 _POINTS = 24
 #: Width of the white rim that must be seen for the marker's outline to be clear, in its widths.
 RIM = 0.06
@@ -44,15 +45,13 @@ class MarkerTruth:
         return self.visible == 1.0 and self.rim_visible == 1.0
 
     def as_json(self) -> dict[str, Any]:
-        """The same in plain numbers."""
+        """All of it as JSON."""
         return {
             "dictionary": self.dictionary,
             "id": self.id,
-            "corners": [[round(float(x), 5) for x in corner] for corner in self.corners],
+            "corners": [rounded(corner, 5) for corner in self.corners],
             "width_m": self.width_m,
-            "camera_from_marker": [
-                [round(float(x), 9) for x in row] for row in self.camera_from_marker[:3]
-            ],
+            "camera_from_marker": [rounded(row, 9) for row in self.camera_from_marker[:3]],
             "width_px": round(self.width_px, 3),
             "slant_deg": round(self.slant_deg, 3),
             "contrast_grey": round(self.contrast_grey, 2),
@@ -108,3 +107,19 @@ def visible_shares(
         x, y = np.ascontiguousarray((seen[:, :2] / seen[:, 2:]).T)
         shares.append(count_visible(x, y, int(number[0]), arrays) / len(points))
     return shares[0], shares[1]
+
+
+def marker_truth(
+    camera: Camera, surfaces: Sequence[Surface], which: int, marker: tuple[str, int, float],
+    arrays: SurfaceArrays,
+) -> MarkerTruth:  # fmt: skip
+    """The truth of a marker (dictionary, number, width), but for its contrast, which is 0.
+
+    The other parameters are those of `visible_shares`.
+    """
+    pose, width_m = surfaces[which].pose, marker[2]
+    corners = marker_corners(camera, pose, width_m)
+    return MarkerTruth(
+        *marker[:2], corners, pose, width_m, mean_side_px(corners), slant_deg(pose), 0.0,
+        *visible_shares(camera, surfaces, which, width_m, arrays),
+    )  # fmt: skip
