@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -85,6 +86,18 @@ def test_every_command_line_is_accepted(
         if not accepts(list(command)):
             refused.append(f"{place}: {' '.join(command)}\n{capsys.readouterr()[1]}")
     assert not refused, "\n".join(refused)
+
+
+def test_commands_within_sentences_exist(project_root: Path) -> None:
+    commands = {name: import_module(module).PROGRAM.commands for name, module in PROGRAMS.items()}
+    named = re.compile(rf"`(?:redetect )?({'|'.join(PROGRAMS)}) ([a-z][a-z-]*)[ `]")
+    shown = [
+        (document.name, *words)
+        for document in documents(project_root)
+        for words in named.findall(document.read_text("utf-8"))
+    ]
+    assert len(shown) > 200
+    assert [one for one in shown if one[2] not in commands[one[1]]] == []
 
 
 def test_a_wrong_command_line_is_noticed(accepts: Callable[[list[str]], bool]) -> None:
