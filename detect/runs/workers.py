@@ -271,18 +271,16 @@ class _InProcess(Executor):
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # If no process can be started, this one compiles all kernels.
         with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
-            one, *others = [
-                started.enter_context(_ProcessPool(1, plan, show=False))
-                for plan in (discs, lines, discs)[: _cores()]
+            path, later = [
+                started.enter_context(_ProcessPool(1, self._plan, show=False)) for _ in range(2)
             ]
-            # Discs take longer than lines, so other processes compile their later stages.
+            # The stages after the judgement of discs take nearly as long to compile as all others.
             done: list[Future[Any]] = [
-                one.submit(work_on_chunk, discs, self._chunk),
-                others[0].submit(work_on_chunk, lines, self._chunk),
-                others[0].submit(level_none, discs, self._chunk),
+                path.submit(work_on_chunk, lines, self._chunk),
+                path.submit(work_on_chunk, discs, self._chunk),
+                later.submit(place_none, discs, self._chunk),
+                later.submit(level_none, discs, self._chunk),
             ]
-            for more in others[1:]:
-                more.submit(place_none, discs, self._chunk)
             # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:
                 raise_if_interrupt_waits()
