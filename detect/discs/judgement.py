@@ -197,13 +197,9 @@ def _glances(
     count = 0
     for i in range(n):
         x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
-        seen, size = glance(image, camera_numbers, x, y, nominal)
-        contrast[i] = _contrast(seen, candidates.sign[i], least_step)
+        grey[count], scale[count] = glance(image, camera_numbers, x, y, nominal)
+        contrast[i] = _contrast(grey[count], candidates.sign[i], least_step)
         if contrast[i] != 0.0:
-            for k in range(GLANCED):
-                scale[count, k] = size[k]
-                for m in range(len(GLANCED_AT)):
-                    grey[count, k, m] = seen[k, m]
             chosen[count], sign[count], score[count, 0] = i, candidates.sign[i], candidates.score[i]
             count += 1
         if count == _AT_ONCE or i == n - 1:
