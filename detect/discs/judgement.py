@@ -48,8 +48,6 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.3
-#: Candidates whose glances go through the network at once: their arrays fit the first-level cache.
-_AT_ONCE = 16
 #: Threshold of the log-odds of a glance.
 _LEAST_GLANCE = 0.0
 #: Least share of the rim that has to be on a circle.
@@ -133,19 +131,19 @@ def judge(
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
-    contrast, glanced = _glances(
-        image, candidates, nominal, least_step, camera_numbers, networks.glance
-    )
     for i in range(n):
-        if contrast[i] == 0.0:
+        x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
+        grey, scale = glance(image, camera_numbers, x, y, nominal)
+        contrast = _contrast(grey, sign, least_step)
+        if contrast == 0.0:
             continue
-        fate[i], value[i] = _GLANCED, glanced[i]
+        inputs, scales = network_inputs(grey, scale, sign)
+        score = candidates.score[i : i + 1]
+        fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
-        x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
-        score = candidates.score[i]
         seen = profiles(image, camera_numbers, x, y, nominal)
-        rim = follow_rim(image, camera_numbers, seen, sign * contrast[i])
+        rim = follow_rim(image, camera_numbers, seen, sign * contrast)
         fate[i], value[i] = _NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
@@ -153,13 +151,13 @@ def judge(
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, noted = _look(seen, rim, score, sign, networks.look)
+        odds, noted = _look(seen, rim, score[0], sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, seen, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 seen_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, noted_again = _look(seen_again, again, score, sign, networks.look)
+                more, noted_again = _look(seen_again, again, score[0], sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
@@ -177,38 +175,6 @@ def judge(
         fate, value, candidates.sign, features, agreeing, radius, place, seen_from, doubt, step,
         floor_grey, quality, log_odds,
     )  # fmt: skip
-
-
-@kernel()
-def _glances(
-    image: GreyImage,
-    candidates: HoughCandidates,
-    nominal: float,
-    least_step: float,
-    camera_numbers: FloatArray,
-    network: RimNetwork,
-) -> tuple[FloatArray, FloatArray]:
-    """Contrast of each candidate, 0 if too low; and for the others, the log-odds at a glance."""
-    n = len(candidates.score)
-    contrast, odds = np.zeros(n), np.zeros(n)
-    grey = np.zeros((_AT_ONCE, GLANCED, len(GLANCED_AT)))
-    scale, sign, score = np.ones((_AT_ONCE, GLANCED)), np.ones(_AT_ONCE), np.ones((_AT_ONCE, 1))
-    chosen = np.empty(_AT_ONCE, np.int64)
-    count = 0
-    for i in range(n):
-        x, y = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1]
-        grey[count], scale[count] = glance(image, camera_numbers, x, y, nominal)
-        contrast[i] = _contrast(grey[count], candidates.sign[i], least_step)
-        if contrast[i] != 0.0:
-            chosen[count], sign[count], score[count, 0] = i, candidates.sign[i], candidates.score[i]
-            count += 1
-        if count == _AT_ONCE or i == n - 1:
-            inputs, scales = network_inputs(grey, scale, sign)
-            found = network_log_odds(inputs, scales, score, network)
-            for k in range(count):
-                odds[chosen[k]] = found[k]
-            count = 0
-    return contrast, odds
 
 
 @kernel()
@@ -314,9 +280,5 @@ def _look(
     noted[4] = 10.0 * off * off
     noted[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     noted[6] = min(score, 12.0)
-    inputs, scales = network_inputs(
-        pairs_of_steps(seen.grey).reshape(1, DIRECTIONS, STEPS // 2),
-        seen.pixels_per_radius.reshape(1, DIRECTIONS),
-        np.full(1, sign),
-    )
-    return network_log_odds(inputs, scales, noted.reshape(1, -1), network)[0], noted
+    inputs, scales = network_inputs(pairs_of_steps(seen.grey), seen.pixels_per_radius, sign)
+    return network_log_odds(inputs, scales, noted, network), noted

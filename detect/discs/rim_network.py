@@ -75,120 +75,100 @@ def trained_networks() -> Networks:
 
 @kernel()
 def network_inputs(
-    grey: FloatArray, pixels_per_radius: FloatArray, sign: FloatArray
+    grey: FloatArray, pixels_per_radius: FloatArray, sign: float
 ) -> tuple[_Weights, _Weights]:
-    """The input of a network for (N, K, M) grey values of N rims in K directions at M distances.
+    """The input of a network for (K, M) grey values in K directions at M distances.
 
-    Grey values are NaN outside the image. `sign` (N,) is -1 for a dark disc, which is seen as a
-    light one. The inputs (M + OTHERS, N, K + 2) are deviations from the mean relative to their root
-    mean square, 0 outside the image; the logarithm of the pixels per radius; the share outside.
-    They are padded by the last direction in front and the first at the end. The scales (N, SCALES)
-    are logarithms of the pixels per radius and of the root mean square, relative to usual ones.
+    Grey values are NaN outside the image. `sign` is -1 for a dark disc, which is seen as a light
+    one. The inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean
+    square, 0 outside the image; the logarithm of the pixels per radius; the share outside. They are
+    padded by the last direction in front and the first at the end. The scales are logarithms of the
+    pixels per radius and of the root mean square, relative to usual ones.
     """
-    rims, directions, distances = grey.shape
-    inputs = np.zeros((distances + OTHERS, rims, directions + 2), np.float32)
-    scales = np.empty((rims, SCALES), np.float32)
-    for r in range(rims):
-        total = squares = size = 0.0
-        n = 0
-        for k in range(directions):
-            for m in range(distances):
-                value = grey[r, k, m]
-                if value == value:
-                    total += value
-                    squares += value * value
-                    n += 1
-        mean = total / max(n, 1)
-        deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
-        for k in range(directions):
-            outside = 0
-            for m in range(distances):
-                value = grey[r, k, m]
-                if value == value:
-                    inputs[m, r, k + 1] = sign[r] * (value - mean) / deviation
-                else:
-                    outside += 1
-            log_size = math.log(pixels_per_radius[r, k]) - 1.5
-            size += log_size
-            inputs[distances, r, k + 1] = log_size
-            inputs[distances + 1, r, k + 1] = outside / distances
-        for i in range(distances + OTHERS):
-            inputs[i, r, 0] = inputs[i, r, directions]
-            inputs[i, r, directions + 1] = inputs[i, r, 1]
-        scales[r, 0] = size / directions
-        scales[r, 1] = math.log(deviation) - 2.5
+    directions, distances = grey.shape
+    inputs = np.zeros((distances + OTHERS, directions + 2), np.float32)
+    total = squares = size = 0.0
+    n = 0
+    for k in range(directions):
+        for m in range(distances):
+            value = grey[k, m]
+            if value == value:
+                total += value
+                squares += value * value
+                n += 1
+    mean = total / max(n, 1)
+    deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
+    for k in range(directions):
+        outside = 0
+        for m in range(distances):
+            value = grey[k, m]
+            if value == value:
+                inputs[m, k + 1] = sign * (value - mean) / deviation
+            else:
+                outside += 1
+        log_size = math.log(pixels_per_radius[k]) - 1.5
+        size += log_size
+        inputs[distances, k + 1] = log_size
+        inputs[distances + 1, k + 1] = outside / distances
+    for i in range(distances + OTHERS):
+        inputs[i, 0], inputs[i, directions + 1] = inputs[i, directions], inputs[i, 1]
+    scales = np.empty(SCALES, np.float32)
+    scales[0] = size / directions
+    scales[1] = math.log(deviation) - 2.5
     return inputs, scales
 
 
 @kernel(fastmath={"contract"})
 def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
-    """Convolution over three neighbours on N circles, and relu, as (C, N, K + 2) float32.
-
-    The circles are one row: the two values between circles, which are wrong, are overwritten.
-    """
-    channels, rims, padded = len(bias), values.shape[1], values.shape[2]
-    seen = values.reshape(len(values), rims * padded)
-    result = np.empty((channels, rims * padded), np.float32)
-    inner = rims * padded - 2
-    for c in range(channels):
+    """Convolution over three neighbours on a circle, and relu, as (C, K + 2) float32."""
+    result = np.empty((len(bias), values.shape[1]), np.float32)
+    directions = values.shape[1] - 2
+    for c in range(len(bias)):
         row = result[c, 1:]
-        for k in range(inner):
+        for k in range(directions):
             row[k] = bias[c]
-        for i in range(len(seen)):
-            of = seen[i]
+        for i in range(len(values)):
+            seen = values[i]
             before, same, after = weights[0, i, c], weights[1, i, c], weights[2, i, c]
-            for k in range(inner):
-                row[k] += before * of[k] + same * of[k + 1] + after * of[k + 2]
-        for k in range(inner):
+            for k in range(directions):
+                row[k] += before * seen[k] + same * seen[k + 1] + after * seen[k + 2]
+        for k in range(directions):
             row[k] = max(row[k], np.float32(0.0))
-        for first in range(0, rims * padded, padded):
-            result[c, first] = result[c, first + padded - 2]
-            result[c, first + padded - 1] = result[c, first + 1]
-    return result.reshape(channels, rims, padded)
-
-
-@kernel()
-def _member_log_odds(
-    inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork, n: int
-) -> FloatArray:
-    """(N,) log-odds by the n-th network."""
-    channels, units = network.around_bias.shape[1], network.dense_bias.shape[1]
-    rims, directions = inputs.shape[1], inputs.shape[2] - 2
-    around = _convolve(inputs, network.around[n], network.around_bias[n])
-    again = _convolve(around, network.again[n], network.again_bias[n])
-    pooled = np.empty(3 * channels + SCALES, np.float32)
-    odds = np.full(rims, np.float64(network.out_bias[n]))
-    for r in range(rims):
-        for c in range(channels):
-            total = most = least = again[c, r, 1]
-            for k in range(2, directions + 1):
-                total += again[c, r, k]
-                most = max(most, again[c, r, k])
-                least = min(least, again[c, r, k])
-            pooled[c] = total / np.float32(directions)
-            pooled[channels + c], pooled[2 * channels + c] = most, least
-        for i in range(SCALES):
-            pooled[3 * channels + i] = scales[r, i]
-        for d in range(units):
-            unit = network.dense_bias[n, d]
-            for i in range(len(pooled)):
-                unit += pooled[i] * network.dense[n, i, d]
-            odds[r] += max(unit, np.float32(0.0)) * network.out[n, d]
-        for f in range(features.shape[1]):
-            odds[r] += features[r, f] * network.out[n, units + f]
-    return odds
+        result[c, 0], row[directions] = row[directions - 1], row[0]
+    return result
 
 
 @kernel()
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
-) -> FloatArray:
-    """(N,) log-odds that rims with (N, F) features are those of discs, the mean of the networks."""
-    odds = _member_log_odds(inputs, scales, features, network, 0)
-    unsure = (odds >= HOPELESS) & (odds <= CERTAIN)
-    members = len(network.out_bias)
-    if members > 1 and unsure.any():
-        for n in range(1, members):
-            odds += unsure * _member_log_odds(inputs, scales, features, network, n)
-        odds /= np.where(unsure, members, 1)
-    return odds
+) -> float:
+    """Log-odds that a rim with (F,) features is a disc's, the mean of the networks."""
+    members, channels = network.around_bias.shape
+    units = network.dense_bias.shape[1]
+    directions = inputs.shape[1] - 2
+    odds = np.float64(0.0)
+    pooled = np.empty(3 * channels + len(scales), np.float32)
+    for i in range(len(scales)):
+        pooled[3 * channels + i] = scales[i]
+    for n in range(members):
+        around = _convolve(inputs, network.around[n], network.around_bias[n])
+        again = _convolve(around, network.again[n], network.again_bias[n])
+        for c in range(channels):
+            total = most = least = again[c, 1]
+            for k in range(2, directions + 1):
+                total += again[c, k]
+                most = max(most, again[c, k])
+                least = min(least, again[c, k])
+            pooled[c] = total / np.float32(directions)
+            pooled[channels + c], pooled[2 * channels + c] = most, least
+        odds += network.out_bias[n]
+        for d in range(units):
+            unit = network.dense_bias[n, d]
+            for i in range(len(pooled)):
+                unit += pooled[i] * network.dense[n, i, d]
+            odds += max(unit, np.float32(0.0)) * network.out[n, d]
+        for f in range(len(features)):
+            odds += features[f] * network.out[n, units + f]
+        if n == 0 and not HOPELESS <= odds <= CERTAIN:
+            return float(odds)
+    return float(odds / members)
