@@ -202,7 +202,7 @@ def eliminate(matrices: FloatArray, k: int) -> None:
                 matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
 
 
-@kernel(forceinline=True)
+@kernel(inline="always")
 def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
     """Fit a disc; `work` is the working space, a `WORK`."""
     patch, rows, by_parts = work.patch, work.rows, settings.by_parts
