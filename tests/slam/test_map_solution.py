@@ -292,7 +292,7 @@ def test_calibration_with_another_cameras_rows_is_refused(published_camera: Came
     run = small_run(1)
     circles = run.recording.circles
     behind = replace(circles, xy=circles.xy + np.array([0.0, 9.0]))
-    with pytest.raises(SlamError, match="cannot see"):
+    with pytest.raises(SlamError, match="are not visible to the camera"):
         map_run(
             replace(_only_discs(run), circles=behind), published_camera, Weighting(calibrate=True)
         )
