@@ -32,7 +32,7 @@ from redetect.compiled import kernel
 _BACKGROUND = 0.3
 #: Lowest score of a candidate, and of a clear one. Limits: doubtful candidates of an image,
 #: candidates that are compared with their neighbours, peaks.
-_LEAST_SCORE, _CLEAR_SCORE = 1.2, 3.0
+_LEAST_SCORE, _CLEAR_SCORE = 1.7, 3.0
 _MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 200, 600, 4000
 #: Least distance from a better candidate, radii; less than 2, for discs may touch.
 _APART = 0.6

@@ -80,7 +80,12 @@ class Benchmark(Study):
         numba.set_num_threads(1)
         run = open_run(self.run)
         detectors = f.whole_detectors(run.camera)
-        print(f"- {this_machine()}\n- settings: {self}\n")
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        settings = (
+            f"{name} {' '.join(map(str, value)) if isinstance(value, tuple) else value}"
+            for name, value in given.items()
+        )
+        print(f"- {this_machine()}\n- settings: {', '.join(settings)}\n")
         print("Median processor time per image, relative to decoding the same image "
               "(quartiles; milliseconds):\n")  # fmt: skip
         self._print_table(self._kinds(run))
