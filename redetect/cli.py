@@ -8,8 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import make_dataclass
+from functools import reduce
 from importlib import import_module
-from typing import Annotated, Any, Union
+from operator import or_
+from typing import Annotated, Any
 
 from redetect.storage import __version__
 from redetect.storage.command_line import FOR_ALL, end_with, no_such
@@ -79,8 +81,8 @@ def _write_completion(words: list[str]) -> None:
     from tyro.conf import arg, subcommand
 
     def choice(commands: Mapping[str, type]) -> Any:
-        kinds = tuple(Annotated[kind, subcommand(name)] for name, kind in commands.items())
-        return Annotated[Union.__getitem__(kinds), arg(name="")]
+        kinds: Any = (Annotated[kind, subcommand(name)] for name, kind in commands.items())
+        return Annotated[reduce(or_, kinds), arg(name="")]
 
     programs = {name: import_module(module).PROGRAM for name, module in PROGRAMS.items()}
     below = {

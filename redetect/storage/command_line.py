@@ -15,10 +15,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
+from functools import reduce
 from importlib import import_module
+from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Union, cast, get_type_hints
+from typing import Annotated, Any, cast, get_type_hints
 
 import tyro
 from tyro.conf import Suppress, arg, subcommand
@@ -179,7 +181,7 @@ class Program:
             Annotated[self._brief(kind) if brief else kind, subcommand(name, **known.get(kind, {}))]
             for name, kind in self.commands.items()
         )
-        choice: Any = Union.__getitem__(commands)
+        choice: Any = reduce(or_, commands)
         return tyro.cli(
             Annotated[choice, arg(name="")],
             prog=self.name,
