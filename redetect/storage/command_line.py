@@ -17,6 +17,7 @@ from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import reduce
 from importlib import import_module
+from inspect import cleandoc
 from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -198,9 +199,8 @@ class Program:
         """The dataclass of a command without its expert flags, for its help."""
         short = _without(kind, self.expert)
         if short is not kind:
-            text, section, parameters = (kind.__doc__ or "").partition("\n\n    Parameters\n")
-            short.__doc__ = f"{text.rstrip()}\n\n    More flags are shown by {_HELP_ALL}."
-            short.__doc__ += section + parameters
+            text, section, parameters = cleandoc(kind.__doc__ or "").partition("\n\nParameters\n")
+            short.__doc__ = f"{text}\n\nMore flags are shown by {_HELP_ALL}.{section}{parameters}"
         return short
 
 
@@ -257,8 +257,8 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
         nested = is_dataclass(inner)
         if each.name in hidden:
             hint = Annotated[hint, Suppress]
-        elif nested and (short := _without(inner, expert)) is not inner:
-            own.default_factory = hint = short
+        elif nested and (brief := _without(inner, expert)) is not inner:
+            own.default_factory = hint = brief
             for mark in marks:
                 hint = Annotated[hint, mark]
         else:
@@ -266,5 +266,9 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
         changed.append((each.name, hint, own))
     if not changed:
         return kind
-    names = {"__doc__": kind.__doc__, "__module__": kind.__module__}
-    return make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True, namespace=names)
+    short = make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)
+    # The help is in comments: tyro finds them by module and name, since Python 3.13 by line.
+    for name in ("__doc__", "__module__", "__firstlineno__"):
+        if name in vars(kind):
+            setattr(short, name, vars(kind)[name])
+    return short

@@ -16,7 +16,17 @@ LONGEST_MESSAGE = 1000
 _LONGEST_EXCERPT = 60
 _ELLIPSIS = " ... "
 
-_SHORT = reprlib.Repr()
+#: Python does not format numbers of thousands of digits.
+_MOST_BITS = 1000
+
+
+class _ShortRepr(reprlib.Repr):
+    def repr_int(self, x: int, level: int) -> str:
+        long = x.bit_length() > _MOST_BITS
+        return "a very long number" if long else super().repr_int(x, level)
+
+
+_SHORT = _ShortRepr()
 _SHORT.maxlevel = 3
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 40
 
@@ -42,10 +52,7 @@ def one_line(text: str, longest: int = LONGEST_MESSAGE) -> str:
 
 def excerpt(value: object) -> str:
     """Show a value from a file, however large and deep it is, in about 60 characters."""
-    try:
-        return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
-    except ValueError:  # Python does not format numbers of thousands of digits
-        return "a very long number"
+    return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
 
 
 class OneLineError(Exception):
