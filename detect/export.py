@@ -41,6 +41,9 @@ _TABLES: dict[str, TableName] = {
 }
 _OR_CSV = ", or write --to csv"
 
+#: The values of a row's columns: number, prefix and time of the frame, then the table's own.
+Row = tuple[Value, ...]
+
 
 def perform(command: Export) -> int:
     """Export a file; returns the exit code."""
@@ -100,10 +103,6 @@ def _times(command: Export) -> dict[str, float] | None:
         if beside.is_file():
             return read_times(beside)
     return None
-
-
-#: The values of a row's columns: number, prefix and time of the frame, then the table's own.
-Row = tuple[Value, ...]
 
 
 def read_tables(

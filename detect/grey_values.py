@@ -14,6 +14,16 @@ _DARK, _LIGHT = 2, 253
 #: The mask's absolute coefficients add up to 16, so no response is larger.
 _MOST_RESPONSE = 16 * 255
 
+#: Largest range of the grey values of a margin: noise and compression artefacts; least step to the
+#: column next to it, grey levels, and the share of that column's pixels with such a step.
+_MOST_RANGE, _LEAST_STEP, _LEAST_SHARE = 24, 8, 0.5
+#: Widths of margins are multiples of this (columns), so that few tables are needed.
+_COLUMNS = 8
+#: If a larger share of the width is blank, it is a blank scene, not a margin.
+_LARGEST_SHARE = 0.05
+#: Spacing of the rows in which margins are searched for.
+_ROWS_APART = 4
+
 
 def estimate_noise(image: GreyImage, most_rows: int | None = None) -> float:
     """Standard deviation of an image's noise, grey levels; 0 for less than 3 rows or columns.
@@ -65,17 +75,6 @@ def _median_response(image: GreyImage, rows: IntArray) -> float:
             seen += histogram[k]
         total += 0.5 * k
     return total
-
-
-#: Largest range of the grey values of a margin: noise and compression artefacts; least step to the
-#: column next to it, grey levels, and the share of that column's pixels with such a step.
-_MOST_RANGE, _LEAST_STEP, _LEAST_SHARE = 24, 8, 0.5
-#: Widths of margins are multiples of this (columns), so that few tables are needed.
-_COLUMNS = 8
-#: If a larger share of the width is blank, it is a blank scene, not a margin.
-_LARGEST_SHARE = 0.05
-#: Spacing of the rows in which margins are searched for.
-_ROWS_APART = 4
 
 
 def steep_gradient(image: GreyImage, most_rows: int) -> float:

@@ -37,6 +37,8 @@ from redetect.landmarks import FrameTilt, read_frames
 #: Step of central differences of levelled positions, metres and radians.
 _STEP = 1e-6
 
+_tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
+
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
     """The same discs, their positions and covariances corrected for the tilt of their frame.
@@ -123,9 +125,6 @@ def common_covariance(
 @lru_cache(maxsize=4)
 def _wrong_by(pixels: float) -> CircleSettings:
     return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
-
-
-_tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:

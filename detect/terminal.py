@@ -19,6 +19,8 @@ from redetect.storage.messages import is_quiet
 
 _log = logging.getLogger("redetect")
 
+_SHOWN_FAILURES = 10
+
 
 def show_announcements() -> None:
     """Show announcements on stderr."""
@@ -63,9 +65,6 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
     compilation = Compilation()
     event.register("numba:compile", compilation)
     return lambda: event.unregister("numba:compile", compilation)
-
-
-_SHOWN_FAILURES = 10
 
 
 @contextmanager

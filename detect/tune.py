@@ -34,6 +34,9 @@ from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_r
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
 
+# Largest number of labelled points.
+_MOST_NAMED = 12
+
 
 def perform(options: Tune) -> int:
     """Execute the command; returns the exit code."""
@@ -135,10 +138,6 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
         )
     values = {name: parameter_values(name, text) for name, text in varied.items()}
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
-
-
-# Largest number of labelled points.
-_MOST_NAMED = 12
 
 
 def tune_run(

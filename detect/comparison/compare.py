@@ -57,6 +57,11 @@ _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files have six digits: a smaller sigma is meaningless.
 LEAST_SIGMA_RAD = 1e-12
 
+#: Of discs that are compared on the floor, where nothing else is said (m).
+FLOOR_GATE_M = 0.10
+# Breaks ties between pairs of lines, so that the result does not depend on the file's order.
+_line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
+
 
 def compare_with_file(
     kind: Kind,
@@ -255,12 +260,6 @@ def _on_lookalikes(
         for m in matches
         if m.name in known
     )
-
-
-#: Of discs that are compared on the floor, where nothing else is said (m).
-FLOOR_GATE_M = 0.10
-# Breaks ties between pairs of lines, so that the result does not depend on the file's order.
-_line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
 
 
 def frames_by_image(frames: Iterable[Frame], name: str) -> dict[str, Frame]:

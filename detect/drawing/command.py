@@ -26,6 +26,8 @@ from lut import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
 
+Video = Callable[[ByteArray], None]
+
 
 def perform(options: Draw) -> int:
     """Execute the command; returns the exit code."""
@@ -53,9 +55,6 @@ def perform(options: Draw) -> int:
         if where is not None:
             print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
     return report_failures(len(failures), failures)
-
-
-Video = Callable[[ByteArray], None]
 
 
 def draw_run(

@@ -38,6 +38,7 @@ from redetect.plane import ellipses
 _POINTS = 33
 #: Size of the ellipses of markers' corners, in standard deviations.
 _SIGMAS = 20.0
+Colour = tuple[int, int, int]
 LINE_COLOUR: Colour = (60, 220, 60)
 SIGMA_COLOUR: Colour = (0, 170, 255)
 _EDGE_COLOUR: Colour = (0, 170, 255)
@@ -46,6 +47,13 @@ _TEXT_COLOUR: Colour = (0, 230, 255)
 EXTRA_COLOUR: Colour = (255, 60, 255)
 MISSED_COLOUR: Colour = (60, 60, 255)
 _WORDS_COLOUR: Colour = (230, 230, 230)
+
+_SUBPIXEL_BITS = 4
+# OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
+_FARTHEST_PX = 1e6
+# Up to this width, strokes are one pixel wide; wider pictures (of phones) get wider strokes.
+_COLUMNS = 1500
+_CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def draw_rows(
@@ -194,15 +202,6 @@ def _outline_disc(
     draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))
 
 
-Colour = tuple[int, int, int]
-
-_SUBPIXEL_BITS = 4
-# OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
-_FARTHEST_PX = 1e6
-# Up to this width, strokes are one pixel wide; wider pictures (of phones) get wider strokes.
-_COLUMNS = 1500
-
-
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
     """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
 
@@ -283,9 +282,6 @@ def with_legend(
         shift = 4 + column_px * (k % per_row), 13 + 14 * (k // per_row)
         draw_text(legend, text, (0, 0), colour, size, shift)
     return np.concatenate([canvas, legend])
-
-
-_CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def _colours(names: Sequence[str]) -> dict[str, Colour]:

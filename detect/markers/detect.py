@@ -65,6 +65,44 @@ _UNCLIPPED = (3.0, 250.0)
 #: Systematic error without optical blur, and the blur's variance (px^2) at which it vanishes.
 _STAIRCASE_PX, _STAIRCASE_VARIANCE = 0.035, 0.1
 
+#: Reasons for rejection, as reported.
+OUTSIDE = "partly outside the image"
+NO_PATTERN = "no matching pattern"
+AMBIGUOUS = "two matching patterns"
+NOT_FITTED = "fit of the marker failed"
+UNEXPLAINED = "grey values unexplained"
+WRONG_CELLS = "wrong cells"
+TOO_SMALL = "cells too small for the blur"
+NO_MARKER = "similar to common non-markers"
+#: Distance between samples of a cell, in cells.
+_SPREAD_CELLS = 0.25
+#: Patterns with a correlation this close to the best are tried, too, up to `_MOST_TRIED` in all.
+_CLOSE_CORRELATION = 0.06
+_MOST_TRIED = 3
+#: If cells are blurred by less than this (in cells), it must be four times as close.
+_CLEAR_BLUR_CELLS = 0.3
+_LEAST_CORRELATION = 0.6
+#: Least log-odds of the best pattern against the second best.
+_LEAST_LOG_ODDS = 15.0
+#: Least standard deviation of the whiteness of cells.
+_LEAST_CELL_SIGMA = 0.08
+#: Markers whose cells are blurred by more than this (in cells) are rejected. The first number of
+#: each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
+#: others (see `Templates.weakness`).
+_LARGEST_BLUR_CELLS = (0.62, 0.6)
+#: The requirements on a fit increase from the first blur (in cells) to the second: many patterns
+#: fit blurred cells roughly, but only the right one fits them to within the noise.
+_STRICT_FROM, _STRICT_AT = 0.3, 0.6
+#: Largest misfit beyond the noise (in contrasts), and least mean agreement of the cells: for clear
+#: cells, and for blurred ones.
+_CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
+_BLURRED_MISFIT = (0.06, 0.03)
+_BLURRED_AGREEMENT = (0.92, 0.95)
+#: The same for patterns that also occur on other objects, and their largest error of a cell.
+_PLAIN_LARGEST_MISFIT = 0.04
+_PLAIN_LEAST_AGREEMENT = 0.95
+_PLAIN_LARGEST_CELL_ERROR = 0.25
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -269,46 +307,6 @@ def _image_covariance(
     jacobian = picture.pixel_jacobians(pixels)
     covariance = jacobian @ marker.covariance @ jacobian.transpose(0, 2, 1)
     return np.asarray(covariance + (settings.systematic_px**2 + staircase_px**2) * np.eye(2))
-
-
-#: Reasons for rejection, as reported.
-OUTSIDE = "partly outside the image"
-NO_PATTERN = "no matching pattern"
-AMBIGUOUS = "two matching patterns"
-NOT_FITTED = "fit of the marker failed"
-UNEXPLAINED = "grey values unexplained"
-WRONG_CELLS = "wrong cells"
-TOO_SMALL = "cells too small for the blur"
-NO_MARKER = "similar to common non-markers"
-
-#: Distance between samples of a cell, in cells.
-_SPREAD_CELLS = 0.25
-#: Patterns with a correlation this close to the best are tried, too, up to `_MOST_TRIED` in all.
-_CLOSE_CORRELATION = 0.06
-_MOST_TRIED = 3
-#: If cells are blurred by less than this (in cells), it must be four times as close.
-_CLEAR_BLUR_CELLS = 0.3
-_LEAST_CORRELATION = 0.6
-#: Least log-odds of the best pattern against the second best.
-_LEAST_LOG_ODDS = 15.0
-#: Least standard deviation of the whiteness of cells.
-_LEAST_CELL_SIGMA = 0.08
-#: Markers whose cells are blurred by more than this (in cells) are rejected. The first number of
-#: each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
-#: others (see `Templates.weakness`).
-_LARGEST_BLUR_CELLS = (0.62, 0.6)
-#: The requirements on a fit increase from the first blur (in cells) to the second: many patterns
-#: fit blurred cells roughly, but only the right one fits them to within the noise.
-_STRICT_FROM, _STRICT_AT = 0.3, 0.6
-#: Largest misfit beyond the noise (in contrasts), and least mean agreement of the cells: for clear
-#: cells, and for blurred ones.
-_CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
-_BLURRED_MISFIT = (0.06, 0.03)
-_BLURRED_AGREEMENT = (0.92, 0.95)
-#: The same for patterns that also occur on other objects, and their largest error of a cell.
-_PLAIN_LARGEST_MISFIT = 0.04
-_PLAIN_LEAST_AGREEMENT = 0.95
-_PLAIN_LARGEST_CELL_ERROR = 0.25
 
 
 def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -> FloatArray | None:

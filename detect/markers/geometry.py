@@ -27,6 +27,14 @@ from redetect.compiled import kernel
 #: Number of rows from which the image's noise is estimated.
 _NOISE_ROWS = 64
 
+#: Reasons for rejection, as reported.
+NOT_FOUR_CORNERS = "not four corners"
+NO_QUADRANGLE = "no quadrangle"
+#: Quadrangles whose corners are all this near (pixels, and in widths) are duplicates.
+_SAME_PX, _SAME_WIDTHS = 1.0, 0.08
+_NEXT = np.array([1, 2, 3, 0])
+_SQUARE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
+
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -86,16 +94,6 @@ def _straight_positions(camera: Camera | None, width: int, height: int) -> Float
 def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
     scale, offset = [camera.scale_x, camera.scale_y], [camera.offset_x, camera.offset_y]
     return np.asarray(np.add(camera.undistort(pixels) * scale, offset))
-
-
-#: Reasons for rejection, as reported.
-NOT_FOUR_CORNERS = "not four corners"
-NO_QUADRANGLE = "no quadrangle"
-
-#: Quadrangles whose corners are all this near (pixels, and in widths) are duplicates.
-_SAME_PX, _SAME_WIDTHS = 1.0, 0.08
-_NEXT = np.array([1, 2, 3, 0])
-_SQUARE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
 
 
 def rough_corners(hull: FloatArray) -> FloatArray | None:

@@ -27,6 +27,9 @@ _WIDE = 7.6
 _HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
+#: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
+_SIGMAS, _CORNERS = 3.0, 32
+
 
 def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
     """Recall and precision over the threshold of the quality."""
@@ -162,10 +165,6 @@ def _finish(axes: Axes, x: str, y: str) -> None:
 
 def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
-
-
-#: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
-_SIGMAS, _CORNERS = 3.0, 32
 
 
 def floor_map(rows: Sequence[SeenRows]) -> Part | None:

@@ -23,6 +23,13 @@ from detect.sources.opening import demand_recording, open_source
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
+_JPEG_QUALITY = 88
+_NAMES = {
+    "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
+}  # fmt: skip
+_NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
+_CURVE_POINTS = 41
+
 
 @dataclass(frozen=True)
 class ReportInputs:
@@ -72,9 +79,6 @@ def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
     return ReportInputs(run, files, names, rows, sight, discs, lines)
 
 
-_JPEG_QUALITY = 88
-
-
 def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
     """The picture of a frame with its rows, or a note on why there is none."""
     frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
@@ -103,13 +107,6 @@ def perform(options: Report) -> int:
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
     return 0
-
-
-_NAMES = {
-    "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
-}  # fmt: skip
-_NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
-_CURVE_POINTS = 41
 
 
 def report_page(inputs: ReportInputs, worst: int) -> bytes:

@@ -72,6 +72,20 @@ if TYPE_CHECKING:
 #: Errors of one frame, not of the run.
 COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
+#: Prefix, lines and tilt of a frame.
+_Tilted = tuple[str, int, FrameTilt | None]
+#: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
+_MAP_SIGMA_M = 0.1
+#: Least lean that the search for discs considers, degrees, and the factor by which it must increase
+#: the evidence: all verticals of a building may lean, and a slight lean does no harm.
+_LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
+#: Steps of the lean of a single frame, degrees.
+_FRAME_LEAN_DEG = 2.0
+#: Number of frames whose discs are levelled at once.
+_LEVELLED_AT_ONCE = 64
+#: Largest number of pixels that are decoded at once.
+PIXELS_AT_ONCE = 1 << 25
+
 
 @dataclass
 class FrameDetections:
@@ -201,22 +215,6 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     return tilt_as_written(
         FrameTilt(prefix, tilt.pitch_rad, tilt.roll_rad, cpp, cpr, crr, tilt.lines)
     )
-
-
-#: Prefix, lines and tilt of a frame.
-_Tilted = tuple[str, int, FrameTilt | None]
-
-#: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
-_MAP_SIGMA_M = 0.1
-#: Least lean that the search for discs considers, degrees, and the factor by which it must increase
-#: the evidence: all verticals of a building may lean, and a slight lean does no harm.
-_LEAST_LEAN_DEG, _MORE_EVIDENCE = 0.5, 1.03
-#: Steps of the lean of a single frame, degrees.
-_FRAME_LEAN_DEG = 2.0
-#: Number of frames whose discs are levelled at once.
-_LEVELLED_AT_ONCE = 64
-#: Largest number of pixels that are decoded at once.
-PIXELS_AT_ONCE = 1 << 25
 
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRows]:

@@ -58,6 +58,8 @@ _COMPLETE = "complete"
 #: Number of frames from which the camera's lean is estimated, and their largest spacing.
 _LEAN_FRAMES, _LEAN_STEP = 32, 20
 
+_log = logging.getLogger("redetect")
+
 
 class Journal:
     """A journal that this process has locked; the caller closes or removes its file."""
@@ -164,9 +166,6 @@ def _file_of(frame: RunFrame) -> object:
     except (OSError, ValueError):
         return frame.image.name  # a missing file is a state as well
     return frame.image.name, status.st_size, status.st_mtime_ns
-
-
-_log = logging.getLogger("redetect")
 
 
 def detect_run(

@@ -47,6 +47,20 @@ Chunk = tuple[FrameTask, ...]
 #: After this many consecutive frames that killed their workers, the run is given up.
 _DEADLY_FRAMES = 10
 
+P = ParamSpec("P")
+R = TypeVar("R")
+#: Number of frames for which starting another process pays off.
+FRAMES_PER_PROCESS = 500
+#: Frames per chunk.
+_TOGETHER = 16
+_WINDOW_PER_WORKER = 3
+_CLUSTER_ANSWER_S = 10.0
+_CLUSTER_PATIENCE_S = 60.0
+#: Time after which processes are killed, and interval of checks for an interrupt.
+_GRACE_S, _PATIENCE_S = 1.0, 0.2
+#: The lock that a process holds while it compiles kernels, until the end of that task.
+_compiling: list[RLock] = []
+
 
 @dataclass(frozen=True)
 class Workers:
@@ -170,21 +184,6 @@ class Crew:
         if not future.done():
             return self._executor is None
         return isinstance(future.exception(), self.died)
-
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-#: Number of frames for which starting another process pays off.
-FRAMES_PER_PROCESS = 500
-
-#: Frames per chunk.
-_TOGETHER = 16
-_WINDOW_PER_WORKER = 3
-_CLUSTER_ANSWER_S = 10.0
-_CLUSTER_PATIENCE_S = 60.0
-#: Time after which processes are killed, and interval of checks for an interrupt.
-_GRACE_S, _PATIENCE_S = 1.0, 0.2
 
 
 def default_jobs(frames: int) -> int:
@@ -325,10 +324,6 @@ class _ProcessPool(ProcessPoolExecutor):
                 process.join()
             if manager is not None:
                 manager.join(_GRACE_S)
-
-
-#: The lock that a process holds while it compiles kernels, until the end of that task.
-_compiling: list[RLock] = []
 
 
 def _begin(plan: FramePlan, lock: RLock, show: bool) -> None:

@@ -48,6 +48,15 @@ _CHANNELS = {
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
 _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)_?[0-9]*")
 
+#: Largest deviation of a conversion from the camera_info, anywhere in the image.
+LIMIT_PX = 0.05
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_ODOMETRY, _INFO = "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
+# x, y and the rotation about z, in the 6x6 covariances of ROS.
+_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+# Least relative eigenvalue of a growth of a pose's covariance; below, it counts as constant.
+_INDEFINITE = 1e-9
+
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[AnyReader]:
@@ -171,18 +180,6 @@ def content_of_message(message: Any, name: object) -> bytes | GreyImage:
     if "compressedDepth" in message.format:
         raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
     return bytes(message.data)
-
-
-#: Largest deviation of a conversion from the camera_info, anywhere in the image.
-LIMIT_PX = 0.05
-
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_ODOMETRY, _INFO = "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
-
-# x, y and the rotation about z, in the 6x6 covariances of ROS.
-_PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-# Least relative eigenvalue of a growth of a pose's covariance; below, it counts as constant.
-_INDEFINITE = 1e-9
 
 
 class Bag(Source):

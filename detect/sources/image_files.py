@@ -22,6 +22,8 @@ from redetect.storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
+WILDCARDS = frozenset("*?[")
+
 
 def image_name(prefix: str) -> str:
     """Name of an image without directories (of either system) and image extension."""
@@ -104,9 +106,6 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
     """Sort key of names: numbers by value, before letters."""
     parts = re.findall("([0-9]+)|([^0-9]+)", name)
     return [(int(number), "") if number else (-1, word) for number, word in parts]
-
-
-WILDCARDS = frozenset("*?[")
 
 
 class RunFrames(Frames):

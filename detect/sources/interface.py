@@ -34,6 +34,13 @@ from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
 
+#: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
+_BIT_DEPTHS = (8, 10, 12, 14, 16)
+# Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
+# expand, plus thumbnails and other metadata of cameras.
+_BYTES_PER_PIXEL = 16
+_BYTES_BESIDE = 1 << 23
+
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
@@ -157,15 +164,6 @@ def read_image(
     if camera is not None and image.shape != (camera.height, camera.width):
         raise wrong_size(name, (image.shape[1], image.shape[0]), (camera.width, camera.height))
     return image
-
-
-#: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
-_BIT_DEPTHS = (8, 10, 12, 14, 16)
-
-# Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
-# expand, plus thumbnails and other metadata of cameras.
-_BYTES_PER_PIXEL = 16
-_BYTES_BESIDE = 1 << 23
 
 
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:

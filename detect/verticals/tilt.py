@@ -51,6 +51,9 @@ TOGETHER_RAD = 0.15
 #: Half width at half maximum of the inclinations of lines that are not vertical (rad).
 STRAY_RAD = math.radians(1.0)
 
+#: Least ratio of the axes of the stretched grid.
+_SLENDEREST = 0.1
+
 
 def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) -> FloatArray:
     """(3, N) positions x, y of a grid around 0 and the areas of its cells."""
@@ -66,8 +69,6 @@ def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) ->
 
 
 _GRID = _polar_grid(12, 10, math.radians(0.02), math.radians(6.0))
-#: Least ratio of the axes of the stretched grid.
-_SLENDEREST = 0.1
 
 
 class TiltEstimate(NamedTuple):

@@ -29,6 +29,27 @@ from redetect.storage.messages import one_line
 
 _LARGEST_TEXT_BYTES = 1 << 28
 
+_DRIVE = re.compile(r"[A-Za-z]:")
+#: Names that denote a device on Windows, in any folder and with any ending.
+_DEVICE = re.compile(
+    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
+)
+#: Bound of an image's size: one byte per grey value.
+MOST_PIXELS = 1 << 27
+#: The start-of-frame markers of a JPEG: C0 to CF except tables (C4), extensions (C8, CC).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})(?=[\s#])")
+_PNM_HEADER_BYTES = 4096
+_TIFF_ENTRIES = 512
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
+_TIFF_ORIENTATION = 274
+_TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
+# Tiles are padded and may be larger than a small image; up to this many pixels this is valid.
+_ORDINARY_TILE = 1 << 22
+
 
 def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
     """The content of a regular file, or a link to one, of at most `largest_bytes`.
@@ -118,13 +139,6 @@ def writable_by_others(state: os.stat_result) -> str | None:
     return None
 
 
-_DRIVE = re.compile(r"[A-Za-z]:")
-#: Names that denote a device on Windows, in any folder and with any ending.
-_DEVICE = re.compile(
-    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
-)
-
-
 def leads_out(name: str, *folders: str) -> str | None:
     r"""Why a name cannot be that of a file within a folder, judged by its letters alone.
 
@@ -202,24 +216,6 @@ def read_plain_array(
     if len(data) != size:
         raise ValueError(f"{len(data)} bytes of data: expected {size}: {expected}")
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)
-
-
-#: Bound of an image's size: one byte per grey value.
-MOST_PIXELS = 1 << 27
-
-#: The start-of-frame markers of a JPEG: C0 to CF except tables (C4), extensions (C8, CC).
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
-_PNG = b"\x89PNG\r\n\x1a\n"
-_PNM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+(\d{1,10})(?:\s|#[^\n]*\n)+(\d{1,10})(?=[\s#])")
-_PNM_HEADER_BYTES = 4096
-_TIFF_ENTRIES = 512
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_TIFF_SIZES = (256, 257, 322, 323)  # width, height, and those of a tile
-_TIFF_ORIENTATION = 274
-_TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
-# Tiles are padded and may be larger than a small image; up to this many pixels this is valid.
-_ORDINARY_TILE = 1 << 22
 
 
 def claimed_size(content: bytes) -> tuple[int, int] | None:

@@ -19,6 +19,13 @@ from typing import Annotated, Any, Optional, get_type_hints
 
 from redetect.storage.messages import excerpt
 
+# Types of flags; for `X | None` tyro imports another library that takes a tenth of a second.
+MaybePath = Optional[Path]  # noqa: UP045
+MaybeInt = Optional[int]  # noqa: UP045
+MaybeFloat = Optional[float]  # noqa: UP045
+MaybeStr = Optional[str]  # noqa: UP045
+MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -72,13 +79,6 @@ Limit = Annotated[float, LIMIT]
 LimitOr0 = Annotated[float, LIMIT_OR_0]
 ShareAbove0 = Annotated[float, SHARE_ABOVE_0]
 Share = Annotated[float, SHARE]
-
-# Types of flags; for `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
-MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
 
 
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:

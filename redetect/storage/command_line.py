@@ -50,6 +50,9 @@ _ADVICE = (
     "or set the environment variable NUMBA_CACHE_DIR to another folder"
 )
 
+#: As the name of a JSON file: standard output, with no other output there.
+_STANDARD_OUTPUT = Path("-")
+
 
 def exit_code_of(work: Callable[[], int]) -> int:
     """Run a command and report its errors on one line; returns its exit code, or one of those
@@ -118,10 +121,6 @@ def _is_of_cache(error: Exception) -> bool:
     program; Numba's own message does not help.
     """
     return _NUMBAS_CACHING in "".join(traceback.format_exception(error))
-
-
-#: As the name of a JSON file: standard output, with no other output there.
-_STANDARD_OUTPUT = Path("-")
 
 
 @dataclass(frozen=True)
