@@ -26,7 +26,8 @@ _LARGEST_FILE_BYTES = 1 << 26
 _LARGEST_NUMBER = 1e100
 _ROUNDING = 1e-6
 _DIGITS = re.compile(r"[-+0-9.eE]*")
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+#: A number in a file; unlike `float`, this excludes 1_000, nan and infinity.
+NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -279,5 +280,5 @@ def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> 
                 return values
     except ValueError:
         pass
-    wrong = next(w for w in words if not (_NUMBER.fullmatch(w) and math.isfinite(float(w))))
+    wrong = next(w for w in words if not (re.fullmatch(NUMBER, w) and math.isfinite(float(w))))
     raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected a finite number")

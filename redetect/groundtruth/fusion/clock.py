@@ -27,7 +27,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject
+from redetect.groundtruth.files import NUMBER, JsonObject
 from redetect.storage.bounded import read_content
 from redetect.storage.bounds import NOT_NEGATIVE, from_to, inside
 
@@ -201,12 +201,11 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
 
 
 _LARGEST_FILE_BYTES = 1 << 28
-_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _OFFSET_MESSAGE = re.compile(
-    rf"offset from master:\s*({_NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
+    rf"offset from master:\s*({NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
 )
-_DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({_NUMBER})")
-_LEADING_TIME = re.compile(rf"^\s*\[?({_NUMBER})\]?[\s,:]")
+_DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({NUMBER})")
+_LEADING_TIME = re.compile(rf"^\s*\[?({NUMBER})\]?[\s,:]")
 _CALENDAR = (
     "%Y-%m-%d %H:%M:%S.%f",
     "%Y-%m-%d %H:%M:%S",
@@ -276,7 +275,7 @@ def _table_row(line: str, columns: dict[str, int]) -> list[float] | None:
 
 
 def _number(word: str) -> float:
-    return float(word) if re.fullmatch(_NUMBER, word) else math.nan
+    return float(word) if re.fullmatch(NUMBER, word) else math.nan
 
 
 def _time(text: str) -> float:

@@ -51,7 +51,7 @@ _COST_OF_TERM = 2.0
 _MEASURED = 0.5
 
 
-def likeliest_noise(problem: MovementProblem) -> FloatArray:
+def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     """Maximum likelihood estimate of odometry's random errors, near those given.
 
     Long gaps are excluded: a linearised filter may be lost at their ends, and then the likelihood
@@ -68,19 +68,19 @@ def likeliest_noise(problem: MovementProblem) -> FloatArray:
     for _ in range(_LEARNING_ROUNDS):
         for axis in (2, 0, 1):
 
-            def surprise(value: float, axis: int = axis) -> float:
+            def deviance(value: float, axis: int = axis) -> float:
                 tried = logarithms.copy()
                 tried[axis] = value
-                return sum(part.account(scaled(tried)).surprise for part in some)
+                return sum(part.innovations(scaled(tried)).deviance for part in some)
 
             found = minimize_scalar(
-                surprise, bounds=bounds, method="bounded", options={"xatol": 0.05}
+                deviance, bounds=bounds, method="bounded", options={"xatol": 0.05}
             )
             logarithms[axis] = float(found.x)
     return scaled(logarithms)
 
 
-def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
+def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """Factor of odometry's variances over seconds to those expected from single samples.
 
     A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
@@ -91,27 +91,27 @@ def looser_over_seconds(problem: MovementProblem, noise: FloatArray) -> float:
     # Outliers would look like odometry's errors, more so where few others are left.
     some = [
         part.thinned(_SPACING_S)
-        for part in short.with_only(short.account(noise).accepted).split(
+        for part in short.with_only(short.innovations(noise).accepted).split(
             _LONGEST_GAP_TO_LEARN_FROM_S
         )
     ]
     numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
-    looser = 1.0
+    inflation = 1.0
     for _ in range(_LOOSENING_ROUNDS):
         # The first one of each part gives no information on odometry.
         squared = sum(
-            float(np.sum(np.minimum(account.squared[1:], problem.gate())))
-            for account in (part.account(math.sqrt(looser) * noise) for part in some)
+            float(np.sum(np.minimum(found.squared[1:], problem.gate())))
+            for found in (part.innovations(math.sqrt(inflation) * noise) for part in some)
         )
-        if looser == 1.0 and squared < chdtri(numbers, _DOUBT):
+        if inflation == 1.0 and squared < chdtri(numbers, _DOUBT):
             return 1.0
-        looser *= max(squared / numbers, 1.0)
-    return looser
+        inflation *= max(squared / numbers, 1.0)
+    return inflation
 
 
-def terms_that_pay(
+def useful_terms(
     problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
 ) -> BoolArray:
     """(3,) mask of odometry's systematic errors whose estimates improve predictions over seconds.
@@ -123,16 +123,16 @@ def terms_that_pay(
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0
 
-    def surprise(terms: BoolArray) -> float:
-        account = thin.account(noise, (means * terms, deviations * terms))
-        return account.surprise + _COST_OF_TERM * np.count_nonzero(terms)
+    def aic(terms: BoolArray) -> float:
+        found = thin.innovations(noise, (means * terms, deviations * terms))
+        return found.deviance + _COST_OF_TERM * np.count_nonzero(terms)
 
-    best = surprise(kept)
+    best = aic(kept)
     # Terms that were hardly measured keep their uncertainty.
     measured = deviations < _MEASURED * systematic_sigmas(problem.settings)
     while np.any(kept & measured):
         fewer = [kept & (np.arange(3) != term) for term in np.flatnonzero(kept & measured)]
-        tried = [surprise(terms) for terms in fewer]
+        tried = [aic(terms) for terms in fewer]
         if min(tried) > best:
             break
         best, kept = min(tried), fewer[int(np.argmin(tried))]
@@ -221,12 +221,12 @@ def fuse(
             f"no sample of odometry from the first measured pose ({first:.3f} s) to the last "
             f"({last:.3f} s): expected some, which are the times of the result"
         )
-    noise = likeliest_noise(problem) if chosen.learn_noise else noise_of(chosen)
-    looser = looser_over_seconds(problem, noise) if chosen.learn_noise else 1.0
-    smoothed, spread, account = problem.smooth(noise, looser)
-    deviations = np.sqrt(np.maximum(np.diagonal(spread[-1])[3:], 0.0))
-    over_seconds = math.sqrt(looser) * noise
-    kept = terms_that_pay(problem, over_seconds, smoothed[-1, 3:], deviations)
+    noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)
+    inflation = variance_inflation(problem, noise) if chosen.learn_noise else 1.0
+    smoothed, spread, innovations = problem.smooth(noise, inflation)
+    deviations = _systematic_deviations(spread)
+    over_seconds = math.sqrt(inflation) * noise
+    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], deviations)
     if not np.all(kept):
         turn, bend, way = np.where(kept, systematic_sigmas(chosen), 0.0).tolist()
         fewer = replace(
@@ -236,36 +236,36 @@ def fuse(
             distance_scale_sigma=way,
         )
         problem = replace(problem, settings=fewer)
-        smoothed, spread, account = problem.smooth(noise, looser)
+        smoothed, spread, innovations = problem.smooth(noise, inflation)
 
     at = np.searchsorted(problem.times_s, inside)
     path = _path(inside, smoothed[at], spread[at])
     states, spreads = problem.filtered(noise)
-    restarted = account.restarted > 0
+    restarted = innovations.restarted > 0
     localisation = None
     if chosen.learn_noise:
         found = as_localisation(last_of_each_time(odometry), problem, over_seconds, path)
         if found is not None:
             path, localisation = found
             restarted[:] = False
-    # Odometry's errors are constants: their final estimate uses all measurements.
-    last_spread = np.sqrt(np.maximum(np.diagonal(spread[-1]), 0.0))
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
         rejected=tuple(
             Rejected(
-                str(problem.streams[i]), float(problem.measured_s[i]), float(account.squared[i])
+                str(problem.streams[i]), float(problem.measured_s[i]), float(innovations.squared[i])
             )
-            for i in np.flatnonzero(~account.accepted)
+            for i in np.flatnonzero(~innovations.accepted)
         ),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
-            name: int(np.count_nonzero(account.accepted & (problem.streams == name)))
+            name: int(np.count_nonzero(innovations.accepted & (problem.streams == name)))
             for name in streams
         },
         odometry=OdometryErrors(
-            *np.concatenate([smoothed[-1, 3:], last_spread[3:], noise, [looser]]).tolist()
+            *np.concatenate(
+                [smoothed[-1, 3:], _systematic_deviations(spread), noise, [inflation]]
+            ).tolist()
         ),
         localisation=localisation,
         repaired=problem.repaired,
@@ -275,6 +275,11 @@ def fuse(
             if end > first and begin < last
         ),
     )
+
+
+def _systematic_deviations(spread: FloatArray) -> FloatArray:
+    """(3,) of odometry's errors: constants, whose estimate at the last node uses everything."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(spread[-1])[POSE:], 0.0)))
 
 
 def _path(times_s: FloatArray, states: FloatArray, covariances: FloatArray) -> PlanarPoses:

@@ -20,25 +20,14 @@ from redetect.plane import between, log_motion
 
 def systematic_sigmas(settings: FuseSettings) -> FloatArray:
     """(3,) prior deviations of turn scale, turn per metre (rad) and distance scale."""
-    return np.array(
-        [
-            settings.turn_scale_sigma,
-            settings.turn_bias_per_metre_sigma,
-            settings.distance_scale_sigma,
-        ]
-    )
+    s = settings
+    return np.array([s.turn_scale_sigma, s.turn_bias_per_metre_sigma, s.distance_scale_sigma])
 
 
 def noise_of(settings: FuseSettings) -> FloatArray:
     """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
-    return np.array(
-        [
-            settings.distance_sigma,
-            settings.lateral_sigma,
-            settings.turn_sigma,
-            settings.turn_per_metre_sigma,
-        ]
-    )
+    s = settings
+    return np.array([s.distance_sigma, s.lateral_sigma, s.turn_sigma, s.turn_per_metre_sigma])
 
 
 #: Noise of a robot at rest, without which covariances would be singular.

@@ -28,7 +28,7 @@ from redetect.compiled import kernel
 STATE = 6
 POSE = 3
 #: Restart of the filter at a node: none, after many rejections, because it was lost.
-NOT_ANEW, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
+NO_RESTART, AFTER_REJECTIONS, WHERE_LOST = 0, 1, 2
 # Below this half turn (rad) differences cancel, and series are accurate to ten digits.
 _SERIES_BELOW = 0.1
 
@@ -62,7 +62,7 @@ def arc_integrals(half_turn: float) -> tuple[float, float, float, float, float]:
 
 
 @kernel()
-def move(
+def predict(
     x: FloatArray,
     p: FloatArray,
     f: FloatArray,
@@ -168,7 +168,7 @@ def squared_innovation(
 
 
 @kernel()
-def take_in(
+def update(
     x: FloatArray,
     p: FloatArray,
     common: FloatArray,
@@ -199,7 +199,7 @@ def take_in(
 class Odometry(NamedTuple):
     """Movements to N nodes, each from the node before; the first is not used."""
 
-    controls: FloatArray  # (N, 4): as for `move`
+    controls: FloatArray  # (N, 4): as for `predict`
     variances: FloatArray  # (N, 3): accumulated noise along the path, across it and of the turn
 
 
@@ -234,18 +234,18 @@ class FilterHistory(NamedTuple):
     transitions: FloatArray
 
 
-class MeasurementAccount(NamedTuple):
+class Innovations(NamedTuple):
     """How a filter used M measurements at N nodes."""
 
     squared: FloatArray  # (M,): squared normalised innovations
     accepted: BoolArray  # (M,)
     restarted: NDArray[np.int8]  # (N,): whether the filter restarted at a node, and why
-    surprise: float  # Minus twice the log-likelihood of the accepted innovations
+    deviance: float  # Minus twice the log-likelihood of the accepted innovations
 
 
-def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
+def empty_history(nodes: int) -> FilterHistory:
     """A history to be filled; with zero nodes if none is needed."""
-    states, spreads = (nodes, state), (nodes, state, state)
+    states, spreads = (nodes, STATE), (nodes, STATE, STATE)
     return FilterHistory(
         np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
     )
@@ -253,7 +253,9 @@ def empty_history(nodes: int, state: int = STATE) -> FilterHistory:
 
 # Element by element, since an assignment of arrays takes seconds to compile.
 @kernel()
-def keep(states: FloatArray, covariances: FloatArray, k: int, x: FloatArray, p: FloatArray) -> None:
+def store(
+    states: FloatArray, covariances: FloatArray, k: int, x: FloatArray, p: FloatArray
+) -> None:
     """Store a state and its covariance as those of a node."""
     for i in range(len(x)):
         states[k, i] = x[i]
@@ -270,7 +272,7 @@ def filter_forward(
     gating: Gating,
     points: FloatArray,
     history: FilterHistory,
-) -> MeasurementAccount:
+) -> Innovations:
     """Filter N nodes forward.
 
     `start`, `start_covariance` (6,), (6, 6): before the measurements at the first node. `points`
@@ -296,21 +298,21 @@ def filter_forward(
     gain = np.empty((STATE, POSE))
     m = 0
     rejections = 0
-    surprise = 0.0
+    deviance = 0.0
     for k in range(controls.shape[0]):
-        restarted[k] = NOT_ANEW
+        restarted[k] = NO_RESTART
         cut = gating.cuts[k]
         if k > 0:
             if points.shape[0] > 1:
-                move(x, p, f, controls[k], odometry.variances[k], points[k - 1])
+                predict(x, p, f, controls[k], odometry.variances[k], points[k - 1])
             else:
-                move(x, p, f, controls[k], odometry.variances[k], x.copy())
+                predict(x, p, f, controls[k], odometry.variances[k], x.copy())
             if kept:
                 for i in range(STATE):
                     for j in range(STATE):
                         transitions[k, i, j] = f[i, j]
         if kept:
-            keep(predicted, predicted_covariance, k, x, p)
+            store(predicted, predicted_covariance, k, x, p)
         while m < nodes.shape[0] and nodes[m] == k:
             for i in range(POSE):
                 innovation[i] = measured.poses[m, i] - x[i]
@@ -331,7 +333,7 @@ def filter_forward(
                 cut = False
                 restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS
                 if kept:
-                    keep(predicted, predicted_covariance, k, x, p)
+                    store(predicted, predicted_covariance, k, x, p)
                     transitions[k, :POSE] = 0.0
             for j in range(POSE):
                 for i in range(STATE):
@@ -343,15 +345,15 @@ def filter_forward(
             accepted[m] = squared <= gating.largest_squared
             if accepted[m]:
                 rejections = 0
-                surprise += squared + math.log(determinant)
-                take_in(x, p, common, innovation, s_inverse, gain)
+                deviance += squared + math.log(determinant)
+                update(x, p, common, innovation, s_inverse, gain)
             else:
                 rejections += 1
-                surprise += gating.largest_squared + math.log(determinant)
+                deviance += gating.largest_squared + math.log(determinant)
             m += 1
         if kept:
-            keep(filtered, filtered_covariance, k, x, p)
-    return MeasurementAccount(squared_innovations, accepted, restarted, surprise)
+            store(filtered, filtered_covariance, k, x, p)
+    return Innovations(squared_innovations, accepted, restarted, deviance)
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
@@ -368,7 +370,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     reached = history.transitions[1:] @ history.filtered_covariance[:-1]
     gains = np.linalg.solve(expected, reached).swapaxes(1, 2)
     states, covariances = history.filtered.copy(), history.filtered_covariance.copy()
-    _take_back(
+    _smooth_in_place(
         states, covariances, np.ascontiguousarray(gains), history.predicted,
         history.predicted_covariance,
     )  # fmt: skip
@@ -376,7 +378,7 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
 
 
 @kernel()
-def _take_back(
+def _smooth_in_place(
     states: FloatArray,
     covariances: FloatArray,
     gains: FloatArray,

@@ -46,7 +46,7 @@ _LEVEL_SIGMA = 10.0  # Prior deviation of unknowns (m, rad)
 # within 10 m by 10 m.
 _USUAL = 6.0
 _TRIMMINGS = 5
-_OUTLIER_SURPRISE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
+_OUTLIER_DEVIANCE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def as_localisation(
         times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(positions - centre)
     )
     heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
-    surprise = position.surprise + heading.surprise + _OUTLIER_SURPRISE * np.count_nonzero(~usual)
-    if not surprise < thin.account(noise).surprise:
+    deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
+    if not deviance < thin.innovations(noise).deviance:
         return None
     aligned = moved_poses(odometry, motion)
     by_motion = _by_motion(aligned.poses[:, :2] - centre)
@@ -127,7 +127,7 @@ class _Stationary(NamedTuple):
     lasting_s: float
     mean: FloatArray  # (k,)
     mean_covariance: FloatArray  # (k, k)
-    surprise: float  # Minus twice the log-likelihood
+    deviance: float  # Minus twice the log-likelihood
 
 
 def _stationary(
@@ -159,7 +159,7 @@ def _stationary(
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
-        return fitted(logarithms).surprise / stride + float(off / _LOG_CORRELATION_SIGMA) ** 2
+        return fitted(logarithms).deviance / stride + float(off / _LOG_CORRELATION_SIGMA) ** 2
 
     start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
     found = minimize(

@@ -33,8 +33,8 @@ from redetect.groundtruth.fusion.kernels import (
     WHERE_LOST,
     FilterHistory,
     Gating,
+    Innovations,
     MeasuredPoses,
-    MeasurementAccount,
     Odometry,
     empty_history,
     filter_forward,
@@ -52,7 +52,7 @@ UNMEASURED_S = 1.0
 _TURN_PER_METRE = 4
 
 
-def back_from(
+def predicted_backward(
     odometry: Odometry, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
@@ -138,10 +138,10 @@ class MovementProblem:
             self._part(int(own[0]), int(own[-1]) + 1) for own in np.split(self.measured.nodes, cuts)
         ]
 
-    def account(
+    def innovations(
         self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
-    ) -> MeasurementAccount:
-        """The use of the measurements by a forward-only filter.
+    ) -> Innovations:
+        """Innovations of the measurements in a forward filter.
 
         It begins with the given means and deviations of odometry's systematic errors, by default
         those of the settings.
@@ -172,7 +172,7 @@ class MovementProblem:
 
     def smooth(
         self, noise: FloatArray, looser_in_gaps: float = 1.0
-    ) -> tuple[FloatArray, FloatArray, MeasurementAccount]:
+    ) -> tuple[FloatArray, FloatArray, Innovations]:
         """Smoothed states, their covariances, and the use of the measurements.
 
         `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.inputs.noise_of`.
@@ -187,37 +187,37 @@ class MovementProblem:
         history = empty_history(len(self.times_s))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
-            account = self._forward(variances, cuts=cuts, history=history)
-            unfit = self._ends_that_did_not_fit(account)
+            innovations = self._forward(variances, cuts=cuts, history=history)
+            unfit = self._ends_that_did_not_fit(innovations)
             if not unfit:
                 break
             cuts[unfit] = True
         states, covariances = smooth_backward(history)
-        good = nodes[account.accepted]
+        good = nodes[innovations.accepted]
         # The nodes of the last measurement before and the first one after each gap that was cut.
         gaps = [
             (int(good[np.searchsorted(good, end) - 1]), int(end))
-            for end in np.flatnonzero(account.restarted == WHERE_LOST)
+            for end in np.flatnonzero(innovations.restarted == WHERE_LOST)
         ]
         carried = cuts.copy()
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):
             before = states
-            account = self._forward(variances, before, cuts, history)
+            innovations = self._forward(variances, before, cuts, history)
             states, covariances = smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
         for begin, end in gaps:
             self._anchor(begin, end, variances, states, covariances, carried=bool(carried[end]))
-        return states, covariances, account
+        return states, covariances, innovations
 
-    def _ends_that_did_not_fit(self, account: MeasurementAccount) -> list[int]:
+    def _ends_that_did_not_fit(self, innovations: Innovations) -> list[int]:
         """Nodes after gaps at which the rejections began that made the filter restart."""
         nodes, times_s = self.measured.nodes, self.measured_s
         found = []
-        for node in np.flatnonzero(account.restarted == AFTER_REJECTIONS):
+        for node in np.flatnonzero(innovations.restarted == AFTER_REJECTIONS):
             first = int(np.searchsorted(nodes, node))
-            while first > 0 and not account.accepted[first - 1]:
+            while first > 0 and not innovations.accepted[first - 1]:
                 first -= 1
             if first > 0 and times_s[first] - times_s[first - 1] > UNMEASURED_S:
                 found.append(int(nodes[first]))
@@ -239,7 +239,7 @@ class MovementProblem:
         covariances include the other end's path as a possibility.
         """
         gap = slice(begin, end + 1)
-        back, spreads = back_from(
+        back, spreads = predicted_backward(
             Odometry(self.controls[gap], variances[gap]), states[end], covariances[end]
         )
         way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
@@ -283,7 +283,7 @@ class MovementProblem:
         cuts: BoolArray | None = None,
         history: FilterHistory | None = None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
-    ) -> MeasurementAccount:
+    ) -> Innovations:
         means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
         return filter_forward(
             Odometry(self.controls, variances),

@@ -4,7 +4,6 @@ The headings of odometry and ground truth are those of one robot; the offset and
 their clocks minimise the squared difference, with the angle between their axes eliminated in closed
 form (RAWSEEDS D2.1 part 2). That search is global and derivative-free and needs no initial value.
 But odometry's heading drifts, which a sum of squares would partly explain by a time offset. So the
-
 clock is then refined by maximising the likelihood of the measured poses, given odometry's movements
 and their errors: once for the headings of the ground truth alone, and once for its full poses, if
 they have covariances, so that curves of the path and changes of speed contribute, too. The more
@@ -31,7 +30,7 @@ from redetect.groundtruth.fusion.clock import (
     knots_of,
     on_one_line,
 )
-from redetect.groundtruth.fusion.fuse import likeliest_noise, looser_over_seconds
+from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -143,12 +142,12 @@ def _segment(
     pair = HeadingPair.of(own, measured, reach)
     clock = _search(pair, bounds)
     jittered = _with_jitter(measured, own)
-    best = _likeliest(own, _headings_alone(jittered), pair.reference_s, clock, bounds)
+    best = _most_likely_clock(own, _headings_alone(jittered), pair.reference_s, clock, bounds)
     if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
     if measured.covariances is not None and driven >= _LEAST_WAY_M:
-        moving = _likeliest(own, jittered, pair.reference_s, best.clock, bounds)
+        moving = _most_likely_clock(own, jittered, pair.reference_s, best.clock, bounds)
         if moving is not None and moving.uncertainty(measured) < best.uncertainty(measured):
             best = moving
     place = _jump(best, bounds) if jumps_left > 0 else None
@@ -266,7 +265,7 @@ class ClockFit(NamedTuple):
     def squared(self, clock: FloatArray) -> FloatArray:
         """(M,) squared normalised errors of the measured poses with another clock, gated."""
         problem = self.problem_at(clock)
-        return np.minimum(problem.account(self.noise).squared, problem.gate())
+        return np.minimum(problem.innovations(self.noise).squared, problem.gate())
 
     def uncertainty(self, measured: PlanarPoses) -> float:
         """Variance of the offset at the ends of the measurements (s^2)."""
@@ -274,7 +273,7 @@ class ClockFit(NamedTuple):
         return float(np.sum(np.square(self.sigmas * [1.0, half])))
 
 
-def _likeliest(
+def _most_likely_clock(
     odometry: PlanarPoses,
     measured: PlanarPoses,
     reference_s: float,
@@ -291,20 +290,20 @@ def _likeliest(
         own = PlanarPoses(times, odometry.poses)
         return movement_problem(own, {"pose": measured}, FuseSettings())
 
-    def surprise(clock: FloatArray) -> float:
+    def deviance(clock: FloatArray) -> float:
         # The prior is uniform between the bounds.
         prior = 3.0 * float(np.sum(np.square(clock / largest)))
-        return problem_at(clock).account(noise).surprise + prior
+        return problem_at(clock).innovations(noise).deviance + prior
 
     clock, unit = start, np.array([_STEP_S, _STEP_S / half])
     for _ in range(_ROUNDS):
         problem = problem_at(clock)
-        noise = likeliest_noise(problem)
-        noise *= math.sqrt(looser_over_seconds(problem, noise))
+        noise = maximum_likelihood_noise(problem)
+        noise *= math.sqrt(variance_inflation(problem, noise))
         clock, unit = np.clip(clock, -0.999 * largest, 0.999 * largest), np.minimum(unit, largest)
         inward = np.where(clock > 0.0, -unit, unit)
         found = minimize(
-            lambda x, unit: surprise(x * unit),
+            lambda x, unit: deviance(x * unit),
             clock / unit,
             (unit,),
             method="Nelder-Mead",
@@ -316,7 +315,7 @@ def _likeliest(
             },
         )
         clock = found.x * unit
-        deviations = _deviations(surprise, clock, _DERIVATIVE_STEP * unit)
+        deviations = _deviations(deviance, clock, _DERIVATIVE_STEP * unit)
         if deviations is None:
             return None
         unit = deviations
@@ -324,7 +323,7 @@ def _likeliest(
     if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
         around = np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0])
         offset_s = minimize_scalar(
-            lambda offset_s: surprise(np.array([offset_s, 0.0])),
+            lambda offset_s: deviance(np.array([offset_s, 0.0])),
             bounds=around,
             method="bounded",
             options={"xatol": 1e-4},
@@ -334,16 +333,16 @@ def _likeliest(
 
 
 def _deviations(
-    surprise: Callable[[FloatArray], float], at: FloatArray, step: FloatArray
+    deviance: Callable[[FloatArray], float], at: FloatArray, step: FloatArray
 ) -> FloatArray | None:
     """(2,) deviations of two unknowns, from the curvature of minus twice the log-likelihood."""
     e, f = np.diag(step)
-    here = surprise(at)
-    curvature = np.diag([surprise(at + d) + surprise(at - d) - 2.0 * here for d in (e, f)])
+    here = deviance(at)
+    curvature = np.diag([deviance(at + d) + deviance(at - d) - 2.0 * here for d in (e, f)])
     if not np.all(np.diag(curvature) > 0.0):
         return None
     cross = 0.25 * (
-        surprise(at + e + f) - surprise(at + e - f) - surprise(at - e + f) + surprise(at - e - f)
+        deviance(at + e + f) - deviance(at + e - f) - deviance(at - e + f) + deviance(at - e - f)
     )
     # If a gate opens or closes, a step may look like curvature.
     if cross**2 < np.prod(np.diag(curvature)):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from redetect.groundtruth.fusion.kernels import STATE, arc_integrals, move
+from redetect.groundtruth.fusion.kernels import STATE, arc_integrals, predict
 from redetect.groundtruth.fusion.movement import movement_problem
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
@@ -45,7 +45,7 @@ def moved(
     point: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     x, p, f = x.copy(), p.copy(), np.eye(STATE)
-    move(x, p, f, control, variances, x.copy() if point is None else point)
+    predict(x, p, f, control, variances, x.copy() if point is None else point)
     return x, p, f
 
 
