@@ -5,8 +5,6 @@ Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupt
 
 from __future__ import annotations
 
-import sys
-
 from camera.options import Board, Calibrate, Convert, Floor, Level
 from redetect.storage.command_line import Program
 
@@ -25,6 +23,3 @@ PROGRAM = Program(
 )
 
 main, parsed = PROGRAM.main, PROGRAM.parsed
-
-if __name__ == "__main__":
-    sys.exit(main())

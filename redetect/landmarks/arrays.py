@@ -167,10 +167,10 @@ def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -
     gate_m : float
         Largest distance of a pair (m), at least 0.
     """
+    one, other = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (first, second))
     with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
-        distance = np.linalg.norm(_differences(first, second), axis=-1)
-        squared = distance**2
-    return associate(squared, distance <= gate_m)
+        distance = np.linalg.norm(one[:, np.newaxis] - other, axis=-1)
+        return associate(distance**2, distance <= gate_m)
 
 
 def squared_mahalanobis(offset: ArrayLike, covariance: ArrayLike) -> FloatArray:
@@ -201,9 +201,3 @@ def wrap_angle(angle_rad: ArrayLike) -> FloatArray:
     """Wrap angles to [-pi, pi) (rad)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi, dtype=np.float64)
-
-
-def _differences(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """All (N, M, 2) differences between two sets of positions."""
-    positions = [np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (first, second)]
-    return np.asarray(positions[0][:, np.newaxis] - positions[1], dtype=np.float64)

@@ -5,8 +5,6 @@ Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupt
 
 from __future__ import annotations
 
-import sys
-
 from redetect.slam.options import Associate, Audit, Ekf, Export, Import, Localize, Map, Noise
 from redetect.storage.command_line import Program
 
@@ -27,6 +25,3 @@ PROGRAM = Program(
 )
 
 main, parsed = PROGRAM.main, PROGRAM.parsed
-
-if __name__ == "__main__":
-    sys.exit(main())

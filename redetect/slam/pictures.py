@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from redetect import plane
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.reporting.page import figure_file
@@ -220,10 +220,6 @@ def _extent(
     return middle - half, middle + half
 
 
-def _inside(xy: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    return np.asarray(np.all((xy >= low) & (xy <= high), axis=1))
-
-
 def _draw_panel(
     axes: Axes,
     some: LandmarkMap,
@@ -272,7 +268,7 @@ def _draw_landmarks(
     name, colour, marker = look
     if len(some) == 0:
         return
-    shown = _inside(some.xy, low, high)
+    shown = np.all((some.xy >= low) & (some.xy <= high), axis=1)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
     # With hundreds of landmarks, only small dots show walls.

@@ -205,8 +205,8 @@ class Tracker:
     def _points(self, i: int, pose: FloatArray, motion: FloatArray, alone_s: float) -> Seen:
         centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
-        about = np.array([motion[0], motion[1], motion[2], pose[0], pose[1]])
-        return new_points(self.sets[i], self.fixed, centre, reach, about)
+        moving = np.array([*motion, *pose[:2]])
+        return new_points(self.sets[i], self.fixed, centre, reach, moving)
 
     def _refine(self, i: int, seen: Seen, start: FloatArray) -> OutlinePose:
         found = refine(seen, start, self.fixed, self.body, self.settings, float(self.prior_m[i]))

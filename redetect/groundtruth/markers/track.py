@@ -73,12 +73,10 @@ class Track:
     def planar(self) -> PlanarPoses:
         """The poses on the floor with their covariances."""
         posed = self.posed
-        if not posed:
-            return PlanarPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        poses = np.stack([pose.world_from_robot for _, pose in posed])
-        covariances = np.stack([pose.covariance for _, pose in posed])
+        poses = np.array([pose.world_from_robot for _, pose in posed]).reshape(-1, 4, 4)
+        covariances = np.array([pose.covariance for _, pose in posed]).reshape(-1, 6, 6)
         return PlanarPoses(
-            np.array([time for time, _ in posed]),
+            np.array([time_s for time_s, _ in posed], dtype=np.float64),
             np.column_stack([poses[:, 0, 3], poses[:, 1, 3], heading(poses)]),
             planar_covariance(poses, covariances),
         )

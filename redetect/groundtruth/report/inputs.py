@@ -80,9 +80,8 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     inputs = Inputs(session.resolve().name)
     inputs.building = _building(session, inputs)
     for name in STREAMS:
-        optional = name == "filtered"
-        stream = _read(inputs, session / f"{name}.csv", read_planar_poses, optional=optional)
-        if stream is not None:
+        path, optional = session / f"{name}.csv", name == "filtered"
+        if (stream := _read(inputs, path, read_planar_poses, optional=optional)) is not None:
             inputs.streams[name] = stream
     if truth is not None:
         inputs.truth = read_planar_poses(truth)
@@ -96,13 +95,12 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         session / "fused.json",
         session / "validation" / "validation.json",
     ):
-        document = _read(inputs, path, read_json, optional=path.name == "clock.json")
-        if document is not None:
+        optional = path.name == "clock.json"
+        if (document := _read(inputs, path, read_json, optional=optional)) is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
     for name in PICTURES:
-        picture = _read(inputs, session / name, _picture)
-        if picture is not None:
+        if (picture := _read(inputs, session / name, _picture)) is not None:
             inputs.pictures[name] = picture
     inputs.dimensions = _read(inputs, session / "dimensions.csv", read_dimensions) or []
     inputs.fiducials = _read(inputs, session / "fiducial_distances.csv", _surveyed)

@@ -97,9 +97,8 @@ def meeting_points(
     of the point along it (n,) (m), and from it in standard deviations (n,).
     """
     centre = apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2)))
-    angle = (
-        bearing_rad + poses[:, 2]
-    )  # bearing b in the robot frame is the direction (sin b, -cos b)
+    # A bearing b in the robot frame is the direction (sin b, -cos b).
+    angle = bearing_rad + poses[:, 2]
     along = np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     offset = np.sum(normal * centre, axis=1)
