@@ -119,18 +119,19 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
     return np.concatenate([-by_disc, turned[..., None]], axis=-1), by_disc
 
 
-# Typical height of the camera above the floor (m).
-_CAMERA_HEIGHT_M = 1.5
+#: Typical height of the camera above the floor (m).
+CAMERA_HEIGHT_M = 1.5
 
 
-def tilt_jacobian(disc_xy: FloatArray) -> FloatArray:
+def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
     """Derivative of apparent floor positions by a small tilt of the robot.
 
     Takes `disc_xy` (n, 2); returns (n, 2, 2).
     """
-    (x, y), h = disc_xy.T, _CAMERA_HEIGHT_M
-    by_tilt = np.array([[x * y / h, -h - x**2 / h], [h + y**2 / h, -x * y / h]])
-    return np.moveaxis(by_tilt, 2, 0)
+    x, y = disc_xy.T
+    rows = (x * y / height_m, -height_m - x**2 / height_m)
+    others = (height_m + y**2 / height_m, -x * y / height_m)
+    return np.stack([np.stack(rows, -1), np.stack(others, -1)], axis=1)
 
 
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:

@@ -14,8 +14,8 @@ from redetect.slam.association.loop_closing import (
     in_order,
     intersect_bearings,
     merge_labels,
+    pairs_by_position,
     pairs_by_votes,
-    pairs_in_place,
     seen_together,
     solve_path,
 )
@@ -178,18 +178,18 @@ def test_labels_at_one_spot_are_paired_only_in_stretches_known_to_be_one_place()
     xy = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     spread = np.tile(0.01**2 * np.eye(2), (10, 1, 1))
     known = [Stretch(0, np.array([0, 1, 2, 3]), xy), Stretch(90, np.array([0, 1, 2, 9]), xy + 0.01)]
-    assert pairs_in_place(known, spread, 0.999) == [(3, 9)]
-    assert pairs_in_place(known, 0.01 * spread, 0.999) == []
+    assert pairs_by_position(known, spread, 0.999) == [(3, 9)]
+    assert pairs_by_position(known, 0.01 * spread, 0.999) == []
     strangers = [known[0], Stretch(90, np.array([6, 7, 2, 9]), xy)]
-    assert pairs_in_place(strangers, spread, 0.999) == []
-    assert pairs_in_place(known[:0], spread, 0.999) == []
+    assert pairs_by_position(strangers, spread, 0.999) == []
+    assert pairs_by_position(known[:0], spread, 0.999) == []
 
 
 def test_labels_of_one_stretch_are_paired_by_their_covariances() -> None:
     """The nearest need not be the likeliest: positions are uncertain along the line of sight."""
     xy = np.array([[0.0, 0.0], [0.0, 0.2], [0.1, 0.0]])
     spread = np.tile(np.diag([0.01**2, 0.1**2]), (3, 1, 1))
-    assert pairs_in_place([Stretch(0, np.arange(3), xy)], spread, 0.999) == [(0, 1)]
+    assert pairs_by_position([Stretch(0, np.arange(3), xy)], spread, 0.999) == [(0, 1)]
 
 
 def test_mutual_pairs_are_each_others_nearest() -> None:

@@ -13,7 +13,7 @@ from redetect.landmarks import LineLandmark, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import read_map, read_path, with_joint_covariance
 from redetect.plane import apply, between, invert
 from redetect.slam.association.loops import Stretch
-from redetect.slam.association.placing import lay_together
+from redetect.slam.association.registration import register_maps
 from redetect.slam.cli import main
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, frames_of_discs, joined, read_recording
@@ -143,7 +143,7 @@ def test_maps_lie_where_they_are_certain_to() -> None:
         labels = np.argsort(seen[:, 0])
         parts = np.array_split(labels, 2 if high - low < 15.0 else 3)
         stretches.append([Stretch(25, np.sort(p), places[-1][np.sort(p)]) for p in parts])
-    motions, pairs, apart = lay_together(places, stretches)
+    motions, pairs, apart = register_maps(places, stretches)
     assert apart == []
     np.testing.assert_allclose(motions, true, atol=0.1)
     everywhere = np.concatenate([apply(m, p) for m, p in zip(motions, places)])
@@ -151,4 +151,4 @@ def test_maps_lie_where_they_are_certain_to() -> None:
     assert sum(map(len, gaps)) > 40
     assert max(map(max, gaps)) < 0.15
     twins = np.concatenate([places[0], places[0] + [0.0, 20.0]])
-    assert lay_together([twins, places[2]], [[], stretches[2]])[2] == [1]
+    assert register_maps([twins, places[2]], [[], stretches[2]])[2] == [1]

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.slam.association.placing import wake_up
+from redetect.slam.association.registration import localise_globally
 from redetect.slam.association.run import associate_run
 from redetect.slam.commands.associate import score_run
 from redetect.slam.commands.files import camera_xy_of
@@ -87,15 +87,15 @@ class WakingUp(Study):
         off, turned, taken, squared = [], [], [], []
         starts = range(0, len(recording), self.every)
         for start in starts:
-            woken = wake_up(recording.part(start), discs)
-            if woken is None:
+            located = localise_globally(recording.part(start), discs)
+            if located is None:
                 continue
-            difference = woken.pose - poses[start]
+            difference = located.pose - poses[start]
             difference[2] = wrap_angle(difference[2])
             off.append(np.hypot(difference[0], difference[1]))
             turned.append(abs(np.degrees(difference[2])))
-            taken.append(woken.frames)
-            squared.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
+            taken.append(located.frames)
+            squared.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
         table = Table({"": "<6", "off m": ".2f", "turned deg": ".1f", "after frames": ".0f"})
         for name, of in (("median", np.median), ("most", np.max)):
             table.row(name, *(of(values) if values else np.nan for values in (off, turned, taken)))

@@ -2,6 +2,6 @@
 
 `run` calls the stages: `frame_to_frame` against a local map that moves with the robot, detection of
 revisited places by constellations of landmarks (`loops`), the resulting path (`loop_closing`), and
-verticals along it (`line_points`). `placing` registers a run in a map. `compatibility` gates single
-rows or tests them jointly; `score` compares with known identifiers.
+verticals along it (`line_points`). `registration` registers a run in a map. `compatibility` gates
+single rows or tests them jointly; `score` compares with known identifiers.
 """

@@ -40,9 +40,9 @@ def associate_locally(
     Returns the landmark of each row of a disc (n,) and of a line (m,), both numbered from 0 in the
     order of first sight.
     """
-    setting = settings or AssociateSettings()
+    settings = settings or AssociateSettings()
     circles = recording.circles
-    scaled = replace(circles, covariance=setting.sigma_scale**2 * circles.covariance)
+    scaled = replace(circles, covariance=settings.sigma_scale**2 * circles.covariance)
     none = FrameRows(CircleRows.of(), LineRows.of())
     disc_labels: list[int] = []
     line_labels: list[int] = []
@@ -51,17 +51,17 @@ def associate_locally(
     lost = {0, *recording.lost.tolist()}
     for frame, rows in enumerate(frames_of(replace(recording, circles=scaled))):
         if frame in lost:
-            ekf = EkfSlam(camera_xy=camera_xy, tilt_sigma_rad=setting.tilt_sigma_rad)
+            ekf = EkfSlam(camera_xy=camera_xy, tilt_sigma_rad=settings.tilt_sigma_rad)
         ekf.predict(recording.steps[frame], recording.step_covariance[frame])
         _forget(ekf, frame, discs_seen, lines_seen)
         # Discs first, since they improve the pose.
         if len(rows.circles):
-            found = _labels(ekf, rows.circles, len(discs_seen), setting)
+            found = _labels(ekf, rows.circles, len(discs_seen), settings)
             disc_labels += found
             discs_seen.update(dict.fromkeys(found, frame))
             ekf.measure(none._replace(circles=replace(rows.circles, ids=np.array(found))))
         if len(rows.lines):
-            found = _labels(ekf, rows.lines, len(lines_seen), setting)
+            found = _labels(ekf, rows.lines, len(lines_seen), settings)
             line_labels += found
             lines_seen.update(dict.fromkeys(found, frame))
             ids = tuple((number,) for number in found)
@@ -72,12 +72,12 @@ def associate_locally(
 
 
 def _labels(
-    ekf: EkfSlam, rows: CircleRows | LineRows, fresh: int, setting: AssociateSettings
+    ekf: EkfSlam, rows: CircleRows | LineRows, fresh: int, settings: AssociateSettings
 ) -> list[int]:
     """The landmarks that rows of one kind show; new ones are numbered from `fresh` on."""
     slots = ekf.line_slots if isinstance(rows, LineRows) else ekf.disc_slots
     names = np.array(list(slots), dtype=np.int64)
-    landmark = compatible(setting.method, *ekf.compared(rows, names), setting.gate_probability)
+    landmark = compatible(settings.method, *ekf.compared(rows, names), settings.gate_probability)
     found = np.append(names, UNKNOWN_ID)[landmark]
     found[landmark < 0] = fresh + np.arange(np.count_nonzero(landmark < 0))
     return [int(label) for label in found]

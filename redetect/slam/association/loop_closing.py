@@ -174,7 +174,7 @@ def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
 
-def pairs_in_place(
+def pairs_by_position(
     stretches: Sequence[Stretch], covariance: FloatArray, gate_probability: float
 ) -> list[tuple[int, int]]:
     """Pairs of labels at the same position, in stretches known to be the same place.

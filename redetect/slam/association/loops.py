@@ -285,7 +285,7 @@ def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
     return Motion(pose, agreeing, tried)
 
 
-def settled(
+def refined_motion(
     place: FloatArray, target: FloatArray, pose: FloatArray, least_agreeing: int
 ) -> tuple[FloatArray, IntArray] | None:
     """The pose that aligns landmarks with those they agree with, by least squares, and the pairs.
@@ -335,7 +335,7 @@ def _refined(
     earlier: Stretch, later: Stretch, pose: FloatArray, tried: int, search: Search
 ) -> Match | None:
     """Refine a match by least squares over all agreeing landmarks; None if too few agree then."""
-    found = settled(later.xy, earlier.xy, pose, search.least_agreeing)
+    found = refined_motion(later.xy, earlier.xy, pose, search.least_agreeing)
     if found is None:
         return None
     pose, pairs = found

@@ -9,8 +9,8 @@ distortion. Verticals, which the local association often confuses, are then asso
 the path that the discs give (`redetect.slam.association.line_points`).
 
 Several runs are treated as one with lost steps in between (`redetect.slam.recording.joined`). Loops
-are closed in each, their maps are registered (`redetect.slam.association.placing`), and loops are
-closed again in the whole.
+are closed in each, their maps are registered (`redetect.slam.association.registration`), and loops
+are closed again in the whole.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from redetect.slam.association.loop_closing import (
     in_order,
     intersect_bearings,
     merge_labels,
+    pairs_by_position,
     pairs_by_votes,
-    pairs_in_place,
     solve_path,
 )
 from redetect.slam.association.loops import (
@@ -49,7 +49,7 @@ from redetect.slam.association.loops import (
     find_matches,
     stretches_of,
 )
-from redetect.slam.association.placing import ANYWHERE, lay_together
+from redetect.slam.association.registration import ANYWHERE, register_maps
 from redetect.slam.errors import SlamError
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
@@ -102,25 +102,25 @@ def associate_run(
     progress : callable, optional
         Called with a description of the current stage.
     """
-    setting = settings or AssociateSettings()
+    settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
-    local = _associated_locally(recording, setting, camera_xy, report)
+    local = _associated_locally(recording, settings, camera_xy, report)
     circle_labels, line_labels = local
     matches: tuple[Match, ...] = ()
     path = None
-    if setting.map_level:
+    if settings.map_level:
         by_discs = len(recording.circles) > 0
         closed = _closed_by_parts(
             _without_lines(recording) if by_discs else recording,
             circle_labels if by_discs else line_labels,
-            setting,
+            settings,
             camera_xy,
             report,
         )
         path, matches = closed.path, closed.matches
         if by_discs:
             labels = closed.labels
-            circle_labels = _without_clutter(recording, labels, path, setting)
+            circle_labels = _without_clutter(recording, labels, path, settings)
             if len(line_labels):
                 report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
@@ -129,10 +129,10 @@ def associate_run(
                     labels,
                     line_labels,
                     camera_xy=camera_xy,
-                    disc_sigma_scale=setting.sigma_scale,
+                    disc_sigma_scale=settings.sigma_scale,
                 )
                 line_labels = _merged_lines(
-                    recording, path_of_both, line_labels, setting, camera_xy
+                    recording, path_of_both, line_labels, settings, camera_xy
                 )
         else:
             line_labels = closed.labels
@@ -147,20 +147,20 @@ def associate_run(
 
 
 def _associated_locally(
-    recording: Recording, setting: AssociateSettings, camera_xy: ArrayLike, report: Progress
+    recording: Recording, settings: AssociateSettings, camera_xy: ArrayLike, report: Progress
 ) -> tuple[IntArray, IntArray]:
     """Labels from frame to frame; of a run with discs and lines, discs are associated alone."""
     both = len(recording.circles) > 0 and len(recording.lines) > 0
     circle_labels, line_labels = associate_locally(
         recording,
         # Bearings say more of a frame's heading than discs, whose sway would only blur it.
-        replace(setting, tilt_sigma_deg=0.0) if both else setting,
+        replace(settings, tilt_sigma_deg=0.0) if both else settings,
         camera_xy=camera_xy,
         progress=lambda done: report(f"frame {done} of {len(recording)}"),
     )
     if both:
         # Discs help to associate lines; lines are often confused and would only harm the discs.
-        circle_labels, _ = associate_locally(_without_lines(recording), setting)
+        circle_labels, _ = associate_locally(_without_lines(recording), settings)
     return circle_labels, line_labels
 
 
@@ -176,7 +176,7 @@ class _Closed(NamedTuple):
 def _closed_by_parts(
     recording: Recording,
     labels: IntArray,
-    setting: AssociateSettings,
+    settings: AssociateSettings,
     camera_xy: ArrayLike,
     report: Progress,
 ) -> _Closed:
@@ -194,7 +194,7 @@ def _closed_by_parts(
             known = np.concatenate([_HARDLY_ANY[None], part.step_covariance[1:]])
             part = replace(part, step_covariance=known)
         rows = slice(*np.searchsorted(frames, [first, end]))
-        closed = _closed(part, in_order(labels[rows]), setting, camera_xy, report)
+        closed = _closed(part, in_order(labels[rows]), settings, camera_xy, report)
         parts.append(closed)
         stretches.append(
             stretches_of(
@@ -206,7 +206,7 @@ def _closed_by_parts(
     if len(parts) == 1:
         return parts[0]
     report("laying parts on each other")
-    motions, pairs, left = lay_together([part.xy for part in parts], stretches)
+    motions, pairs, left = register_maps([part.xy for part in parts], stretches)
     if left:
         raise SlamError(
             f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "
@@ -217,7 +217,7 @@ def _closed_by_parts(
     own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
     laid = [compose(motion, path) for motion, path in zip(motions, own)]
     labels, _ = merge_labels(frames, together, pairs_by_votes(pairs))
-    whole = _closed(recording, labels, setting, camera_xy, report, np.concatenate(laid))
+    whole = _closed(recording, labels, settings, camera_xy, report, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
     return whole._replace(matches=tuple(matches))
 
@@ -225,7 +225,7 @@ def _closed_by_parts(
 def _closed(
     recording: Recording,
     labels: IntArray,
-    setting: AssociateSettings,
+    settings: AssociateSettings,
     camera_xy: ArrayLike,
     report: Progress,
     path: FloatArray | None = None,
@@ -233,7 +233,7 @@ def _closed(
     """Close all loops, starting from a path (by default odometry)."""
     by_discs = len(recording.circles) > 0
     frames = _frames_of_labels(recording)
-    swayed, search = _swayed(recording, setting), Search()
+    swayed, search = _with_sway(recording, settings), Search()
     none = np.zeros(0, dtype=np.int64)
     if path is not None:  # most of it is in its place already
         search = _EVERYWHERE._replace(
@@ -253,7 +253,7 @@ def _closed(
             path,
             line_xy,
             camera_xy=camera_xy,
-            sigma_scale=setting.sigma_scale,
+            sigma_scale=settings.sigma_scale,
         )
         return found.path, found.circle_xy if by_discs else found.line_xy
 
@@ -271,13 +271,13 @@ def _closed(
         stretches = stretches_of(frames, labels, xy, len(recording))
         spread = _isotropic(len(xy), REACH_M)
         if by_discs:
-            spread = _spread(swayed, path, labels, setting.sigma_scale)
-        pairs = pairs_in_place(stretches, spread, _SAME_PLACE)
-        labels, in_place = merge_labels(frames, labels, pairs)
-        if in_place:
+            spread = _spread(swayed, path, labels, settings.sigma_scale)
+        pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
+        labels, by_position = merge_labels(frames, labels, pairs)
+        if by_position:
             path, xy = solved(path)
         matches += found
-        if matched + in_place == 0 and search == _EVERYWHERE:
+        if matched + by_position == 0 and search == _EVERYWHERE:
             break
         search = _EVERYWHERE
     return _Closed(labels, path, xy, tuple(matches))
@@ -292,20 +292,20 @@ def _without_lines(recording: Recording) -> Recording:
     return replace(recording, lines=LineRows.of())
 
 
-def _swayed(recording: Recording, setting: AssociateSettings) -> Recording:
+def _with_sway(recording: Recording, settings: AssociateSettings) -> Recording:
     """The run with the robot's sway added to its discs' covariances."""
-    if setting.tilt_sigma_rad == 0.0:
+    if settings.tilt_sigma_rad == 0.0:
         return recording
-    moving = setting.tilt_sigma_rad * tilt_jacobian(recording.circles.xy)
+    moving = settings.tilt_sigma_rad * tilt_jacobian(recording.circles.xy)
     covariance = recording.circles.covariance + moving @ moving.swapaxes(1, 2)
     return replace(recording, circles=replace(recording.circles, covariance=covariance))
 
 
 def _without_clutter(
-    recording: Recording, labels: IntArray, path: FloatArray, setting: AssociateSettings
+    recording: Recording, labels: IntArray, path: FloatArray, settings: AssociateSettings
 ) -> IntArray:
     """Labels of discs, -1 for outliers, and for rows of discs with too few rows."""
-    gate = chdtri(2, 1.0 - setting.kept_probability)
+    gate = chdtri(2, 1.0 - settings.kept_probability)
     circles = recording.circles
     kept = np.ones(len(labels), dtype=np.bool_)
     none = np.zeros(0, dtype=np.int64)
@@ -319,7 +319,7 @@ def _without_clutter(
         places[known] = solution.circle_xy
         off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
         kept = squared_mahalanobis(off, circles.covariance) <= gate
-        kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= setting.fewest_rows
+        kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= settings.fewest_rows
     return np.where(kept, labels, -1)
 
 
@@ -349,7 +349,7 @@ def _merged_lines(
     recording: Recording,
     path: FloatArray,
     labels: IntArray,
-    setting: AssociateSettings,
+    settings: AssociateSettings,
     camera_xy: ArrayLike,
 ) -> IntArray:
     """Labels of lines, those at the same position in the map merged, -1 for clutter."""
@@ -358,7 +358,7 @@ def _merged_lines(
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
         stretches = stretches_of(recording.lines.frame, labels, xy, len(recording))
-        pairs = pairs_in_place(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
+        pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:
             break
@@ -366,7 +366,7 @@ def _merged_lines(
     xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)[labels]
     off = bearing_of_vertical(path[lines.frame + 1], xy, camera_xy) - lines.bearing_rad
     # Rows of lines without a position cannot contradict it.
-    gate = lines.sigma_rad * np.sqrt(chdtri(1, 1.0 - setting.kept_probability))
+    gate = lines.sigma_rad * np.sqrt(chdtri(1, 1.0 - settings.kept_probability))
     kept = ~(np.abs(wrap_angle(off)) > gate)
-    kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= setting.fewest_rows
+    kept &= np.bincount(labels[kept], minlength=len(labels))[labels] >= settings.fewest_rows
     return np.where(kept, labels, -1)

@@ -23,7 +23,7 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
-from redetect.slam.association.placing import wake_up
+from redetect.slam.association.registration import localise_globally
 from redetect.slam.commands.files import (
     MAP_NAME,
     MAP_PICTURE,
@@ -134,7 +134,7 @@ def localized_run_of(
     demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
     start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))
     if command.lost:
-        start, covariance = _woken_up(command, recording, landmark_map)
+        start, covariance = _global_start(command, recording, landmark_map)
     localizer = Localizer(
         landmark_map,
         start,
@@ -154,24 +154,24 @@ def localized_run_of(
     return run
 
 
-def _woken_up(
+def _global_start(
     command: Localize, recording: Recording, landmark_map: LandmarkMap
 ) -> tuple[FloatArray, FloatArray]:
     """The pose at the start and its covariance, from the discs of the first frames."""
     if any(command.start) or any(command.start_sigma):
         raise SlamError("--lost and --start: expected one of them")
-    woken = wake_up(recording, landmark_map.discs.xy)
-    if woken is None:
+    found = localise_globally(recording, landmark_map.discs.xy)
+    if found is None:
         raise SlamError(
             f"{command.run}: the discs of the first frames have no certain place in {command.map}: "
             "expected five or more that fit no other place as well; or give the pose by --start"
         )
-    x, y, heading = woken.pose
+    x, y, heading = found.pose
     print(
-        f"located at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {woken.agreeing} "
-        f"of {woken.discs} discs of the first {woken.frames} frames are in the map"
+        f"located at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {found.agreeing} "
+        f"of {found.discs} discs of the first {found.frames} frames are in the map"
     )
-    return woken.pose, woken.covariance
+    return found.pose, found.covariance
 
 
 def _mapped(command: Ekf, recording: Recording) -> _Result:

@@ -10,7 +10,7 @@ import pytest
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply, compose, invert
-from redetect.slam.association.placing import wake_up
+from redetect.slam.association.registration import localise_globally
 from redetect.slam.cli import main
 from redetect.slam.recording import CircleRows, LineRows, Recording
 
@@ -46,15 +46,15 @@ def test_the_pose_is_found_in_a_large_map() -> None:
         rng = np.random.default_rng(seed)
         disc_xy = rng.uniform(0.0, [40.0, 30.0], (300, 2))
         start = np.array([*rng.uniform([5.0, 5.0], [35.0, 25.0]), rng.uniform(-3.0, 3.0)])
-        woken = wake_up(drive(disc_xy, start, seed), disc_xy)
-        assert woken is not None
-        off = compose(invert(start), woken.pose)
+        located = localise_globally(drive(disc_xy, start, seed), disc_xy)
+        assert located is not None
+        off = compose(invert(start), located.pose)
         assert np.hypot(off[0], off[1]) < 0.5
         assert abs(off[2]) < 0.15
-        difference = woken.pose - start
+        difference = located.pose - start
         difference[2] = off[2]
-        squares.append(difference @ np.linalg.solve(woken.covariance, difference) / 3.0)
-        assert woken.agreeing >= 0.5 * woken.discs
+        squares.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
+        assert located.agreeing >= 0.5 * located.discs
     assert 0.05 < np.mean(squares) < 1.5
 
 
@@ -62,8 +62,9 @@ def test_where_the_building_repeats_itself_nothing_is_certain() -> None:
     rng = np.random.default_rng(1)
     room = rng.uniform(0.0, 7.0, (25, 2))
     disc_xy = np.concatenate([room, room + np.array([20.0, 0.0])])
-    assert wake_up(drive(disc_xy, np.array([3.0, 5.0, 0.3]), 1, steps=10), disc_xy) is None
-    one = wake_up(drive(room, np.array([3.0, 5.0, 0.3]), 1, steps=10), room)
+    seen = drive(disc_xy, np.array([3.0, 5.0, 0.3]), 1, steps=10)
+    assert localise_globally(seen, disc_xy) is None
+    one = localise_globally(drive(room, np.array([3.0, 5.0, 0.3]), 1, steps=10), room)
     assert one is not None
     np.testing.assert_allclose(one.pose, [3.0, 5.0, 0.3], atol=0.4)
 
@@ -72,13 +73,13 @@ def test_another_building_has_no_place_for_it() -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         here, there = rng.uniform(0.0, 30.0, (2, 250, 2))
-        assert wake_up(drive(here, np.array([15.0, 15.0, 0.0]), seed), there) is None
+        assert localise_globally(drive(here, np.array([15.0, 15.0, 0.0]), seed), there) is None
 
 
 @pytest.mark.parametrize("count", [0, 4])
 def test_few_discs_are_no_place(count: int) -> None:
     disc_xy = np.random.default_rng(2).uniform(0.0, 5.0, (count, 2))
-    assert wake_up(drive(disc_xy, np.zeros(3), 2), disc_xy) is None
+    assert localise_globally(drive(disc_xy, np.zeros(3), 2), disc_xy) is None
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ from redetect.slam.association.loops import (
     chance_of_agreeing,
     log10_false_alarms,
     motion_onto,
-    settled,
+    refined_motion,
 )
 from redetect.slam.recording import Recording
 
@@ -46,7 +46,7 @@ ANYWHERE = Search(math.inf, math.inf, least_agreeing=5)
 _DRIFT = Search()
 
 
-class Place(NamedTuple):
+class Location(NamedTuple):
     """Location of a constellation in a map."""
 
     pose: FloatArray  # (3,) m, m, rad
@@ -54,7 +54,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Waking:
+class GlobalPose:
     """The pose at the start of a run, in a map."""
 
     pose: FloatArray  # (3,) m, m, rad
@@ -64,7 +64,7 @@ class Waking:
     agreeing: int  # number of these discs that are in the map
 
 
-def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
+def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose | None:
     """The pose at the start of a run from the discs of its first frames; None if not certain.
 
     Identifiers are not used. Takes the map's discs (M, 2) (m).
@@ -80,12 +80,12 @@ def wake_up(recording: Recording, disc_xy: FloatArray) -> Waking | None:
         discs = _merged(at[rows.frame < frames])
         # Without new discs the result would be the same.
         if len(discs) != before:
-            found = placed(discs, disc_xy)
+            found = located(discs, disc_xy)
             if found is not None:
                 pose, pairs = found
                 covariance = _covariance(pose, discs[pairs[:, 1]], disc_xy[pairs[:, 0]])
                 covariance += _drift(recording.step_covariance[:frames], pose, discs)
-                return Waking(pose, covariance, frames, len(discs), len(pairs))
+                return GlobalPose(pose, covariance, frames, len(discs), len(pairs))
         if frames == most:
             return None
         frames, before = min(math.ceil(_MORE * frames), most), len(discs)
@@ -107,9 +107,9 @@ def _merged(xy: FloatArray) -> FloatArray:
     return np.array(means).reshape(-1, 2)
 
 
-def placed(
+def located(
     discs: FloatArray, disc_xy: FloatArray, false_alarms: float = ANYWHERE.false_alarms
-) -> Place | None:
+) -> Location | None:
     """The unique place of a constellation in a map, if there is one.
 
     Takes `discs` (n, 2), `disc_xy` (M, 2) of the map.
@@ -120,7 +120,7 @@ def placed(
     motion = motion_onto(discs, disc_xy, ANYWHERE)
     if motion.agreeing < least:
         return None
-    found = settled(discs, disc_xy, motion.pose, least)
+    found = refined_motion(discs, disc_xy, motion.pose, least)
     if found is None:
         return None
     pose, pairs = found
@@ -133,7 +133,7 @@ def placed(
         rival = motion_onto(discs, others, ANYWHERE)
         if rival.agreeing > _RIVAL_SHARE * len(pairs):
             return None
-    return Place(pose, pairs)
+    return Location(pose, pairs)
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
@@ -156,7 +156,7 @@ def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> 
     return np.asarray(moved + total[2, 2] * np.outer(turned, turned))
 
 
-def lay_together(
+def register_maps(
     places: Sequence[FloatArray], stretches: Sequence[Sequence[Stretch]]
 ) -> tuple[FloatArray, list[IntArray], list[int]]:
     """Register maps in the first one, or in those already registered.
@@ -183,7 +183,7 @@ def lay_together(
     pairs: list[IntArray] = []
     waiting = list(range(1, len(places)))
     while True:
-        laid = ((k, lay_on(stretches[k], xy)) for k in waiting)
+        laid = ((k, register(stretches[k], xy)) for k in waiting)
         k, found = next(((k, found) for k, found in laid if found), (0, None))
         if found is None:
             return motions, pairs, waiting
@@ -196,7 +196,7 @@ def lay_together(
         xy, names = np.concatenate([xy, own[fresh]]), np.append(names, offsets[k] + fresh)
 
 
-def lay_on(
+def register(
     stretches: Sequence[Stretch], xy: FloatArray
 ) -> tuple[FloatArray, list[tuple[IntArray, IntArray]]] | None:
     """The motion that registers a run's map in another one, and the identical landmarks.
@@ -208,7 +208,7 @@ def lay_on(
     stretch, indices into `xy` and labels, both (k,).
     """
     alarms = ANYWHERE.false_alarms / max(len(stretches), 1)
-    tried = [(stretch, placed(stretch.xy, xy, alarms)) for stretch in stretches]
+    tried = [(stretch, located(stretch.xy, xy, alarms)) for stretch in stretches]
     found = [(stretch, place) for stretch, place in tried if place is not None]
     if not found:
         return None
