@@ -10,7 +10,6 @@ import csv
 from dataclasses import dataclass, replace
 from math import degrees, radians
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -54,10 +53,10 @@ def perform(options: Floor) -> int:
     """Execute the command; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     camera = read_camera(options.camera)
-    seen = floor_points(options, (camera.width, camera.height))
+    pixels, floor_xy, radius_m = floor_points(options, (camera.width, camera.height))
     known = covariance_of(camera)
     lens = None if known is None else known[:COUNT, :COUNT]
-    placed = place_on_floor(camera, seen.pixels, seen.xy, lens, seen.radius_m)
+    placed = place_on_floor(camera, pixels, floor_xy, lens, radius_m)
     print(describe_pose(placed))
     if lens is None:
         print("the .cam file has no covariance of the lens: that of the pose is not written")
@@ -178,19 +177,15 @@ def placed_camera(
     )
 
 
-class FloorPoints(NamedTuple):
-    """(N, 2) pixels, (N, 2) places (robot X, Y in m), radius of the circles seen there (m) or 0."""
+def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, FloatArray, float]:
+    """Points on the floor of a .csv file, or of a picture of the board.
 
-    pixels: FloatArray
-    xy: FloatArray
-    radius_m: float = 0.0
-
-
-def floor_points(options: Floor, size: tuple[int, int]) -> FloorPoints:
-    """Points on the floor of a .csv file, or of a picture of the board."""
+    Returns `pixels` (N, 2), places `floor_xy` (N, 2) (robot X, Y in m), and the radius of the
+    circles seen there (m), 0 for points.
+    """
     path = options.floor
     if path.suffix.lower() == ".csv":
-        return FloorPoints(*read_floor_points(path))
+        return *read_floor_points(path), 0.0
     if 0 in (options.columns, options.rows, options.square_m):
         raise CalibrationError(
             "a picture of a board needs --columns, --rows and --square-m of the board; a .csv "
@@ -214,7 +209,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> FloorPoints:
         raise CalibrationError(f"{path}: {error}") from None
     yaw = radians(options.floor_yaw)
     places = on_floor(board.points[indices], options.floor_origin, yaw)[:, :2]
-    return FloorPoints(pixels, places, 0.5 * board.circle_m)
+    return pixels, places, 0.5 * board.circle_m
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
-from redetect.array_types import FloatArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import UNMEASURED_S, MovementProblem
 from redetect.groundtruth.trajectories.streams import (
@@ -75,20 +75,16 @@ def as_localisation(
         return None
     own, _ = interpolate_poses(odometry, thin.measured_s)
     measured = PlanarPoses(thin.measured_s, thin.measured.poses, thin.measured.covariances)
-    usual = np.ones(len(measured), dtype=np.bool_)
-    for _ in range(_TRIMMINGS):
-        motion = planar_alignment(own.only(usual), measured.only(usual))
-        errors = pose_differences(measured.poses, moved_poses(own, motion).poses)
-        off = np.column_stack([np.hypot(errors[:, 0], errors[:, 1]), errors[:, 2]])
-        usual = np.all(np.abs(off) <= _USUAL * np.median(np.abs(off), axis=0), axis=1)
-        if np.count_nonzero(usual) < _FEWEST:
-            return None
-    times_s, errors = measured.times_s[usual], errors[usual]
+    trimmed = _trimmed_alignment(own, measured)
+    if trimmed is None:
+        return None
+    motion, usual = trimmed
+    times_s, there = measured.times_s[usual], moved_poses(own, motion).poses[usual]
+    errors = pose_differences(measured.poses[usual], there)
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
-    positions = moved_poses(own, motion).poses[usual, :2]
-    centre = positions.mean(axis=0)
+    centre = there[:, :2].mean(axis=0)
     position = _stationary(
-        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(positions - centre)
+        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(there[:, :2] - centre)
     )
     heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
@@ -104,12 +100,27 @@ def as_localisation(
     found = LocalisationErrors(
         position.sigma,
         heading.sigma,
-        position.lasting_s,
-        heading.lasting_s,
+        position.correlation_s,
+        heading.correlation_s,
         float(heading.mean[0]),
     )
     aligned = PlanarPoses(aligned.times_s, aligned.poses, spread)
     return _bridged(path, aligned, problem.measured_s, found), found
+
+
+def _trimmed_alignment(
+    own: PlanarPoses, measured: PlanarPoses
+) -> tuple[FloatArray, BoolArray] | None:
+    """Rigid motion (3,) that aligns poses with measured ones, and a mask without gross errors."""
+    usual = np.ones(len(measured), dtype=np.bool_)
+    for _ in range(_TRIMMINGS):
+        motion = planar_alignment(own.only(usual), measured.only(usual))
+        errors = pose_differences(measured.poses, moved_poses(own, motion).poses)
+        off = np.column_stack([np.hypot(errors[:, 0], errors[:, 1]), errors[:, 2]])
+        usual = np.all(np.abs(off) <= _USUAL * np.median(np.abs(off), axis=0), axis=1)
+        if np.count_nonzero(usual) < _FEWEST:
+            return None
+    return motion, usual
 
 
 def _by_motion(from_centre: FloatArray) -> FloatArray:
@@ -124,7 +135,7 @@ class _Stationary(NamedTuple):
     """A process with a deviation and a correlation time about a mean with k unknowns."""
 
     sigma: float
-    lasting_s: float
+    correlation_s: float
     mean: FloatArray  # (k,)
     mean_covariance: FloatArray  # (k, k)
     deviance: float  # Minus twice the log-likelihood
@@ -145,8 +156,8 @@ def _stationary(
     columns = np.concatenate([design, values[:, :, None]], axis=2)[::stride]
 
     def fitted(logarithms: FloatArray) -> _Stationary:
-        sigma, lasting = np.exp(logarithms).tolist()
-        lower = cholesky(sigma**2 * np.exp(-apart / lasting) + noise, lower=True)
+        sigma, correlation = np.exp(logarithms).tolist()
+        lower = cholesky(sigma**2 * np.exp(-apart / correlation) + noise, lower=True)
         white = solve_triangular(lower, columns.reshape(len(columns), -1), lower=True)
         white = white.reshape(-1, columns.shape[2])
         normal = white.T @ white
@@ -155,7 +166,9 @@ def _stationary(
         squared = normal[-1, -1] - normal[:-1, -1] @ mean
         determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(lower)))
         determinant -= np.linalg.slogdet(covariance / _LEVEL_SIGMA**2)[1]
-        return _Stationary(sigma, lasting, mean, covariance, stride * float(squared + determinant))
+        return _Stationary(
+            sigma, correlation, mean, covariance, stride * float(squared + determinant)
+        )
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
@@ -179,7 +192,7 @@ def _bridged(
     times, poses, covariances = path.times_s, path.poses.copy(), path.covariances.copy()
     there, _ = interpolate_poses(aligned, times)
     assert there.covariances is not None
-    lasting = np.array([errors.position_correlation_s] * 2 + [errors.heading_correlation_s])
+    correlation = np.array([errors.position_correlation_s] * 2 + [errors.heading_correlation_s])
     variances = np.square([errors.position_sigma] * 2 + [errors.heading_sigma])
     for gap in np.flatnonzero(np.diff(measured_s) > UNMEASURED_S):
         first = max(int(np.searchsorted(times, measured_s[gap], side="right")) - 1, 0)
@@ -187,9 +200,9 @@ def _bridged(
         within = slice(first + 1, last)
         ends = pose_differences(poses[[first, last]], there.poses[[first, last]])
         after, before = (
-            np.exp(-np.abs(times[within, None] - times[end]) / lasting) for end in (first, last)
+            np.exp(-np.abs(times[within, None] - times[end]) / correlation) for end in (first, last)
         )
-        whole = np.exp(-(times[last] - times[first]) / lasting)
+        whole = np.exp(-(times[last] - times[first]) / correlation)
         by_first = (after - whole * before) / (1.0 - whole**2)
         by_last = (before - whole * after) / (1.0 - whole**2)
         free = 1.0 - by_first - by_last

@@ -116,37 +116,31 @@ class Tracker:
 
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""
-        times = self.sets.times_s
         pose, motion = np.zeros(3), np.zeros(3)
-        last = before = sure = looked = -math.inf
-        segment, begun = -1, 0
-        tracked = False
-        for i, t in enumerate(times.tolist()):
-            if tracked and t - last > self.settings.coast_s:
-                tracked = False
+        # Times of the last set, the last pose, the last one determined in all directions, and the
+        # last search.
+        before_s = posed_s = determined_s = searched_s = -math.inf
+        segment, begun, tracked = -1, 0, False
+        for i, t in enumerate(self.sets.times_s.tolist()):
+            tracked = tracked and t - posed_s <= self.settings.coast_s
             if not tracked:
-                if t - looked < self.settings.acquire_s:
+                if t - searched_s < self.settings.acquire_s:
                     continue
-                looked = t
-                found = acquire(self.sets[i], self.fixed, self.body, self.settings)
-                if found is None:
-                    continue
-                fitted = self._fit(i, found, np.zeros(3), 0.0)
-                if fitted is None:
-                    continue
-                pose, motion, segment, tracked = fitted, np.zeros(3), segment + 1, True
-                last, before, sure, begun = t, t, t, i
-                self.track.segment[i] = segment
-                if self.track.status[i] == OK:
-                    self.track.status[i] = REACQUIRED
+                searched_s = t
+                acquired = self._acquired(i)
+                if acquired is not None:
+                    pose, motion, segment, tracked = acquired, np.zeros(3), segment + 1, True
+                    posed_s = before_s = determined_s = t
+                    begun = i
+                    self.track.segment[i] = segment
                 continue
-            step = t - before
-            before = t
+            step = t - before_s
+            before_s = t
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
-            self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - sure)
-            fitted = self._fit(i, predicted, motion, t - last)
+            self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - determined_s)
+            fitted = self._fit(i, predicted, motion, t - posed_s)
             if fitted is None:
                 self.track.status[i], pose = COASTING, predicted
                 continue
@@ -156,16 +150,24 @@ class Tracker:
             pose = predicted + (_POSE_GAIN + (1.0 - _POSE_GAIN) * young) * error
             if step > 0.0:
                 motion = motion + (_MOTION_GAIN + 0.3 * young) / step * error
-            last = t
-            sure = t if self.track.status[i] == OK else sure
+            posed_s = t
+            determined_s = t if self.track.status[i] == OK else determined_s
         return self._finished()
 
+    def _acquired(self, i: int) -> FloatArray | None:
+        """Pose of set i from its scans alone, if they show the robot."""
+        found = acquire(self.sets[i], self.fixed, self.body, self.settings)
+        pose = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
+        if pose is not None and self.track.status[i] == OK:
+            self.track.status[i] = REACQUIRED
+        return pose
+
     def _fit(
-        self, i: int, predicted: FloatArray, motion: FloatArray, alone_s: float
+        self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
     ) -> FloatArray | None:
-        """Pose of set i, or None and the reason."""
+        """Pose of set i near a prediction over `unseen_s` without poses; None, with a reason."""
         s = self.settings
-        seen = self._points(i, predicted, motion, alone_s)
+        seen = self._points(i, predicted, motion, unseen_s)
         if len(seen.points) < s.least_readings:
             self.track.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
             return None
@@ -182,7 +184,7 @@ class Tracker:
             self.track.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used} readings"
             return None
         far = math.hypot(pose[0] - predicted[0], pose[1] - predicted[1])
-        if far > 0.1 + 2.0 * self.speed * alone_s:
+        if far > 0.1 + 2.0 * self.speed * unseen_s:
             self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
             return None
         beams = explain_set(self.sets[i], self.fixed, self.body, pose)
@@ -202,9 +204,10 @@ class Tracker:
         )
         return pose, count
 
-    def _points(self, i: int, pose: FloatArray, motion: FloatArray, alone_s: float) -> Seen:
+    def _points(self, i: int, pose: FloatArray, motion: FloatArray, unseen_s: float) -> Seen:
+        """New readings of set i where the robot may be."""
         centre = apply(pose, self.body.middle)
-        reach = self.body.radius_m + self.settings.gate_m + self.speed * alone_s
+        reach = self.body.radius_m + self.settings.gate_m + self.speed * unseen_s
         moving = np.array([*motion, *pose[:2]])
         return new_points(self.sets[i], self.fixed, centre, reach, moving)
 

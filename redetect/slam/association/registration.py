@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -44,13 +43,6 @@ _DISC_SIGMA_M = 0.25
 ANYWHERE = Search(math.inf, math.inf, least_agreeing=5)
 # Largest disagreement of stretches of one run, due to the drift of odometry.
 _DRIFT = Search()
-
-
-class Location(NamedTuple):
-    """Location of a constellation in a map."""
-
-    pose: FloatArray  # (3,) m, m, rad
-    pairs: IntArray  # (k, 2): agreeing discs of the map and of the constellation
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +101,11 @@ def _merged(xy: FloatArray) -> FloatArray:
 
 def located(
     discs: FloatArray, disc_xy: FloatArray, false_alarms: float = ANYWHERE.false_alarms
-) -> Location | None:
+) -> tuple[FloatArray, IntArray] | None:
     """The unique place of a constellation in a map, if there is one.
 
-    Takes `discs` (n, 2), `disc_xy` (M, 2) of the map.
+    Takes `discs` (n, 2), `disc_xy` (M, 2) of the map. Returns the constellation's pose (3,) in the
+    map, and the agreeing discs (k, 2) of the map and of the constellation.
     """
     least = ANYWHERE.least_agreeing
     if min(len(discs), len(disc_xy)) < least:
@@ -133,7 +126,7 @@ def located(
         rival = motion_onto(discs, others, ANYWHERE)
         if rival.agreeing > _RIVAL_SHARE * len(pairs):
             return None
-    return Location(pose, pairs)
+    return pose, pairs
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
@@ -209,11 +202,11 @@ def register(
     """
     alarms = ANYWHERE.false_alarms / max(len(stretches), 1)
     tried = [(stretch, located(stretch.xy, xy, alarms)) for stretch in stretches]
-    found = [(stretch, place) for stretch, place in tried if place is not None]
+    found = [(stretch, *place) for stretch, place in tried if place is not None]
     if not found:
         return None
-    poses = np.array([place.pose for _, place in found])
-    middles = np.array([stretch.xy.mean(axis=0) for stretch, _ in found])
+    poses = np.array([pose for _, pose, _ in found])
+    middles = np.array([stretch.xy.mean(axis=0) for stretch, _, _ in found])
     off = np.linalg.norm(apply(poses[:, None], middles) - apply(poses, middles), axis=2)
     turned = np.abs(wrap_angle(poses[:, None, 2] - poses[:, 2]))
     agree = (off <= _DRIFT.most_shift_m) & (turned <= _DRIFT.most_turn_rad)
@@ -221,7 +214,7 @@ def register(
     if 2 * np.count_nonzero(agree[best]) <= len(found):
         return None
     return poses[best], [
-        (place.pairs[:, 0], stretch.labels[place.pairs[:, 1]])
-        for (stretch, place), right in zip(found, agree[best])
+        (pairs[:, 0], stretch.labels[pairs[:, 1]])
+        for (stretch, _, pairs), right in zip(found, agree[best])
         if right
     ]
