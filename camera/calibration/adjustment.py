@@ -112,12 +112,7 @@ class Adjusted:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance (u and v together) between seen and projected."""
-        return rms_px(self.residuals)
-
-
-def rms_px(residuals: FloatArray) -> float:
-    """Root of the mean squared length of (N, 2) residuals."""
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +219,7 @@ def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
 def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adjusted:
     points, span, sigma = problem.points, problem.span, problem.sigma
     residuals = problem.residuals(estimate)
-    weights = robustified((residuals.ravel() / sigma) ** 2, problem.loss)[1].reshape(
-        residuals.shape
-    )
+    _, weights = robustified((residuals / sigma) ** 2, problem.loss)
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.
     psi = weights * residuals / sigma

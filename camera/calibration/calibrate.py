@@ -153,10 +153,6 @@ def calibrate(
         Width and height of the pictures, pixels.
     settings : CalibrationSettings, optional
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     CalibrationError

@@ -24,7 +24,6 @@ from camera.calibration.adjustment import (
     adjust,
     fit_to_centres,
     project_estimate,
-    rms_px,
 )
 from camera.calibration.calibrate import largest_rms_px
 from camera.calibration.images import read_grey
@@ -75,15 +74,9 @@ class FloorPose:
     # (6, 6): of the position (m, robot frame) and of a small rotation from the left (rad, about the
     # robot's axes), in this order; errors of the points and of the intrinsics.
     covariance: FloatArray
-    residuals: FloatArray  # (N, 2): seen less projected, pixels
-    sigma_px: float  # noise of a coordinate that the residuals show
     by_intrinsics: FloatArray  # (6, 14): how the pose follows errors of the intrinsics
+    fit: Adjusted  # the adjusted view, with its residuals
     warnings: tuple[str, ...] = ()
-
-    @property
-    def rms_px(self) -> float:
-        """Root of the mean squared distance between seen and projected."""
-        return rms_px(self.residuals)
 
 
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
@@ -139,12 +132,12 @@ def place_on_floor(
     to_pose[:3, 3:] = -R
     to_pose[:3, :3] = -R @ cross_matrices(estimate.translations[0])
     to_pose[3:, :3] = -R
-    _, by_intrinsics, by_pose = project_estimate(estimate, points)
-    gain = np.linalg.pinv(by_pose.reshape(-1, 6)) @ by_intrinsics.reshape(-1, COUNT)
-    follows = -to_pose @ gain
+    _, pixels_by_intrinsics, pixels_by_pose = project_estimate(estimate, points)
+    gain = np.linalg.pinv(pixels_by_pose.reshape(-1, 6)) @ pixels_by_intrinsics.reshape(-1, COUNT)
+    by_intrinsics = -to_pose @ gain
     covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T
     if intrinsics_covariance is not None:
-        covariance = covariance + follows @ intrinsics_covariance @ follows.T
+        covariance = covariance + by_intrinsics @ intrinsics_covariance @ by_intrinsics.T
     warnings = []
     if fit.rms_px > largest_rms_px(camera.width):
         away = np.linalg.norm(fit.residuals, axis=1)
@@ -154,14 +147,8 @@ def place_on_floor(
             f"worst, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all points right, "
             "is the floor flat, and is it this camera's calibration?"
         )
-    return FloorPose(
-        robot_from_camera=np.column_stack([R, t]),
-        covariance=covariance,
-        residuals=fit.residuals,
-        sigma_px=fit.sigma_px,
-        by_intrinsics=follows,
-        warnings=tuple(warnings),
-    )
+    robot_from_camera = np.column_stack([R, t])
+    return FloorPose(robot_from_camera, covariance, by_intrinsics, fit, tuple(warnings))
 
 
 def placed_camera(
@@ -268,13 +255,13 @@ def _check(pixels: FloatArray, floor: FloatArray, size: tuple[int, int]) -> None
 
 def describe_pose(pose: FloorPose) -> str:
     """The pose with its standard deviations, for people."""
-    sigma = np.sqrt(np.diag(pose.covariance))
+    sigma, fit = np.sqrt(np.diag(pose.covariance)), pose.fit
     R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
     down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
     bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
     return "\n".join(
         [
-            f"pose from {len(pose.residuals)} points on the floor, RMS {pose.rms_px:.3f} px:",
+            f"pose from {len(fit.residuals)} points on the floor, RMS {fit.rms_px:.3f} px:",
             *(
                 f"  {axis} {value:9.5f} m +- {s:.5f}"
                 for axis, value, s in zip(

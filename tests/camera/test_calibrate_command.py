@@ -224,7 +224,7 @@ def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
         shift = found.robot_from_camera[:, 3] - still.robot_from_camera[:, 3]
         error = np.concatenate([shift, vector])
         # The scale is found from 50 residuals, so compare at the true one.
-        covariance = found.covariance * (0.2 / found.sigma_px) ** 2
+        covariance = found.covariance * (0.2 / found.fit.sigma_px) ** 2
         nees.append(error @ np.linalg.solve(covariance, error))
     # 40 trials know the mean to 9 %.
     assert np.mean(nees) == pytest.approx(6.0, rel=0.2)

@@ -32,7 +32,7 @@ def test_circles_on_the_floor_are_seen_through_perspective(published_camera: Cam
     assert away_m[0] > 2e-3
     # The file's rotation has six digits.
     assert away_m[1] < 2e-5
-    assert found.rms_px < 0.1 * naive.rms_px
+    assert found.fit.rms_px < 0.1 * naive.fit.rms_px
 
 
 def test_places_that_contradict_the_camera_are_told(published_camera: Camera) -> None:
