@@ -25,7 +25,7 @@ from redetect.groundtruth.lasers.tracking import (
     UNDETERMINED,
     LaserTrack,
     combined_poses,
-    track_robot,
+    track_by_lasers,
     track_without_suspects,
 )
 from redetect.groundtruth.trajectories.streams import (
@@ -111,7 +111,7 @@ class LaserSessions(_Sessions):
         first = replace(
             sets, times_s=sets.times_s[rows], rows=sets.rows[rows], ages_s=sets.ages_s[rows]
         )
-        track_robot(first, tables, robot)  # compiles
+        track_by_lasers(first, tables, robot)  # compiles
         began = time.process_time()
         track, left_out = track_without_suspects(sets, tables, robot, scanners)
         elapsed = time.process_time() - began

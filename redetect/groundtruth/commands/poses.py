@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.session import (
-    MarkerFrame,
-    Network,
     find_runs,
     group_by_time,
-    read_marker_frames,
     read_network,
+    read_network_frames,
     read_rig,
 )
-from redetect.groundtruth.markers.track import report_entry, track_robot
+from redetect.groundtruth.markers.track import report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
@@ -38,9 +33,9 @@ def perform(command: Poses) -> int:
     check_outputs((output, settings_path, command.tum, command.report), command.force)
     network = read_network(network_path)
     rig = read_rig(rig_path)
-    frames = read_all_frames(runs, network)
+    frames = read_network_frames(runs, network)
     groups = group_by_time(frames, command.settings.time_tolerance_s)
-    track = track_robot(progress(groups, "poses"), rig, network, command.settings)
+    track = track_by_markers(progress(groups, "poses"), rig, network, command.settings)
     poses = track.planar()
     print(
         f"{len(poses)} poses of {len(track.times)} times: "
@@ -76,16 +71,3 @@ def perform(command: Poses) -> int:
         write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0
-
-
-def read_all_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
-    """The markers found in all runs, whose folders have the names of cameras."""
-    frames = []
-    for run in runs:
-        name = run.resolve().name
-        if name not in network.names:
-            raise GroundTruthError(
-                f"{run}: is not a camera of the network: expected one of {', '.join(network.names)}"
-            )
-        frames += read_marker_frames(run, network.names.index(name))
-    return frames

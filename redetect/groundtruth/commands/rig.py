@@ -16,7 +16,6 @@ from redetect.groundtruth.commands.outputs import (
     provenance,
     residual_figures,
 )
-from redetect.groundtruth.commands.poses import read_all_frames
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.rig_estimation import estimate_rig
 from redetect.groundtruth.markers.session import (
@@ -25,6 +24,7 @@ from redetect.groundtruth.markers.session import (
     group_by_time,
     read_marker_frames,
     read_network,
+    read_network_frames,
     read_rig,
     write_rig,
 )
@@ -96,7 +96,7 @@ def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]
     """The cameras, and images grouped by time, or separately without a network's file."""
     if command.network is not None:
         network = read_network(command.network)
-        frames = read_all_frames(command.runs, network)
+        frames = read_network_frames(command.runs, network)
         return network, group_by_time(frames, command.settings.time_tolerance_s)
     count = len(command.runs)
     files = [_calibration(run) for run in command.runs]

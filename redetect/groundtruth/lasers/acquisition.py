@@ -31,10 +31,10 @@ from redetect.groundtruth.lasers.scanners import (
 from redetect.groundtruth.lasers.tracking_kernels import (
     Body,
     FixedScanners,
+    NewReadings,
     OutlineFit,
     OutlinePose,
     ScanSet,
-    Seen,
     explain_set,
     new_points,
     refine_outline,
@@ -265,7 +265,7 @@ _LARGEST_CHI2 = 4.0
 
 
 def refine(
-    seen: Seen,
+    seen: NewReadings,
     start: FloatArray,
     fixed: FixedScanners,
     body: Body,
@@ -340,7 +340,7 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
 
 def _search(
     place: FloatArray,
-    seen: Seen,
+    seen: NewReadings,
     scans: ScanSet,
     fixed: FixedScanners,
     body: Body,

@@ -26,7 +26,7 @@ from redetect.groundtruth.lasers.icp import (
     scan_normals,
 )
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.tracking_kernels import OutlineFit, Seen, refine_outline
+from redetect.groundtruth.lasers.tracking_kernels import NewReadings, OutlineFit, refine_outline
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert, rotation
 
@@ -151,7 +151,7 @@ def fit_to_walls(
     """
     # The kernel moves faces onto points: here the map into the scanners' frame.
     faces = np.vstack([walls, walls[:, [2, 3, 0, 1]]])
-    seen = Seen(
+    seen = NewReadings(
         np.concatenate([apply(mount, scan.points) for mount, scan in zip(mounts, scans)]),
         np.repeat(np.arange(len(scans)), [len(scan.range_m) for scan in scans]),
         np.concatenate([s.direction @ rotation(m[2]).T for m, s in zip(mounts, scans)]),

@@ -22,8 +22,8 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     BeamCounts,
     Body,
     FixedScanners,
+    NewReadings,
     OutlinePose,
-    Seen,
     explain_set,
     new_points,
 )
@@ -196,7 +196,7 @@ class Tracker:
         self._store(i, found, beams)
         return pose
 
-    def _aligned(self, seen: Seen, start: FloatArray) -> tuple[FloatArray, int]:
+    def _aligned(self, seen: NewReadings, start: FloatArray) -> tuple[FloatArray, int]:
         """Pose by the trimmed ICP from a start, and the number of readings used."""
         s = self.settings
         pose, _, count = fit_outline(
@@ -204,14 +204,14 @@ class Tracker:
         )
         return pose, count
 
-    def _points(self, i: int, pose: FloatArray, motion: FloatArray, unseen_s: float) -> Seen:
+    def _points(self, i: int, pose: FloatArray, motion: FloatArray, unseen_s: float) -> NewReadings:
         """New readings of set i where the robot may be."""
         centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * unseen_s
         moving = np.array([*motion, *pose[:2]])
         return new_points(self.sets[i], self.fixed, centre, reach, moving)
 
-    def _refine(self, i: int, seen: Seen, start: FloatArray) -> OutlinePose:
+    def _refine(self, i: int, seen: NewReadings, start: FloatArray) -> OutlinePose:
         found = refine(seen, start, self.fixed, self.body, self.settings, float(self.prior_m[i]))
         calibration = found.by_scanner @ self.fixed.covariance @ found.by_scanner.T
         self.track.noise[i] = found.covariance
@@ -364,7 +364,7 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 
 
-def track_robot(
+def track_by_lasers(
     sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings | None = None
 ) -> LaserTrack:
     """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`)."""
@@ -387,7 +387,7 @@ def track_without_suspects(
     standard deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
-    track = track_robot(sets, fixed, robot, settings)
+    track = track_by_lasers(sets, fixed, robot, settings)
     while len(scanners) - len(left_out) >= 3:
         excess = excess_shifts(track, scanners)
         worst = int(np.argmax(excess))
@@ -399,7 +399,7 @@ def track_without_suspects(
         rows = sets.rows.copy()
         rows[:, worst] = -1
         sets = replace(sets, rows=rows)
-        track = track_robot(sets, fixed, robot, settings)
+        track = track_by_lasers(sets, fixed, robot, settings)
     return track, left_out
 
 

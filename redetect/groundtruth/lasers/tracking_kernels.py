@@ -48,7 +48,7 @@ class Body(NamedTuple):
     symmetries: FloatArray  # (s, 3): motions that change its outline not at all, or not clearly
 
 
-class Seen(NamedTuple):
+class NewReadings(NamedTuple):
     """New readings of a set of scans."""
 
     points: FloatArray  # (n, 2): in the world (m)
@@ -56,9 +56,9 @@ class Seen(NamedTuple):
     direction: FloatArray  # (n, 2): of the beams
     range_m: FloatArray  # (n,)
 
-    def where(self, chosen: BoolArray) -> Seen:
+    def where(self, chosen: BoolArray) -> NewReadings:
         """Those chosen."""
-        return Seen(
+        return NewReadings(
             self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]
         )
 
@@ -108,7 +108,7 @@ class OutlineFit(NamedTuple):
 @kernel()
 def new_points(
     scans: ScanSet, fixed: FixedScanners, centre: FloatArray, reach_m: float, motion: FloatArray
-) -> Seen:
+) -> NewReadings:
     """Points of a set that are nearer than the background and within reach of a position.
 
     `centre` (2,): points farther than `reach_m` from here are ignored. `motion` (5,) of the robot:
@@ -146,7 +146,9 @@ def new_points(
             scanner[n] = s
             range_m[n] = 1e-3 * r
             n += 1
-    return Seen(points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy())
+    return NewReadings(
+        points[:n].copy(), scanner[:n].copy(), direction[:n].copy(), range_m[:n].copy()
+    )
 
 
 @kernel()
@@ -220,7 +222,7 @@ def _hold_open(
 
 @kernel()
 def refine_outline(
-    seen: Seen,
+    seen: NewReadings,
     faces: FloatArray,
     start: FloatArray,
     origins: FloatArray,

@@ -85,7 +85,7 @@ def estimate_network(
     )
 
 
-_Seen = Sequence[Sequence[tuple[BoardView, FloatArray]]]
+_PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
 def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:
@@ -96,7 +96,7 @@ def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:
         raise GroundTruthError(f"camera {view.camera}, board {view.board}: {error}") from None
 
 
-def _estimated_offset(seen: _Seen) -> FloatArray:
+def _estimated_offset(seen: _PosedShots) -> FloatArray:
     """`first_from_second`, from shots in which two cameras, or one, see both faces.
 
     With A_k the pose of the first face in one camera and B_k that of the second in another, the
@@ -131,7 +131,7 @@ def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _chained(
-    names: tuple[str, ...], seen: _Seen, parts: Mapping[str, FloatArray]
+    names: tuple[str, ...], seen: _PosedShots, parts: Mapping[str, FloatArray]
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
     """Poses of cameras (C, 4, 4), and of the double board in each shot, chained from the world."""
     # Estimates of one frame in another: the world has index 0, the cameras follow.
@@ -174,7 +174,7 @@ def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
 def _bundle(
     setup: BoardsFile,
     parts: Mapping[str, FloatArray],
-    seen: _Seen,
+    seen: _PosedShots,
     poses: FloatArray,
     bodies: Mapping[int, FloatArray],
     corner_sigma_px: float,

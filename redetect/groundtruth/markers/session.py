@@ -257,6 +257,19 @@ def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[Ma
     return frames
 
 
+def read_network_frames(runs: Sequence[Path], network: Network) -> list[MarkerFrame]:
+    """The markers found in all runs, whose folders have the names of the network's cameras."""
+    frames = []
+    for run in runs:
+        name = run.resolve().name
+        if name not in network.names:
+            raise GroundTruthError(
+                f"{run}: is not a camera of the network: expected one of {', '.join(network.names)}"
+            )
+        frames += read_marker_frames(run, network.names.index(name))
+    return frames
+
+
 def group_by_time(
     frames: Sequence[MarkerFrame], tolerance_s: float
 ) -> list[tuple[MarkerFrame, ...]]:

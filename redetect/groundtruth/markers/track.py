@@ -82,7 +82,7 @@ class Track:
         )
 
 
-def track_robot(
+def track_by_markers(
     groups: Iterable[tuple[MarkerFrame, ...]],
     rig: Rig,
     network: Network,

@@ -133,7 +133,7 @@ def reference_poses(
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
         elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            references.append(refine_pose(d, still_scans(onboard, time), segments))
+            references.append(refined_by_walls(d, still_scans(onboard, time), segments))
         else:
             references.append(_unrefined(d, "not asked"))
     return references, refused
@@ -155,7 +155,9 @@ def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
     return StillScans(tuple(board.scanner for board in onboard), tuple(scans))
 
 
-def refine_pose(distances: DistancePose, still: StillScans, segments: FloatArray) -> ReferencePose:
+def refined_by_walls(
+    distances: DistancePose, still: StillScans, segments: FloatArray
+) -> ReferencePose:
     """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
     prior, covariance = distances.pose, distances.covariance
     try:

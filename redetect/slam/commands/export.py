@@ -30,11 +30,8 @@ def perform(command: Export | Import) -> int:
     """Execute the command; returns the exit code."""
     if isinstance(command, Import):
         return _import(command)
-    if command.to == "g2o":
-        return _export_g2o(command)
-    if command.to == "tum":
-        return _export_tum(command)
-    return _export_tables(command)
+    export = {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to]
+    return export(command)
 
 
 def _export_g2o(command: Export) -> int:

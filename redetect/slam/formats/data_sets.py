@@ -86,7 +86,7 @@ def _steps_between(
     return between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
 
 
-class _Seen(NamedTuple):
+class _Sightings(NamedTuple):
     """Landmarks that a robot saw."""
 
     times: FloatArray  # (N,): of the frames (s), ascending
@@ -96,7 +96,7 @@ class _Seen(NamedTuple):
     ids: IntArray  # (n,): the landmark
 
 
-def _seen_by_robot(odometry: Path) -> _Seen:
+def _seen_by_robot(odometry: Path) -> _Sightings:
     """The measurements beside a robot's odometry; sightings of other robots are ignored."""
     seen = _table(_beside(odometry, MEASUREMENTS), "time barcode range bearing")
     barcodes = _table(odometry.with_name(BARCODES), "subject barcode")
@@ -105,7 +105,7 @@ def _seen_by_robot(odometry: Path) -> _Seen:
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
-    return _Seen(times, frame, seen[order, 2], seen[order, 3], ids[order])
+    return _Sightings(times, frame, seen[order, 2], seen[order, 3], ids[order])
 
 
 def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:

@@ -31,13 +31,13 @@ from redetect.groundtruth.lasers.tracking import (
     UNDETERMINED,
     UNRESOLVED,
     combined_poses,
-    track_robot,
+    track_by_lasers,
     track_without_suspects,
 )
 from redetect.groundtruth.lasers.tracking_kernels import (
     FixedScanners,
+    NewReadings,
     ScanSet,
-    Seen,
     explain_set,
     new_points,
 )
@@ -87,7 +87,7 @@ def one_set(
     return sets_of_scans(scans)
 
 
-def seen_in(sets: ScanSets, tables: FixedScanners, pose: FloatArray, index: int = 0) -> Seen:
+def seen_in(sets: ScanSets, tables: FixedScanners, pose: FloatArray, index: int = 0) -> NewReadings:
     return new_points(sets[index], tables, pose[:2], 2.0, np.zeros(5))
 
 
@@ -118,7 +118,7 @@ def test_points_are_moved_on_with_the_robot() -> None:
 # --- one set
 
 
-def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: FixedScanners) -> Seen:
+def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: FixedScanners) -> NewReadings:
     """Readings without noise nor rounding."""
     from tests.groundtruth.lasers.scene import cast
 
@@ -133,7 +133,7 @@ def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: FixedScanners
         parts[2].append(beams)
         parts[3].append(ranges[hit])
     points, scanner_index, direction, range_m = (np.concatenate(p) for p in parts)
-    return Seen(points, scanner_index.astype(np.int64), direction, range_m)
+    return NewReadings(points, scanner_index.astype(np.int64), direction, range_m)
 
 
 def test_exact_readings_give_the_exact_pose(
@@ -273,7 +273,7 @@ def errors(times: FloatArray, poses: FloatArray) -> FloatArray:
 
 
 def test_a_track_through_a_loss(recorded: ScanSets, tables: FixedScanners) -> None:
-    track = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
+    track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     t = track.times_s
     gap = (t > 2.02) & (t < 2.98)
     there = ((t > 0.1) & (t < 1.98)) | ((t > 3.1) & (t < 4.95))
@@ -293,7 +293,7 @@ def test_a_track_through_a_loss(recorded: ScanSets, tables: FixedScanners) -> No
 
 
 def test_combined_poses(recorded: ScanSets, tables: FixedScanners) -> None:
-    track = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
+    track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     one, six = combined_poses(track, 1), combined_poses(track, 6)
     good = np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
     assert len(one) == good.sum()
@@ -312,8 +312,8 @@ def test_what_all_readings_share_is_not_averaged_away(
     scanners: tuple[Scanner, ...], recorded: ScanSets, tables: FixedScanners
 ) -> None:
     shared = tables._replace(covariance=np.diag(np.tile([1e-4, 1e-4, 1e-6], 4)))
-    exactly = track_robot(recorded, tables, Robot(FRONTED, 1.0, 1.0))
-    track = track_robot(recorded, shared, Robot(FRONTED, 1.0, 1.0))
+    exactly = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
+    track = track_by_lasers(recorded, shared, Robot(FRONTED, 1.0, 1.0))
     for sets in (1, 6):
         a, b = combined_poses(exactly, sets), combined_poses(track, sets)
         assert a.covariances is not None
@@ -326,7 +326,7 @@ def test_the_front_of_a_plain_box_shows_when_it_drives(
     scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     sets = sets_of_scans(record(scanners, circle, (0.0, 3.0), PLAIN, 12))
-    track = track_robot(sets, tables, Robot(PLAIN, 1.0, 1.0))
+    track = track_by_lasers(sets, tables, Robot(PLAIN, 1.0, 1.0))
     good = np.isin(track.status, (OK, REACQUIRED))
     assert good.mean() > 0.95
     error = errors(track.times_s[good], track.poses[good])
@@ -334,7 +334,7 @@ def test_the_front_of_a_plain_box_shows_when_it_drives(
     assert all("driven forward" in front for front in track.fronts.values())
 
     still = sets_of_scans(record(scanners, lambda t: circle(1.0), (0.0, 1.0), PLAIN, 13))
-    standing = track_robot(still, tables, Robot(PLAIN, 1.0, 1.0))
+    standing = track_by_lasers(still, tables, Robot(PLAIN, 1.0, 1.0))
     assert (standing.status == UNRESOLVED).mean() > 0.9
     assert len(combined_poses(standing)) == 0
 
@@ -344,9 +344,9 @@ def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
 ) -> None:
     shift = np.array([0.04, -0.03, 0.01])
     wrong = (*scanners[:2], replace(scanners[2], pose=scanners[2].pose + shift), scanners[3])
-    track = track_robot(recorded, tables_of(scanners), Robot(FRONTED, 1.0, 1.0))
+    track = track_by_lasers(recorded, tables_of(scanners), Robot(FRONTED, 1.0, 1.0))
     moved = fixed_scanners(wrong, empty_scans(scanners, 7))
-    off = track_robot(recorded, moved, Robot(FRONTED, 1.0, 1.0))
+    off = track_by_lasers(recorded, moved, Robot(FRONTED, 1.0, 1.0))
     size = np.hypot(off.corrections[:, 0], off.corrections[:, 1])
     assert int(np.argmax(size)) == 2
     assert size[2] > 0.005
@@ -374,7 +374,7 @@ def test_a_passer_by_is_marked_and_the_effect_bounded(
         return sides(legs, compose(robot, np.array([2.0 - 2.0 * t, 0.5, 0.0])))
 
     sets = sets_of_scans(record(scanners, circle, (0.0, 2.0), FRONTED, 14, passing))
-    track = track_robot(sets, tables, Robot(FRONTED, 1.0, 1.0))
+    track = track_by_lasers(sets, tables, Robot(FRONTED, 1.0, 1.0))
     good = np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
     near = np.abs(track.times_s - 1.0) < 0.2
     far = np.abs(track.times_s - 1.0) > 0.6

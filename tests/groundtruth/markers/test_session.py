@@ -20,7 +20,7 @@ from redetect.groundtruth.markers.session import (
     read_marker_frames,
     rig_views,
 )
-from redetect.groundtruth.markers.track import report_entry, track_robot
+from redetect.groundtruth.markers.track import report_entry, track_by_markers
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3
 from redetect.landmarks import MarkerCorner
@@ -111,7 +111,7 @@ def test_every_time_is_accounted_for() -> None:
         frames[i] = replace(frames[i], markers=only)
     frames[1] = replace(frames[1], markers=())
     network = replace(NETWORK, cameras=(lens(500.0),) * 4)
-    track = track_robot(group_by_time(frames, 0.005), rig, network, PoseSettings())
+    track = track_by_markers(group_by_time(frames, 0.005), rig, network, PoseSettings())
     assert track.counts["unseen"] == 1
     assert track.counts["resolved"] >= 2
     assert sum(track.counts.values()) == 12
@@ -143,7 +143,7 @@ def test_an_undecided_time_has_no_pose() -> None:
     for seed in range(8):
         (only,) = frames_of(np.zeros(1), pose, cameras=1, sigma_px=0.3, scale_px=500.0, seed=seed)
         only = replace(only, markers=tuple(m for m in only.markers if m.id == 31))
-        track = track_robot([(only,)], rig, network, PoseSettings())
+        track = track_by_markers([(only,)], rig, network, PoseSettings())
         if track.times[0].status == "unresolved":
             undecided += 1
             assert len(track.planar()) == 0
