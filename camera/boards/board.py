@@ -28,6 +28,7 @@ from camera.errors import CalibrationError
 from camera.options import BoardFlags, BoardKind
 from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes
+from redetect.storage.messages import excerpt
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,12 @@ class Board:
     circle_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.columns, self.rows) < 3:
+        counts, counted = (self.columns, self.rows), _WHAT_IS_COUNTED[self.kind]
+        if min(counts) < 3 or max(counts) > _MOST_COUNTED:
+            expected = "at least 3 x 3" if min(counts) < 3 else f"at most {_MOST_COUNTED} each way"
             raise CalibrationError(
-                f"a {self.kind} board of {self.columns} x {self.rows}: expected at least 3 x 3 "
-                f"({_WHAT_IS_COUNTED[self.kind]} are counted)"
+                f"a {self.kind} board of {excerpt(self.columns)} x {excerpt(self.rows)}: expected "
+                f"{expected} ({counted} are counted)"
             )
         if not 0.0 < self.square_m <= _LARGEST_SQUARE_M:
             raise CalibrationError(
@@ -105,6 +108,8 @@ class Board:
 
 # Larger values are assumed to be millimetres.
 _LARGEST_SQUARE_M = 10.0
+# OpenCV fails, or takes hours, with many more.
+_MOST_COUNTED = 1000
 
 # Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
 _NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}

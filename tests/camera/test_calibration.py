@@ -380,6 +380,7 @@ def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> No
     ("arguments", "message"),
     [
         (("checkerboard", 2, 6, 0.04), "at least 3 x 3"),
+        (("checkerboard", 10**12, 7, 0.04), "at most 1000 each way"),
         (("checkerboard", 9, 6, 0.0), "metres above 0"),
         (("checkerboard", 9, 6, 25.0), "square_m is 25: .*25 mm are 0.025"),
         (("charuco", 9, 6, 0.04), "marker_m is 0"),

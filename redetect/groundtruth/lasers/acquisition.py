@@ -79,7 +79,7 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> tuple
     sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
     near = np.where(seen, quantile(ordered, _PASSING), 0.0)
     near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
-    quantum_m = 1e-3 * float(np.gcd.reduce(ranges_mm, axis=None))
+    quantum_m = 1e-3 * float(np.gcd.reduce(ranges_mm[hit]))
     return np.where(seen, np.maximum(near, 0.0), np.inf), quantum_m
 
 

@@ -45,6 +45,14 @@ def test_background_is_learned() -> None:
     assert np.all((near_m[[0, 2, 3]] > 2.85) & (near_m[[0, 2, 3]] < 2.97))
 
 
+def test_codes_of_beams_without_return_hide_no_rounding() -> None:
+    """Scanners write 8191, for example, where nothing is in reach."""
+    ranges = np.full((10, 2), 3010, dtype=np.uint16)
+    ranges[:, 1] = 8191
+    _, quantum_m = learn_background(ranges + np.arange(0, 100, 10, dtype=np.uint16)[:, None], 8.0)
+    assert quantum_m == pytest.approx(0.01)
+
+
 def test_background_raises_no_false_alarm(
     scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
