@@ -265,6 +265,10 @@ def test_two_outputs_in_one_place_are_refused(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_wrong_average_is_refused_before_tracking(tmp_path: Path, capsys: Captured) -> None:
+    refused(["laser", str(tmp_path), "--average", "0"], "average is 0", capsys)
+
+
 def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["poses", "somewhere", "--outlier-sigma", "0"])

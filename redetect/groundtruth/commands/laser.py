@@ -11,6 +11,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner
@@ -29,6 +30,7 @@ from redetect.groundtruth.lasers.tracking import (
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_bytes
+from redetect.storage.bounds import demand, whole
 
 #: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
 _DISTURBED = 3
@@ -36,6 +38,7 @@ _DISTURBED = 3
 
 def perform(options: Laser) -> int:
     """Execute the command; returns the exit code: 1 without a single pose."""
+    demand(options, GroundTruthError, average=whole(1))
     output = options.output or options.session / "laser.csv"
     account, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
     check_outputs([output, account, summary], options.force)
