@@ -39,6 +39,7 @@ from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, wi
 from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import read_text
+from redetect.storage.bounds import FINITE, demand
 from redetect.storage.messages import excerpt
 
 #: Columns of a file of floor points: pixel, and position in the robot frame (m).
@@ -50,6 +51,7 @@ _LARGEST_FILE_BYTES = 1 << 24
 
 def perform(options: Floor) -> int:
     """Execute the command; returns the exit code."""
+    demand(options, CalibrationError, floor_origin=FINITE, floor_yaw=FINITE)
     demand_place(options.output, overwrite=options.force)
     camera = read_camera(options.camera)
     pixels, floor_xy, radius_m = floor_points(options, (camera.width, camera.height))

@@ -311,6 +311,7 @@ def test_what_a_newcomer_gets_wrong(
     assert "not an image" in error("calibrate", str(tmp_path), *FLAGS, *output)
     cam = tmp_path / "c.cam"
     write_camera(rays.camera, cam)
+    assert "floor_yaw is nan" in error("floor", str(cam), "a.png", "--floor-yaw", "nan", *output)
     told = error("floor", str(cam), str(tmp_path / "a.png"), *output)
     assert "--columns, --rows and --square-m" in told
     even = ["--columns", "8", "--rows", "6", "--square-m", "0.04"]
