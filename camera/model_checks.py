@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,6 +97,7 @@ def _is_seen(camera: Camera, pixels: FloatArray) -> BoolArray:
         return np.isfinite(camera.undistort(pixels)[..., 0])
 
 
+@lru_cache(maxsize=16)
 def border_pixels(width: int, height: int, places: int) -> FloatArray:
     """(4 * places, 2) pixels along the border of an image, each side from corner to corner."""
     along = np.linspace(0.0, 1.0, places)

@@ -8,7 +8,6 @@ equal scales are one column, and a coefficient that is kept at 0 has none.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -138,7 +137,7 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
     coef, brown = lens_of(intrinsics)
     r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
     factor = radial_factor(np.array(r_max), coef)
-    border = (_border(width, height) - intrinsics[2:4]) / intrinsics[:2]
+    border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
     reach = r_max * factor
     if any(brown):  # else it is the same in all directions
         edge = r_max * _DIRECTIONS
@@ -150,11 +149,6 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
             period=2.0 * np.pi,
         )
     return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + _FOLD_MARGIN) < reach))
-
-
-@lru_cache(maxsize=16)
-def _border(width: int, height: int) -> FloatArray:
-    return border_pixels(width, height, _BORDER_PLACES)
 
 
 def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:

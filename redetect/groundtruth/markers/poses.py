@@ -243,9 +243,9 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     settings = problem.settings
     found = _refined(problem, _starts(problem)[:1])
     # Least squares may not have reached the right minimum from the solver's start.
-    if not (found and _all_agree(found[0], settings)):
+    if not found or np.any(_disagreeing(found[0], settings)):
         found = _refined(problem, _starts(problem) + _own_poses(problem))
-    if found and _all_agree(found[0], settings):
+    if found and not np.any(_disagreeing(found[0], settings)):
         views = np.ones(problem.views, dtype=np.bool_)
     else:
         views, refined = _consensus(problem)
@@ -257,10 +257,6 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     inflation = _inflation(best)
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
     return PoseEstimate(tuple(candidates), views, log_odds)
-
-
-def _all_agree(refined: RefinedPose, settings: PoseSettings) -> bool:
-    return not np.any(_disagreeing(refined, settings))
 
 
 def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:

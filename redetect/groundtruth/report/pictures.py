@@ -53,9 +53,25 @@ class Series(NamedTuple):
     values: FloatArray
 
 
-def map_figure(words: str, tracks: Sequence[Track], building: FloatArray | None) -> Part:
-    """Walls and paths."""
-    return _map(words, tracks, building, np.zeros((0, 1, 2)))
+def map_figure(
+    words: str,
+    tracks: Sequence[Track],
+    building: FloatArray | None,
+    outlines: Sequence[FloatArray] | FloatArray = (),
+) -> Part:
+    """Walls, paths, and outlines (P, 2) in the first path's colour."""
+    low, high = _bounds(tracks, building)
+    size = np.maximum(_scale(tracks, building) * (high - low), (3.0, 2.0))
+    with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
+        axes = figure.subplots()
+        _draw_paths(axes, tracks, building)
+        for outline in outlines:
+            axes.fill(*outline.T, fc=tracks[0].colour, ec=tracks[0].colour, lw=0.8, alpha=0.3)
+        _frame(axes, low, high)
+        axes.grid(alpha=0.25, lw=0.6)
+        if len(tracks) > 1:
+            axes.legend(fontsize=8)
+    return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
 
 
 def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Part:
@@ -63,7 +79,7 @@ def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Par
     outlines, factor = ellipses(track.poses, _scale([track], building), count)
     size = f"magnified {factor:g} times" if factor > 1.0 else "to scale"
     words = f"{track.label}: path and 3\N{GREEK SMALL LETTER SIGMA} ellipses, {size}."
-    return _map(words, [track], building, outlines)
+    return map_figure(words, [track], building, outlines)
 
 
 def series_figure(
@@ -132,23 +148,6 @@ def _scale(tracks: Sequence[Track], building: FloatArray | None) -> float:
     """Inches on the page per metre."""
     low, high = _bounds(tracks, building)
     return float(min(_WIDE_IN / (high[0] - low[0]), _TALLEST_IN / (high[1] - low[1])))
-
-
-def _map(
-    words: str, tracks: Sequence[Track], building: FloatArray | None, outlines: FloatArray
-) -> Part:
-    low, high = _bounds(tracks, building)
-    size = np.maximum(_scale(tracks, building) * (high - low), (3.0, 2.0))
-    with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
-        axes = figure.subplots()
-        _draw_paths(axes, tracks, building)
-        for outline in outlines:
-            axes.fill(*outline.T, fc=tracks[0].colour, ec=tracks[0].colour, lw=0.8, alpha=0.3)
-        _frame(axes, low, high)
-        axes.grid(alpha=0.25, lw=0.6)
-        if len(tracks) > 1:
-            axes.legend(fontsize=8)
-    return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
 
 
 def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None) -> None:

@@ -71,15 +71,8 @@ def perform(command: Localize | Ekf) -> int:
         source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
     seconds = time.perf_counter() - began
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
-    reference, distance = None, None
-    if command.reference:
-        reference = read_path(command.reference)
-        if len(reference.poses) != len(run.path.poses):
-            raise SlamError(
-                f"{command.reference}: {len(reference.poses)} poses: expected "
-                f"{len(run.path.poses)}, the start and one after each step of the run"
-            )
-        distance = path_distance(run.path, reference.poses)
+    reference = _reference_of(command, run)
+    distance = None if reference is None else path_distance(run.path, reference.poses)
 
     output.mkdir(parents=True, exist_ok=True)
     head = [f"slam {name} {slam.__version__}: {source}"]
@@ -111,6 +104,19 @@ def perform(command: Localize | Ekf) -> int:
     if isinstance(command, Ekf):
         write_map(output / MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0
+
+
+def _reference_of(command: Localize | Ekf, run: FilterRun) -> Path2D | None:
+    """The path to compare with, pose by pose, if a command names one."""
+    if command.reference is None:
+        return None
+    reference = read_path(command.reference)
+    if len(reference.poses) != len(run.path.poses):
+        raise SlamError(
+            f"{command.reference}: {len(reference.poses)} poses: expected "
+            f"{len(run.path.poses)}, the start and one after each step of the run"
+        )
+    return reference
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
