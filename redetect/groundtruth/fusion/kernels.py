@@ -264,6 +264,17 @@ def store(
 
 
 @kernel()
+def _restart(x: FloatArray, p: FloatArray, innovation: FloatArray, variances: FloatArray) -> None:
+    """Set a state's pose to the measured one, with `variances` (3,), in place."""
+    p[:POSE] = 0.0
+    p[:, :POSE] = 0.0
+    for i in range(POSE):
+        p[i, i] = variances[i]
+        x[i] += innovation[i]
+        innovation[i] = 0.0
+
+
+@kernel()
 def filter_forward(
     odometry: Odometry,
     start: FloatArray,
@@ -323,12 +334,7 @@ def filter_forward(
                 innovation[2] = wrap(innovation[2])
             lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
             if lost or rejections >= gating.restart_after:
-                p[:POSE] = 0.0
-                p[:, :POSE] = 0.0
-                for i in range(POSE):
-                    p[i, i] = gating.restart_variances[i]
-                    x[i] += innovation[i]
-                    innovation[i] = 0.0
+                _restart(x, p, innovation, gating.restart_variances)
                 rejections = 0
                 cut = False
                 restarted[k] = WHERE_LOST if lost else AFTER_REJECTIONS

@@ -220,6 +220,81 @@ def _hold_open(
     return open_count, vectors[:, 0].copy()
 
 
+class _NormalEquations(NamedTuple):
+    """Sums over the readings used; the pose's errors are in the outline's frame."""
+
+    h: FloatArray  # (3, 3)
+    g: FloatArray  # (3,)
+    cross: FloatArray  # (3, 3 scanners): of the pose and the scanners' own poses
+    # As in `OutlinePose`
+    information: FloatArray
+    gradient: FloatArray
+    used: int
+    chi2: float
+    squares: float  # Sum of squared distances from the outline (m^2)
+    middle: FloatArray  # (2,): of the readings, in the outline's frame
+
+
+@kernel()
+def _normal_equations(
+    seen: NewReadings,
+    faces: FloatArray,
+    normal: FloatArray,
+    pose: FloatArray,
+    origins: FloatArray,
+    sigmas_m: FloatArray,
+    fit: OutlineFit,
+    nearest: bool,
+) -> _NormalEquations:
+    """The normal equations at a pose; `nearest`: readings belong to the nearest faces."""
+    points, scanner, direction, range_m = seen
+    many = sigmas_m.size
+    h = np.zeros((3, 3))
+    g = np.zeros(3)
+    cross = np.zeros((3, 3 * many))
+    information = np.zeros((many, 3, 3))
+    gradient = np.zeros((many, 3))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    used, chi2, squares = 0, 0.0, 0.0
+    sx = sy = 0.0
+    for i in range(points.shape[0]):
+        dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
+        x, y = c * dx + s * dy, -s * dx + c * dy
+        bx = c * direction[i, 0] + s * direction[i, 1]
+        by = -s * direction[i, 0] + c * direction[i, 1]
+        reach = -1.0 if nearest else range_m[i]
+        face = _face_of(x, y, bx, by, reach, faces, normal, fit.gate_m)
+        if face < 0:
+            continue
+        nx, ny = normal[face, 0], normal[face, 1]
+        e = nx * (x - faces[face, 0]) + ny * (y - faces[face, 1])
+        across = min(nx * bx + ny * by, -fit.least_slope) * sigmas_m[scanner[i]]
+        variance = across * across + fit.floor_m * fit.floor_m
+        if e * e > fit.gate_sigma * fit.gate_sigma * variance:
+            continue
+        w = 1.0 / variance
+        used += 1
+        chi2 += w * e * e
+        squares += e * e
+        sx += x
+        sy += y
+        by_robot = (-nx, -ny, nx * y - ny * x)
+        # By the scanner's pose: the normal in the world, and turning about the scanner.
+        q = scanner[i]
+        wx, wy = c * nx - s * ny, s * nx + c * ny
+        lever = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+        by_scanner = (wx, wy, lever)
+        for a in range(3):
+            g[a] += w * by_robot[a] * e
+            gradient[q, a] += w * by_scanner[a] * e
+            for b in range(3):
+                h[a, b] += w * by_robot[a] * by_robot[b]
+                cross[a, 3 * q + b] += w * by_robot[a] * by_scanner[b]
+                information[q, a, b] += w * by_scanner[a] * by_scanner[b]
+    middle = np.array([sx / max(used, 1), sy / max(used, 1)])
+    return _NormalEquations(h, g, cross, information, gradient, used, chi2, squares, middle)
+
+
 @kernel()
 def refine_outline(
     seen: NewReadings,
@@ -237,8 +312,6 @@ def refine_outline(
     to the nearest one facing the scanner. Readings beyond the gate are ignored, and undetermined
     directions stay at the start (see `OutlineFit`).
     """
-    points, scanner, direction, range_m = seen
-    many = sigmas_m.size
     pose = start.copy()
     normal = np.empty((faces.shape[0], 2))
     for k in range(faces.shape[0]):
@@ -246,65 +319,23 @@ def refine_outline(
         length = math.sqrt(ex * ex + ey * ey)
         normal[k, 0], normal[k, 1] = ey / length, -ex / length
     covariance = np.full((3, 3), np.nan)
-    calibration = np.zeros((3, 3 * many))
-    information = np.zeros((many, 3, 3))
-    gradient = np.zeros((many, 3))
-    rms, open_count, used, chi2 = 0.0, 0, 0, 0.0
+    calibration = np.zeros((3, 3 * sigmas_m.size))
+    rms, open_count = 0.0, 0
     weak = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
     for step in range(fit.steps):
-        h = np.zeros((3, 3))
-        g = np.zeros(3)
-        cross = np.zeros((3, 3 * many))
-        information[:] = 0.0
-        gradient[:] = 0.0
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        used, chi2, squares = 0, 0.0, 0.0
-        sx = sy = 0.0
-        for i in range(points.shape[0]):
-            dx, dy = points[i, 0] - pose[0], points[i, 1] - pose[1]
-            x, y = c * dx + s * dy, -s * dx + c * dy
-            bx = c * direction[i, 0] + s * direction[i, 1]
-            by = -s * direction[i, 0] + c * direction[i, 1]
-            # While the pose may be off, the nearest face.
-            reach = -1.0 if step == 0 else range_m[i]
-            face = _face_of(x, y, bx, by, reach, faces, normal, fit.gate_m)
-            if face < 0:
-                continue
-            nx, ny = normal[face, 0], normal[face, 1]
-            e = nx * (x - faces[face, 0]) + ny * (y - faces[face, 1])
-            across = min(nx * bx + ny * by, -fit.least_slope) * sigmas_m[scanner[i]]
-            variance = across * across + fit.floor_m * fit.floor_m
-            if e * e > fit.gate_sigma * fit.gate_sigma * variance:
-                continue
-            w = 1.0 / variance
-            used += 1
-            chi2 += w * e * e
-            squares += e * e
-            sx += x
-            sy += y
-            by_robot = (-nx, -ny, nx * y - ny * x)
-            # By the scanner's pose: the normal in the world, and turning about the scanner.
-            q = scanner[i]
-            wx, wy = c * nx - s * ny, s * nx + c * ny
-            lever = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
-            by_scanner = (wx, wy, lever)
-            for a in range(3):
-                g[a] += w * by_robot[a] * e
-                gradient[q, a] += w * by_scanner[a] * e
-                for b in range(3):
-                    h[a, b] += w * by_robot[a] * by_robot[b]
-                    cross[a, 3 * q + b] += w * by_robot[a] * by_scanner[b]
-                    information[q, a, b] += w * by_scanner[a] * by_scanner[b]
-        if used < 3:
+        # While the pose may be off, the nearest faces.
+        at = _normal_equations(seen, faces, normal, pose, origins, sigmas_m, fit, step == 0)
+        if at.used < 3:
             break
-        rms = math.sqrt(squares / used)
+        rms = math.sqrt(at.squares / at.used)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
         dx, dy = start[0] - pose[0], start[1] - pose[1]
         to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
-        open_count, v = _hold_open(h, g, np.array([sx / used, sy / used]), to_start, fit)
+        open_count, v = _hold_open(at.h, at.g, at.middle, to_start, fit)
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
-        local_covariance = np.ascontiguousarray(np.linalg.inv(h))
-        delta = -local_covariance @ g
+        local_covariance = np.ascontiguousarray(np.linalg.inv(at.h))
+        delta = -local_covariance @ at.g
         if step == fit.steps - 1 or (
             step > 0 and math.sqrt(delta[0] ** 2 + delta[1] ** 2) + abs(delta[2]) < 1e-6
         ):
@@ -312,14 +343,23 @@ def refine_outline(
         pose[0] += c * delta[0] - s * delta[1]
         pose[1] += s * delta[0] + c * delta[1]
         pose[2] += delta[2]
-    if used >= 3:
+    if at.used >= 3:
         c, s = math.cos(pose[2]), math.sin(pose[2])
         turn_world = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         turned = turn_world @ local_covariance
         covariance = turned @ np.ascontiguousarray(turn_world.T)
-        calibration = -turned @ cross
+        calibration = -turned @ at.cross
     return OutlinePose(
-        pose, covariance, calibration, used, chi2, open_count, rms, weak, information, gradient
+        pose,
+        covariance,
+        calibration,
+        at.used,
+        at.chi2,
+        open_count,
+        rms,
+        weak,
+        at.information,
+        at.gradient,
     )
 
 

@@ -27,8 +27,6 @@ from redetect.plane import apply, fitted, rotation
 _CELL_M = 0.05
 # Landmarks are in order of first sight, so neighbours in this order are near each other.
 _NEIGHBOURS = 5
-
-
 # Largest difference of the lengths of two pairs of landmarks that vote, and least length (m).
 _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
 #: Largest distance of landmarks that agree (m).
@@ -54,9 +52,18 @@ class Search(NamedTuple):
     attached_frames: int = 0
 
 
+class _Cells(NamedTuple):
+    """A grid in which the nearest landmark is looked up."""
+
+    # Its low corner (m).
+    low_x: float
+    low_y: float
+    nearest: IntArray  # (columns, rows): landmark nearest to a cell's centre, -1 if out of reach
+
+
 @kernel()
-def _nearest_by_cell(fixed: FloatArray) -> tuple[float, float, IntArray]:
-    """Low corner, and for every cell the landmark nearest to its centre, -1 if out of reach."""
+def _nearest_by_cell(fixed: FloatArray) -> _Cells:
+    """The grid over landmarks (m, 2)."""
     margin = REACH_M + _CELL_M
     low_x, low_y = fixed[:, 0].min() - margin, fixed[:, 1].min() - margin
     columns = int((fixed[:, 0].max() + margin - low_x) / _CELL_M) + 1
@@ -75,7 +82,43 @@ def _nearest_by_cell(fixed: FloatArray) -> tuple[float, float, IntArray]:
                 if squared < distance[a, b]:
                     distance[a, b] = squared
                     nearest[a, b] = j
-    return low_x, low_y, nearest
+    return _Cells(low_x, low_y, nearest)
+
+
+@kernel()
+def _agreement(
+    offsets: FloatArray,
+    motion: tuple[float, float, float, float],
+    fixed: FloatArray,
+    cells: _Cells,
+    enough: int,
+) -> tuple[int, float]:
+    """Number of landmarks that a motion puts on others, and their squared distances' sum (m^2).
+
+    `offsets` (n, 2) of the moved landmarks from their centre; `motion`: cosine and sine of the
+    rotation, and where it puts the centre. Stops as soon as there cannot be `enough`.
+    """
+    cos, sin, centre_x, centre_y = motion
+    low_x, low_y, nearest = cells
+    columns, rows = nearest.shape
+    n = len(offsets)
+    count, squared = 0, 0.0
+    for i in range(n):
+        if count + n - i < enough:
+            break
+        x, y = offsets[i, 0], offsets[i, 1]
+        at_x, at_y = centre_x + cos * x - sin * y, centre_y + sin * x + cos * y
+        column, row = int((at_x - low_x) / _CELL_M), int((at_y - low_y) / _CELL_M)
+        if at_x < low_x or at_y < low_y or column >= columns or row >= rows:
+            continue
+        j = nearest[column, row]
+        if j >= 0:
+            off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
+            distance = off_x * off_x + off_y * off_y
+            if distance <= REACH_M * REACH_M:
+                count += 1
+                squared += distance
+    return count, squared
 
 
 @kernel()
@@ -93,10 +136,10 @@ def _best_motion(
     for i in range(n):
         centre_x += moved[i, 0] / n
         centre_y += moved[i, 1] / n
+    offsets = moved - np.array([centre_x, centre_y])
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
-    low_x, low_y, nearest = _nearest_by_cell(fixed)
-    columns, rows = nearest.shape
+    cells = _nearest_by_cell(fixed)
     squared_length = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
     for a in range(n):
         for b in range(a + 1, min(a + 1 + _NEIGHBOURS, n)):
@@ -124,23 +167,8 @@ def _best_motion(
                     if math.hypot(shift_x, shift_y) > search.most_shift_m:
                         continue
                     tried += 1
-                    count, squared = 0, 0.0
-                    for i in range(n):
-                        if count + n - i < best_count:
-                            break
-                        x, y = moved[i, 0] - centre_x, moved[i, 1] - centre_y
-                        at_x, at_y = new_x + cos * x - sin * y, new_y + sin * x + cos * y
-                        column = int((at_x - low_x) / _CELL_M)
-                        row = int((at_y - low_y) / _CELL_M)
-                        if at_x < low_x or at_y < low_y or column >= columns or row >= rows:
-                            continue
-                        j = nearest[column, row]
-                        if j >= 0:
-                            off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
-                            distance = off_x * off_x + off_y * off_y
-                            if distance <= REACH_M * REACH_M:
-                                count += 1
-                                squared += distance
+                    motion = (cos, sin, new_x, new_y)
+                    count, squared = _agreement(offsets, motion, fixed, cells, best_count)
                     if count > best_count or (count == best_count and squared < best_squared):
                         best_turn, best_x, best_y = turn, shift_x, shift_y
                         best_count, best_squared = count, squared
