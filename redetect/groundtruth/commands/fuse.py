@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
-from redetect.groundtruth.fusion.fuse import fuse, leave_out
+from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
@@ -23,8 +24,8 @@ from redetect.groundtruth.trajectories.streams import (
 
 def perform(options: Fuse) -> int:
     """Carry out ``groundtruth fuse``; returns the exit code."""
-    account = options.output.with_suffix(".json")
-    check_outputs([options.output, account, options.filtered], options.force)
+    report = options.output.with_suffix(".json")
+    check_outputs([options.output, report, options.filtered], options.force)
     named = {"laser": options.laser, "camera": options.camera}
     files: dict[str, Path] = {name: path for name, path in named.items() if path is not None}
     if not files:
@@ -59,7 +60,12 @@ def perform(options: Fuse) -> int:
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
     if options.filtered is not None:
         write_planar_poses(options.filtered, fusion.filtered, overwrite=options.force)
-    write_json(account, document, overwrite=options.force)
+    write_json(report, document, overwrite=options.force)
+    _print_summary(options, fusion, left_out)
+    return 0
+
+
+def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -> None:
     assert fusion.poses.covariances is not None
     sigma = 1e3 * np.sqrt(
         np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
@@ -92,4 +98,3 @@ def perform(options: Fuse) -> int:
             "unknown, and covariances are increased",
             file=sys.stderr,
         )
-    return 0

@@ -40,8 +40,8 @@ def perform(options: Laser) -> int:
     """Execute the command; returns the exit code: 1 without a single pose."""
     demand(options, GroundTruthError, average=whole(1))
     output = options.output or options.session / "laser.csv"
-    account, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
-    check_outputs([output, account, summary], options.force)
+    per_set, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
+    check_outputs([output, per_set, summary], options.force)
     calibration = options.scanners or options.session / "aligned.json"
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
@@ -50,7 +50,7 @@ def perform(options: Laser) -> int:
 
     poses = combined_poses(track, options.average)
     write_planar_poses(output, poses, overwrite=options.force)
-    write_bytes(account, ("\n".join(account_lines(track)) + "\n").encode(), overwrite=options.force)
+    write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
     content = {**provenance(options.settings, files), "sets_per_pose": options.average, **described}
@@ -78,7 +78,7 @@ def perform(options: Laser) -> int:
     return 0 if len(poses) else 1
 
 
-def account_lines(track: LaserTrack) -> list[str]:
+def set_lines(track: LaserTrack) -> list[str]:
     """A line of JSON for every set of scans."""
     lines = []
     for i, status in enumerate(track.status.tolist()):

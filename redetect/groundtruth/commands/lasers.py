@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
-from redetect.groundtruth.lasers.alignment import align_scanners, icp_by_step, still_scan
+from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step, still_scan
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import (
     Scanner,
@@ -71,7 +72,13 @@ def perform(options: Lasers) -> int:
         draw_alignment(measured, alignment, points, building, by_step),
         overwrite=options.force,
     )
+    _print_differences(measured, alignment, far_off)
+    return 0
 
+
+def _print_differences(
+    measured: Sequence[Scanner], alignment: Alignment, far_off: Sequence[str]
+) -> None:
     for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
         shift = pose_differences(after.pose, before.pose)
         sigma = np.sqrt(np.diag(after.covariance))
@@ -93,7 +100,6 @@ def perform(options: Lasers) -> int:
             f"warning: scanner {name}: its pose on the map disagrees with the other scanners",
             file=sys.stderr,
         )
-    return 0
 
 
 def _sigmas(before: Scanner, after: Scanner) -> float:
