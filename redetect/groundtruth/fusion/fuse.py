@@ -221,10 +221,12 @@ def fuse(
             f"no sample of odometry from the first measured pose ({first:.3f} s) to the last "
             f"({last:.3f} s): expected some, which are the times of the result"
         )
+    # Odometry's random errors, and its systematic errors as part of the state.
     noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)
     inflation = variance_inflation(problem, noise) if chosen.learn_noise else 1.0
     smoothed, spread, innovations = problem.smooth(noise, inflation)
     deviations = _systematic_deviations(spread)
+    # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
     kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], deviations)
     if not np.all(kept):
@@ -238,10 +240,12 @@ def fuse(
         problem = replace(problem, settings=fewer)
         smoothed, spread, innovations = problem.smooth(noise, inflation)
 
+    # Smoothed and filtered path at the samples of odometry.
     at = np.searchsorted(problem.times_s, inside)
     path = _path(inside, smoothed[at], spread[at])
     states, spreads = problem.filtered(noise)
     restarted = innovations.restarted > 0
+    # The errors of a localisation are stationary.
     localisation = None
     if chosen.learn_noise:
         found = as_localisation(last_of_each_time(odometry), problem, over_seconds, path)

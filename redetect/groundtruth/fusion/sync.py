@@ -140,6 +140,7 @@ def _segment(
     if min(len(measured), len(own)) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
     pair = HeadingPair.of(own, measured, reach)
+    # By least squares of headings; by maximum likelihood of headings; and of whole poses.
     clock = _search(pair, bounds)
     jittered = _with_jitter(measured, own)
     best = _most_likely_clock(own, _headings_alone(jittered), pair.reference_s, clock, bounds)
@@ -150,6 +151,7 @@ def _segment(
         moving = _most_likely_clock(own, jittered, pair.reference_s, best.clock, bounds)
         if moving is not None and moving.uncertainty(measured) < best.uncertainty(measured):
             best = moving
+    # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, bounds) if jumps_left > 0 else None
     if place is not None:
         parts = []
@@ -320,6 +322,7 @@ def _most_likely_clock(
             return None
         unit = deviations
     sigmas = _SIGMA_FACTOR * unit
+    # If the drift is not determined, it is 0.
     if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
         around = np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0])
         offset_s = minimize_scalar(

@@ -94,6 +94,7 @@ def estimate_rig(
         raise GroundTruthError(
             f"markers of the dictionaries {dictionaries}: expected markers of one dictionary"
         )
+    # Pairs of markers seen together, and a consensus for each pair.
     ids = tuple(sorted({marker.id for marker in markers}))
     candidates = _bare_rig(dictionaries[0], ids, width_m)
     seen = [rig_views(group, candidates) for group in groups]
@@ -109,6 +110,7 @@ def estimate_rig(
             f"no two markers were seen together {settings.least_support} times in agreement: "
             "expected images that show two or more markers of the rig"
         )
+    # Start: markers chained from the root, without those it is not connected to.
     root = _root(ids, support, reference)
     relative = {pair: consensus.a_from_b for pair, consensus in pairs.items()}
     start = chained_poses(relative, support, len(ids), root)
@@ -126,6 +128,7 @@ def estimate_rig(
     priors: tuple[PosePrior, ...] = ()
     if known is not None:
         start, priors = _in_known_frame(kept_ids, start, known, len(network.cameras))
+    # One bundle adjustment of all markers and all times.
     bundle, views, times = _bundle(solved, rig, renumbered, start, network, settings)
     free = bundle.free.copy()
     free[len(network.cameras) + renumbered[root]] = known is not None
