@@ -24,6 +24,11 @@ IDENTITY: Pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.
 UNPOSED = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, (0.0,) * 5, IDENTITY, IDENTITY)
 
 _COLUMNS, _ROWS = 49, 37
+# Of a covariance, the lower triangle is stored.
+_LOWER = np.tril_indices(PARAMETERS)
+#: Directions of hypothetical verticals: bearings and elevations (rad).
+_BEARINGS = np.linspace(-np.pi, np.pi, 145)
+_ELEVATIONS = np.linspace(-0.7, 0.7, 57)
 
 
 def pixel_grid(width: int, height: int, columns: int = _COLUMNS, rows: int = _ROWS) -> FloatArray:
@@ -72,12 +77,6 @@ def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     variance = np.einsum("ni,ij,nj->n", J, covariance, J).reshape(-1, 2).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(_ROWS, _COLUMNS))
-
-
-_LOWER = np.tril_indices(PARAMETERS)
-#: Directions of hypothetical verticals: bearings and elevations (rad).
-_BEARINGS = np.linspace(-np.pi, np.pi, 145)
-_ELEVATIONS = np.linspace(-0.7, 0.7, 57)
 
 
 def with_covariance(camera: Camera, covariance: FloatArray) -> Camera:

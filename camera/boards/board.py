@@ -30,6 +30,25 @@ from redetect.array_types import FloatArray
 from redetect.storage import demand_place, write_bytes
 from redetect.storage.messages import excerpt
 
+# Larger values are assumed to be millimetres.
+_LARGEST_SQUARE_M = 10.0
+# OpenCV fails, or takes hours, with many more.
+_MOST_COUNTED = 1000
+# Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
+_NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
+_WHAT_IS_COUNTED: dict[str, str] = {
+    "checkerboard": "inner corners",
+    "charuco": "squares",
+    "circles": "circles",
+    "asymmetric-circles": "circles",
+}
+#: Left blank by printers, and for the line of text at the bottom (m).
+_MARGIN_M, _TEXT_M = 0.004, 0.012
+# Length of the printed ruler, and the least width of a page (m).
+_RULER_M, _LEAST_WIDTH_M = 0.1, 0.2
+_M_PER_INCH = 0.0254
+_INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
+
 
 @dataclass(frozen=True)
 class Board:
@@ -106,22 +125,6 @@ class Board:
         return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
 
 
-# Larger values are assumed to be millimetres.
-_LARGEST_SQUARE_M = 10.0
-# OpenCV fails, or takes hours, with many more.
-_MOST_COUNTED = 1000
-
-# Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
-_NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
-
-_WHAT_IS_COUNTED: dict[str, str] = {
-    "checkerboard": "inner corners",
-    "charuco": "squares",
-    "circles": "circles",
-    "asymmetric-circles": "circles",
-}
-
-
 def board_of(flags: BoardFlags) -> Board:
     """The board that flags describe, except `discs`."""
     return Board(
@@ -147,13 +150,6 @@ def charuco_of(board: Board) -> cv2.aruco.CharucoBoard:
         )
     size = board.columns, board.rows
     return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
-
-
-#: Left blank by printers, and for the line of text at the bottom (m).
-_MARGIN_M, _TEXT_M = 0.004, 0.012
-_RULER_M, _LEAST_WIDTH_M = 0.1, 0.2
-_M_PER_INCH = 0.0254
-_INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 
 
 def perform(command: options.Board) -> int:

@@ -48,6 +48,9 @@ _DAMPING = 1e-3
 
 _SMALLEST_DECREASE = 1e-10
 _SCALE_ROUNDS = 6
+# Rounds in which images of circles' centres are corrected, and points of a circle's outline.
+_CIRCLE_ROUNDS = 3
+_OUTLINE_POINTS = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,10 +240,6 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
         covariance=spread * (span @ free @ span.T),
         pose_covariances=spread * poses,
     )
-
-
-_CIRCLE_ROUNDS = 3
-_OUTLINE_POINTS = 32
 
 
 def fit_points(

@@ -32,6 +32,12 @@ from redetect.least_squares.solver import StartError
 FEWEST_VIEWS = 3
 _LARGEST_RMS_PX = 1.0
 _LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+# Residual, in standard deviations, beyond which a point is an outlier.
+_WRONG_POINT = 8.0
+# Outliers are not excluded if fewer points of a picture remain.
+_FEWEST_POINTS = 8
+# Pictures that leave the ratio of the scales more uncertain than this leave it open.
+_ASPECT_SIGMA = 0.003
 
 
 def largest_rms_px(width: int) -> float:
@@ -99,13 +105,6 @@ def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
             "corner: beyond, the distortion is extrapolated"
         )
     return warnings
-
-
-# Residual, in standard deviations, beyond which a point is an outlier.
-_WRONG_POINT = 8.0
-_FEWEST_POINTS = 8
-# Pictures that leave the ratio of the scales more uncertain than this leave it open.
-_ASPECT_SIGMA = 0.003
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,13 @@ if TYPE_CHECKING:
 
 
 _ARROW_SHARE = 0.05
+#: Blue, green, red.
+_FOUND, _PROJECTED, _GRID, _HORIZON = (0, 200, 0), (0, 0, 255), (0, 200, 255), (255, 120, 0)
+#: Width to which small pictures are enlarged, and of the rectified floor (px).
+_LEAST_WIDTH_PX, _RECTIFIED_PX = 900, 800
+#: Extent of the drawn floor to the left and right, and ahead, and spacing of the grid (m).
+_ASIDE_M, _AHEAD_M, _GRID_M = 3.0, 6.0, 0.5
+_POINTS_PER_LINE = 400
 
 
 def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
@@ -97,15 +104,6 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
     axes.set_title("Standard deviation of the projection")
 
 
-#: Blue, green, red.
-_FOUND, _PROJECTED, _GRID, _HORIZON = (0, 200, 0), (0, 0, 255), (0, 200, 255), (255, 120, 0)
-#: Width to which small pictures are enlarged, and of the rectified floor (px).
-_LEAST_WIDTH_PX, _RECTIFIED_PX = 900, 800
-#: Extent of the drawn floor to the left and right, and ahead, and spacing of the grid (m).
-_ASIDE_M, _AHEAD_M, _GRID_M = 3.0, 6.0, 0.5
-_STEPS = 400
-
-
 def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> ByteArray:
     """A board's detected points (circles) and projected points (crosses)."""
     points, estimate = calibration.points, calibration.adjusted.estimate
@@ -128,18 +126,18 @@ def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> Byte
 def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
     """The floor's grid and the horizon in a photograph."""
     picture, scale = _enlarged(image)
-    along = np.linspace(-_ASIDE_M, _ASIDE_M, _STEPS)
-    ahead = -np.linspace(0.0, _AHEAD_M, _STEPS)
+    along = np.linspace(-_ASIDE_M, _ASIDE_M, _POINTS_PER_LINE)
+    ahead = -np.linspace(0.0, _AHEAD_M, _POINTS_PER_LINE)
     for y in -np.arange(0.0, _AHEAD_M + 0.01, _GRID_M):
-        line = camera.project_floor(np.column_stack([along, np.full(_STEPS, y)]))
+        line = camera.project_floor(np.column_stack([along, np.full(_POINTS_PER_LINE, y)]))
         _polyline(picture, line, scale, _GRID, 2 if y % 1.0 == 0.0 else 1)
     for x in np.arange(-_ASIDE_M, _ASIDE_M + 0.01, _GRID_M):
-        line = camera.project_floor(np.column_stack([np.full(_STEPS, x), ahead]))
+        line = camera.project_floor(np.column_stack([np.full(_POINTS_PER_LINE, x), ahead]))
         _polyline(picture, line, scale, _GRID, 2 if x % 1.0 == 0.0 else 1)
     for y in range(1, int(_AHEAD_M) + 1):
         _label(picture, camera.project_floor([0.0, -float(y)]), scale, f"{y} m", _GRID)
-    bearing = np.linspace(-np.pi, np.pi, 4 * _STEPS)
-    level = np.column_stack([np.sin(bearing), -np.cos(bearing), np.zeros(4 * _STEPS)])
+    bearing = np.linspace(-np.pi, np.pi, 4 * _POINTS_PER_LINE)
+    level = np.column_stack([np.sin(bearing), -np.cos(bearing), np.zeros(4 * _POINTS_PER_LINE)])
     _polyline(picture, camera.project_robot(camera.centre + 1e6 * level), scale, _HORIZON, 2)
     return _captioned(
         picture, f"floor: a line every {_GRID_M:g} m, thick every metre; blue: the horizon"

@@ -37,6 +37,14 @@ MODELS: dict[str, dict[Model, int]] = {
     "kalibr": {"radtan": 4, "fisheye": 4},
     "colmap": {"radtan": 4, "rational": 8, "fisheye": 4},
 }
+# Formats by parts of a YAML file's name.
+_YAML_NAMES: dict[str, Format] = {
+    "opencv": "opencv",
+    ".ros.": "ros",
+    "camera_info": "ros",
+    "kalibr": "kalibr",
+    "camchain": "kalibr",
+}
 
 
 def perform(options: Convert) -> int:
@@ -107,15 +115,6 @@ def format_of_name(path: Path) -> Format:
         f"{path}: the name does not say which format: end it in .cam, .opencv.yaml, .ros.yaml, "
         ".kalibr.yaml or cameras.txt"
     )
-
-
-_YAML_NAMES: dict[str, Format] = {
-    "opencv": "opencv",
-    ".ros.": "ros",
-    "camera_info": "ros",
-    "kalibr": "kalibr",
-    "camchain": "kalibr",
-}
 
 
 def format_of_text(path: Path, text: str) -> Format:

@@ -18,6 +18,28 @@ from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
 from redetect.storage.messages import excerpt, one_line
 
 _MOST_CAMERAS = 1000
+# Keys of OpenCV's files in use, and values that mean the fisheye model.
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
+_DISTORTION = (
+    "distortion_coefficients",
+    "dist_coeffs",
+    "distCoeffs",
+    "Distortion_Coefficients",
+    "D",
+)
+_FISHEYE = ("1", "true", "fisheye", "equidistant")
+#: Names of the models in ROS (sensor_msgs/distortion_models.h).
+ROS_NAMES: dict[Model, str] = {
+    "radtan": "plumb_bob",
+    "rational": "rational_polynomial",
+    "fisheye": "equidistant",
+}
+_ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
+    "fisheye": "fisheye"
+}
+_KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
+_KALIBR_COEFFICIENTS = 4
+_LONGEST_LIST = 100
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
@@ -121,17 +143,6 @@ def pinhole_matrix(value: Any, name: str) -> tuple[float, float, float, float]:
     return m[0], m[4], m[2], m[5]
 
 
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
-_DISTORTION = (
-    "distortion_coefficients",
-    "dist_coeffs",
-    "distCoeffs",
-    "Distortion_Coefficients",
-    "D",
-)
-_FISHEYE = ("1", "true", "fisheye", "equidistant")
-
-
 def parse_opencv(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of an OpenCV YAML file."""
     content = parse_yaml(text, name)
@@ -218,17 +229,6 @@ def _yaml_of(content: object) -> str:
     return text
 
 
-#: Names of the models in ROS (sensor_msgs/distortion_models.h).
-ROS_NAMES: dict[Model, str] = {
-    "radtan": "plumb_bob",
-    "rational": "rational_polynomial",
-    "fisheye": "equidistant",
-}
-_ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
-    "fisheye": "fisheye"
-}
-
-
 def parse_ros(text: str, name: str = "<text>") -> ForeignCamera:
     """A camera of the text of a camera_info YAML file, or of an echoed message."""
     return camera_of_info(parse_yaml(text, name), name)
@@ -292,11 +292,6 @@ def format_ros(camera: ForeignCamera) -> str:
             "projection_matrix": matrix(3, *m[:3], 0.0, *m[3:6], 0.0, *m[6:], 0.0),
         }
     )
-
-
-_KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
-_KALIBR_COEFFICIENTS = 4
-_LONGEST_LIST = 100
 
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:

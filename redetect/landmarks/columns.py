@@ -22,6 +22,13 @@ from redetect.landmarks.tilts import FrameTilt
 Kind = Literal["text", "number", "whole number", "whole numbers"]
 TableName = Literal["steps", "circles", "lines", "markers", "tilts"]
 Value = str | float | int | tuple[int, ...] | None
+_TABLE_BY_TYPE: dict[type, TableName] = {
+    Step: "steps",
+    CircleLandmark: "circles",
+    LineLandmark: "lines",
+    MarkerLandmark: "markers",
+    FrameTilt: "tilts",
+}
 
 
 class Column(NamedTuple):
@@ -134,12 +141,3 @@ def values_of(record: Step | Landmark | FrameTilt) -> tuple[Value, ...]:
         return (record.dictionary, record.id, record.quality, *corners)
     names = [field.name for field in fields(record) if field.name != "prefix"]
     return tuple(getattr(record, name) for name in names)
-
-
-_TABLE_BY_TYPE: dict[type, TableName] = {
-    Step: "steps",
-    CircleLandmark: "circles",
-    LineLandmark: "lines",
-    MarkerLandmark: "markers",
-    FrameTilt: "tilts",
-}

@@ -48,6 +48,9 @@ _NUMBER = re.compile(_NUMBER_PATTERN)
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
 # A comment, so that other programs can read the file as well.
 _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
+_STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
+_CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
+_LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
 
 
 def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
@@ -240,11 +243,6 @@ def _ids(words: list[bytes]) -> tuple[int, ...]:
                 f"ID is {excerpt(decode(word))}: expected a whole number, -1 if unknown"
             )
     return tuple(map(int, words))
-
-
-_STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
-_CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
-_LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
 
 
 def format_record(record: Record) -> str:

@@ -16,6 +16,14 @@ from operator import attrgetter
 
 from redetect.storage.messages import OneLineError, excerpt
 
+STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
+CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
+LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
+MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
+MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
+_LARGEST_ID = 2**63 - 1
+_WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
+
 
 class LandmarkError(OneLineError, ValueError):
     """An invalid record; the message names the quantity, its value and what was expected."""
@@ -41,20 +49,10 @@ class LandmarkFileError(LandmarkError):
         super().__init__(f"{place}: {problem}")
 
 
-STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
-CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")
-LINE_NUMBERS = ("xtop", "ytop", "xbottom", "ybottom", "alpha", "beta", "quality", "sigma")
-
 #: The numbers of a record as a tuple.
 numbers_of_step = attrgetter(*STEP_NUMBERS)
 numbers_of_circle = attrgetter(*CIRCLE_NUMBERS)
 numbers_of_line = attrgetter(*LINE_NUMBERS)
-
-MARKER_CORNERS = ("top left", "top right", "bottom right", "bottom left")
-MARKER_CORNER_NUMBERS = ("u", "v", "cuu", "cuv", "cvv")
-
-_LARGEST_ID = 2**63 - 1
-_WORD = re.compile(r"[^# \t\n\r\v\f][^ \t\n\r\v\f]*(?<!\\)")
 
 
 @dataclass(frozen=True, slots=True)

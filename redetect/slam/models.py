@@ -18,6 +18,9 @@ from redetect.plane import apply, between, rotation
 from redetect.slam.errors import SlamError
 from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
+#: Typical height of the camera above the floor (m).
+CAMERA_HEIGHT_M = 1.5
+
 
 @dataclass(frozen=True)
 class OdometryNoise:
@@ -117,10 +120,6 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
     by_disc = np.array(np.broadcast_to(turn, (*seen.shape, 2)))
     turned = np.stack([seen[..., 1], -seen[..., 0]], axis=-1)
     return np.concatenate([-by_disc, turned[..., None]], axis=-1), by_disc
-
-
-#: Typical height of the camera above the floor (m).
-CAMERA_HEIGHT_M = 1.5
 
 
 def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:

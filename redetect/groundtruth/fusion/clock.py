@@ -32,6 +32,25 @@ from redetect.storage.bounded import read_content
 from redetect.storage.bounds import NOT_NEGATIVE, from_to, inside
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
+#: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.
+_RATE, _SECONDS, _SIGMA = inside(0.5, 1.5), from_to(-1e15, 1e15), NOT_NEGATIVE
+# Probability that segments of one line pass the test whether they are.
+_AGREEMENT = 0.999
+_LARGEST_FILE_BYTES = 1 << 28
+# Messages, column and times in logs of ptpd.
+_OFFSET_MESSAGE = re.compile(
+    rf"offset from master:\s*({NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
+)
+_DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({NUMBER})")
+_LEADING_TIME = re.compile(rf"^\s*\[?({NUMBER})\]?[\s,:]")
+_CALENDAR = (
+    "%Y-%m-%d %H:%M:%S.%f",
+    "%Y-%m-%d %H:%M:%S",
+    "%m/%d/%Y %H:%M:%S:%f",
+    "%m/%d/%y %H:%M:%S:%f",
+)
+_OFFSET = "offset from master"
+_PARTS_PER_BILLION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -126,10 +145,6 @@ def read_clock(path: str | os.PathLike[str]) -> ClockModel:
     return ClockModel(segments)
 
 
-#: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.
-_RATE, _SECONDS, _SIGMA = inside(0.5, 1.5), from_to(-1e15, 1e15), NOT_NEGATIVE
-
-
 def _segment(row: JsonObject) -> ClockSegment:
     values: dict[str, Any] = {}
     for name in ClockSegment.__dataclass_fields__:
@@ -149,9 +164,6 @@ def _segment(row: JsonObject) -> ClockSegment:
         raise row.wrong("status", f"one of {', '.join(get_args(Status))}")
     note = row.values.get("note", "")
     return ClockSegment(**values, status=status, note=note if isinstance(note, str) else "")
-
-
-_AGREEMENT = 0.999
 
 
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
@@ -198,22 +210,6 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
             )
         result.append(segment)
     return result
-
-
-_LARGEST_FILE_BYTES = 1 << 28
-_OFFSET_MESSAGE = re.compile(
-    rf"offset from master:\s*({NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
-)
-_DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({NUMBER})")
-_LEADING_TIME = re.compile(rf"^\s*\[?({NUMBER})\]?[\s,:]")
-_CALENDAR = (
-    "%Y-%m-%d %H:%M:%S.%f",
-    "%Y-%m-%d %H:%M:%S",
-    "%m/%d/%Y %H:%M:%S:%f",
-    "%m/%d/%y %H:%M:%S:%f",
-)
-_PARTS_PER_BILLION = 1e-9
-_OFFSET = "offset from master"
 
 
 @dataclass(frozen=True, eq=False)

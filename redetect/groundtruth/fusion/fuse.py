@@ -49,6 +49,10 @@ _DOUBT = 0.001
 _COST_OF_TERM = 2.0
 # Share of its prior deviation below which an estimate counts as measured.
 _MEASURED = 0.5
+# A longer pause in the ground truth begins another segment; fused poses and odometry are not
+# interpolated over a longer one.
+_SEGMENT_GAP_S = 5.0
+_LARGEST_GAP_S = 2.0
 
 
 def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
@@ -291,12 +295,6 @@ def _path(times_s: FloatArray, states: FloatArray, covariances: FloatArray) -> P
     poses = states[:, :POSE].copy()
     poses[:, 2] = wrap_angle(poses[:, 2])
     return PlanarPoses(times_s, poses, covariances[:, :POSE, :POSE].copy())
-
-
-# A longer pause in the ground truth begins another segment; fused poses and odometry are not
-# interpolated over a longer one.
-_SEGMENT_GAP_S = 5.0
-_LARGEST_GAP_S = 2.0
 
 
 @dataclass(frozen=True)

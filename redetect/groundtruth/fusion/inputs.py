@@ -17,19 +17,6 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.plane import between, log_motion
 
-
-def systematic_sigmas(settings: FuseSettings) -> FloatArray:
-    """(3,) prior deviations of turn scale, turn per metre (rad) and distance scale."""
-    s = settings
-    return np.array([s.turn_scale_sigma, s.turn_bias_per_metre_sigma, s.distance_scale_sigma])
-
-
-def noise_of(settings: FuseSettings) -> FloatArray:
-    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
-    s = settings
-    return np.array([s.distance_sigma, s.lateral_sigma, s.turn_sigma, s.turn_per_metre_sigma])
-
-
 #: Noise of a robot at rest, without which covariances would be singular.
 CREEP_M2_PER_S = (1e-4) ** 2
 CREEP_RAD2_PER_S = (1e-4) ** 2
@@ -45,6 +32,18 @@ _PAUSE_INTERVALS = 10.0
 # Possible motion in a pause: at this quantile of the rates over a second.
 _USUAL_RATES_OVER_S = 1.0
 _USUAL_RATES_QUANTILE = 0.9
+
+
+def systematic_sigmas(settings: FuseSettings) -> FloatArray:
+    """(3,) prior deviations of turn scale, turn per metre (rad) and distance scale."""
+    s = settings
+    return np.array([s.turn_scale_sigma, s.turn_bias_per_metre_sigma, s.distance_scale_sigma])
+
+
+def noise_of(settings: FuseSettings) -> FloatArray:
+    """Odometry's random errors: along a metre, across it (m), of a radian, of a metre (rad)."""
+    s = settings
+    return np.array([s.distance_sigma, s.lateral_sigma, s.turn_sigma, s.turn_per_metre_sigma])
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:

@@ -50,6 +50,14 @@ from redetect.groundtruth.trajectories.streams import (
 #: Least duration of a gap without measurements; rejections after a gap are attributed to it.
 UNMEASURED_S = 1.0
 _TURN_PER_METRE = 4
+# The filter restarts after this number of consecutive rejections, with these variances.
+_RESTART_AFTER = 40
+_RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
+# Variance of the heading (rad^2) beyond which another number of full turns is possible.
+_LOST_VARIANCE = 1.0
+# Most linearisations of the smoother, and largest change of the headings at which they end.
+_MOST_STEPS = 5
+_SETTLED_RAD = 1e-3
 
 
 def predicted_backward(
@@ -77,14 +85,6 @@ def predicted_backward(
     )
     states, spreads = history.filtered * mirror, history.filtered_covariance
     return states[::-1], (spreads * mirror * mirror[:, None])[::-1]
-
-
-_RESTART_AFTER = 40
-_RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
-# Variance of the heading (rad^2) beyond which another number of full turns is possible.
-_LOST_VARIANCE = 1.0
-_MOST_STEPS = 5
-_SETTLED_RAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

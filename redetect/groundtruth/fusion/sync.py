@@ -70,6 +70,7 @@ _JUMP_SIGMAS = 3.5
 _LEAST_JUMP_S = 0.004
 _LEAST_PART_S = 5.0
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
+_NO_ODOMETRY = "no odometry"
 
 
 def synchronise(
@@ -116,9 +117,6 @@ def synchronise(
             f"overlap within {bounds.largest_offset_s:g} s"
         )
     return tuple(_interpolated(on_one_line(found)))
-
-
-_NO_ODOMETRY = "no odometry"
 
 
 def _segment(

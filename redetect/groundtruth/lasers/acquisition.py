@@ -46,6 +46,9 @@ from redetect.plane import compose, invert, rotation
 # Least standard deviation of a beam's readings (m); a reading is new if it is this many of them
 # nearer than the beam's nearest object, which is at this quantile of its readings.
 _LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
+# Steps of the refinement, and largest chi2 per degree of freedom of an acquired robot.
+_STEPS = 8
+_LARGEST_CHI2 = 4.0
 
 
 def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> tuple[FloatArray, float]:
@@ -257,13 +260,6 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
     )
 
 
-#: Steps of the refinement.
-_STEPS = 8
-
-_EVERYWHERE_M = 1e6
-_LARGEST_CHI2 = 4.0
-
-
 def refine(
     seen: NewReadings,
     start: FloatArray,
@@ -299,7 +295,7 @@ def acquire(
     differ by more than a symmetry of the outline, None is returned; with a symmetric outline it is
     one of the equivalent poses.
     """
-    seen = new_points(scans, fixed, np.zeros(2), _EVERYWHERE_M, np.zeros(5))
+    seen = new_points(scans, fixed, np.zeros(2), math.inf, np.zeros(5))
     if len(seen.points) < settings.acquire_readings:
         return None
     found: list[tuple[float, FloatArray]] = []

@@ -42,6 +42,10 @@ from redetect.storage.messages import excerpt, one_line
 MOST_READINGS = 4096
 
 _MILLIMETRE = 1e-3
+_LARGEST_FILE_BYTES = 1 << 30
+# Far above what 16 bits hold; longer ranges are read as this, and are no readings then.
+_FARTHEST_M = 1e3
+_ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +175,6 @@ def _scanner(entry: JsonObject) -> Scanner:
         return Scanner(name, pose, covariance, first, step, readings, most, sigma)
     except GroundTruthError as error:
         raise GroundTruthError(f"{entry.place}: {error}") from None
-
-
-_LARGEST_FILE_BYTES = 1 << 30
-_FARTHEST_M = 1e3
-_ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
 @dataclass(frozen=True, eq=False)

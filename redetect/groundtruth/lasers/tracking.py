@@ -41,6 +41,11 @@ _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 _VELOCITY_WINDOW_S = 0.3
 _LARGEST_CHI2 = 9.0
 _FRONT_SAMPLE = 60
+# A scanner is suspect if the others contradict its pose by more, in standard deviations and in m
+# and rad.
+_SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
+#: Sets farther apart than this are not of one block (s).
+LARGEST_GAP_S = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,9 +366,6 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     return out
 
 
-_SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
-
-
 def track_by_lasers(
     sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings | None = None
 ) -> LaserTrack:
@@ -413,10 +415,6 @@ def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArra
             allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
             excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
     return excess
-
-
-#: Sets farther apart than this are not of one block (s).
-LARGEST_GAP_S = 0.05
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:

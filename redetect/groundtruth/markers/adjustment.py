@@ -46,6 +46,9 @@ from redetect.least_squares.solver import (
 )
 
 UNDETERMINED = "the points do not determine all poses"
+# A first, coarse pass has a robust loss.
+_ROBUST, _NEAR = Loss("huber", 3.0), 1e-6
+_PLAIN, _TOLERANCE = Loss(), 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +126,6 @@ def project_chain_with_jacobians(chain: Chain, seen: ChainPoints) -> ChainProjec
 def _by_tangent(by_point: FloatArray, points: FloatArray) -> FloatArray:
     """Chain d(u, v) / d(point) with d(point) / d(v, w) = [I, -[point]x]."""
     return np.concatenate([by_point, -(by_point @ cross_matrices(points))], axis=-1)
-
-
-# Scale of the robust loss of the first, coarse pass.
-_PLAIN, _ROBUST, _NEAR = Loss(), Loss("huber", 3.0), 1e-6
-_TOLERANCE = 1e-15
 
 
 @dataclass(frozen=True, eq=False)

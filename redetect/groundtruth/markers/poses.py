@@ -33,6 +33,15 @@ from redetect.groundtruth.trajectories.transforms import (
 )
 
 _RANSAC_PX = 4.0
+# Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
+_SAME_ANGLE_RAD = 0.01
+_SAME_PLACE_M = 0.005
+# A mirror image that explains all views is close to the estimate from one view alone.
+_FARTHEST_START_PX = 40.0
+# Number of poses by single views from which all views are fitted.
+_OWN_STARTS = 4
+# A robot outside the hall is not a solution: least squares diverged.
+_FARTHEST_M = 1e4
 
 
 def solve_camera(
@@ -204,16 +213,6 @@ def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
         return []
     matrix = np.asarray(found["rig_from_world"].matrix(), dtype=np.float64)
     return [transform(matrix[:, :3], matrix[:, 3])]
-
-
-# Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
-_SAME_ANGLE_RAD = 0.01
-_SAME_PLACE_M = 0.005
-# A mirror image that explains all views is close to the estimate from one view alone.
-_FARTHEST_START_PX = 40.0
-_OWN_STARTS = 4
-# A robot outside the hall is not a solution: least squares diverged.
-_FARTHEST_M = 1e4
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,7 @@ from redetect.storage.messages import excerpt
 
 _QUATERNION_TOLERANCE = 1e-3
 _WIDTH = Bounds("metres above 0", lambda x: x > 0.0)
+DETECTED_NAME = "detected.markers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,9 +200,6 @@ def _joint_covariance(
     matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])
-
-
-DETECTED_NAME = "detected.markers"
 
 
 @dataclass(frozen=True)

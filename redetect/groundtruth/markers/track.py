@@ -28,6 +28,13 @@ from redetect.landmarks import squared_mahalanobis
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
 
 STATUSES: tuple[Status, ...] = get_args(Status)
+# Costs as negative log-likelihoods: skipping a frame is cheaper than two jumps around it, and a
+# robot that was carried elsewhere costs one jump.
+_JUMP_COST = 20.0
+_REJECT_COST = 15.0
+# Most consecutive frames that are skipped, and rounding errors of costs.
+_MOST_LEFT_OUT = 3
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,14 +191,6 @@ def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
         pose = tracked.estimate.candidates[choice.candidate]
     reason = reasons.get(choice.status, "")
     return replace(tracked, status=choice.status, choice=choice, reason=reason, pose=pose)
-
-
-# Costs as negative log-likelihoods: skipping a frame is cheaper than two jumps around it, and a
-# robot that was carried elsewhere costs one jump.
-_JUMP_COST = 20.0
-_REJECT_COST = 15.0
-_MOST_LEFT_OUT = 3
-_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from redetect.groundtruth.markers.rig_estimation import RigEstimate
 from redetect.groundtruth.markers.session import Rig, marker_corners
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import apply, inverse
+from redetect.groundtruth.validation.onboard import OF_A_WALL_M
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
 
@@ -32,6 +33,11 @@ _WIDE_IN, _TALLEST_IN, _SERIES_HIGH_IN = 7.9, 7.9, 2.9
 _MOST_POINTS, _MOST_STAGE_POINTS = 1500, 400
 _BREAK_S = 1.0
 _MOST_VISITS = 12
+_PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from the front"))
+_AXES = ("x", "y", "z")
+_AGREES, _DIFFERS = "#2a78b5", "#d9822b"
+_COLOURS = ("#2a78b5", "#d9822b", "#3a9150", "#8e5bb0", "#b03a48", "#6b6b6b")
+_BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
 class Track(NamedTuple):
@@ -228,11 +234,6 @@ def draw_walls(axes: Axes, building: FloatArray) -> None:
     axes.plot(*ends.reshape(-1, 2).T, color="0.4", lw=1.0, zorder=1)
 
 
-_PLANES = ((0, 1, "from above"), (0, 2, "from the right"), (1, 2, "from the front"))
-_AXES = ("x", "y", "z")
-_AGREES, _DIFFERS = "#2a78b5", "#d9822b"
-
-
 def draw_rig(estimate: RigEstimate) -> bytes:
     """Draw a rig from three sides; returns a PNG's bytes, the same for the same input.
 
@@ -290,9 +291,6 @@ def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
         )  # fmt: skip
 
 
-_COLOURS = ("#2a78b5", "#d9822b", "#3a9150", "#8e5bb0", "#b03a48", "#6b6b6b")
-
-
 def draw_alignment(
     measured: tuple[Scanner, ...],
     alignment: Alignment,
@@ -330,11 +328,6 @@ def draw_alignment(
         steps.set_title("ICP of each scanner to the map, from its measured pose")
         steps.grid(alpha=0.25)
     return content.getvalue()
-
-
-# Points farther than this from every wall are of other objects.
-_OF_A_WALL_M = 0.2
-_BLUE, _ORANGE, _GREY = "#1f5f99", "#c8641e", "0.55"
 
 
 def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
@@ -412,7 +405,7 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
         ):
             points = np.concatenate([plane.apply(p, cloud) for p, cloud in zip(poses, clouds)])
             squared = nearest_on_segments(points, building)[2]
-            near = np.sqrt(squared[squared < _OF_A_WALL_M**2])
+            near = np.sqrt(squared[squared < OF_A_WALL_M**2])
             draw_walls(axes, building)
             axes.plot(points[:, 0], points[:, 1], ".", color=_BLUE, ms=1.5, alpha=0.4, mew=0)
             axes.plot(poses[:, 0], poses[:, 1], "x", color=_ORANGE, ms=4)

@@ -40,6 +40,14 @@ _NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
 _WEAK_SIGMA_M = 0.05
 # Distances and walls disagree if the probability of their difference is below this.
 _DISAGREEMENT_PROBABILITY = 1e-4
+#: Readings farther than this from the wall that their beam meets, and points farther from every
+#: wall, are of other objects (m).
+OF_A_WALL_M = 0.2
+#: Ends of the bins of incidence (deg).
+INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
+# Gates of the rounds in which mounts are refined, and the least deviation of a point from a wall.
+_GATES_M = (0.2, 0.1, 0.05, 0.05, 0.05, 0.05)
+_LEAST_SIGMA_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,15 +196,6 @@ def refined_by_walls(
     return ReferencePose(distances, pose, combined, "used", "", found.used, found.rms_m, still)
 
 
-#: Readings farther than this from the wall that their beam meets are of other objects (m).
-_OF_A_WALL_M = 0.2
-#: Ends of the bins of incidence (deg).
-INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
-# Gates of the rounds in which mounts are refined, and the least deviation of a point from a wall.
-_GATES_M = (0.2, 0.1, 0.05, 0.05, 0.05, 0.05)
-_LEAST_SIGMA_M = 1e-3
-
-
 class RefinedMounts(NamedTuple):
     """Poses of M scanners on the robot."""
 
@@ -239,7 +238,7 @@ def range_errors(
         for mount, scan in zip(reference.still.mounts, reference.still.scans):
             pose = compose(reference.pose, mount)
             far, incidence = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
-            of_a_wall = np.abs(scan.range_m - far) < _OF_A_WALL_M
+            of_a_wall = np.abs(scan.range_m - far) < OF_A_WALL_M
             angles.append(incidence[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])
     return np.concatenate(angles), np.concatenate(errors)

@@ -35,6 +35,16 @@ from redetect.storage.bounds import ABOVE_0
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
 _ENDS = ("point", "fiducial")
 _FARTHEST_M = 1e6
+# Number of bearings, and of headings, to start from; minima closer than this are equal (m, rad).
+_DIRECTIONS, _SAME_M = 12, 1e-4
+# Distances are inconsistent if the probability of their misfit is below this.
+_GROSS_PROBABILITY = 1e-4
+# The best pose is ambiguous if the squared normalised misfit of another is less than this above.
+_AMBIGUITY_CHI2 = 20.0
+# A pose with larger standard deviations is undetermined.
+_LARGEST_SIGMA_M, _LARGEST_SIGMA_DEG = 0.1, 5.0
+DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
+FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +109,6 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
 
 
 Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
-
-# Number of bearings, and of headings, to start from; minima closer than this are equal (m, rad).
-_DIRECTIONS, _SAME_M = 12, 1e-4
-# Distances are inconsistent if the probability of their misfit is below this.
-_GROSS_PROBABILITY = 1e-4
-# The best pose is ambiguous if the squared normalised misfit of another is less than this above.
-_AMBIGUITY_CHI2 = 20.0
-# A pose with larger standard deviations is undetermined.
-_LARGEST_SIGMA_M, _LARGEST_SIGMA_DEG = 0.1, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,10 +259,6 @@ def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
         if not np.any(apart.max(axis=1, initial=0.0) < closer):
             kept.append(i)
     return kept
-
-
-DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
-FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
 
 
 class Dimension(NamedTuple):

@@ -33,6 +33,30 @@ from redetect.slam.association.loop_closing import intersect_bearings, solve_pat
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import Recording
 
+# Probability that a visible vertical gives a row, and standard deviations within which a ray may be
+# that row.
+_DETECTED, _GATE = 0.7, 3.0
+# Number of frames before and after a crossing that are considered.
+_WINDOW = 40
+# Of a point: log likelihood ratio of the rows with it to without.
+_LEAST_SCORE = 4.0
+# Numbers of steps between frames whose rays are intersected.
+_GAPS = np.array([2, 4, 7, 11])
+# Least angle between two intersected rays, in standard deviations, and distances of a point.
+_LEAST_PARALLAX_SIGMAS, _NEAREST_M, _FARTHEST_M = 4.0, 0.3, 14.0
+# Points with fewer rows are none, and with fewer than the second do not correct the path.
+_FEWEST_ROWS, _PATH_ROWS = 3, 6
+_ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
+# Tolerance of bearings beyond the field of view.
+_WIDER_RAD = 0.005
+# Number of times that the frame-to-frame association corrects the path.
+_FIRST_ROUNDS = 2
+# Standard deviation of the path's heading in a single frame, for each round (degrees).
+_HEADING_SIGMA_DEG = (0.2, 0.15, 0.1, 0.1)
+# Factor on the rows' standard deviations, which do not include the detector's errors at edges that
+# are close together; the same for rows that correct the path.
+_SIGMA_SCALE, _PATH_SIGMA_SCALE = 1.5, 2.0
+
 
 class Rays(NamedTuple):
     """Rows of verticals in the map, by frame and bearing."""
@@ -47,22 +71,6 @@ class Rays(NamedTuple):
     start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f
     heading: FloatArray  # (F, 2): cosine and sine of the robot's heading
     widest_rad: float  # half the field of view, below a right angle
-
-
-# Probability that a visible vertical gives a row, and standard deviations within which a ray may be
-# that row.
-_DETECTED, _GATE = 0.7, 3.0
-# Number of frames before and after a crossing that are considered.
-_WINDOW = 40
-# Of a point: log likelihood ratio of the rows with it to without.
-_LEAST_SCORE = 4.0
-# Numbers of steps between frames whose rays are intersected.
-_GAPS = np.array([2, 4, 7, 11])
-# Least angle between two intersected rays, in standard deviations, and largest distance.
-_LEAST_PARALLAX_SIGMAS, _FARTHEST_M = 4.0, 14.0
-_NEAREST_M = 0.3
-_FEWEST_ROWS = 3
-_ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 
 
 @kernel()
@@ -226,19 +234,6 @@ def take_points(
             found[count] = point
             count += 1
     return labels, found[:count].copy()
-
-
-# Tolerance of bearings beyond the field of view.
-_WIDER_RAD = 0.005
-# Number of times that the frame-to-frame association corrects the path.
-_FIRST_ROUNDS = 2
-# Standard deviation of the path's heading in a single frame, for each round (degrees).
-_HEADING_SIGMA_DEG = (0.2, 0.15, 0.1, 0.1)
-# Factor on the rows' standard deviations, which do not include the detector's errors at edges that
-# are close together; the same for rows that correct the path.
-_SIGMA_SCALE, _PATH_SIGMA_SCALE = 1.5, 2.0
-# Points with fewer rows do not correct the path.
-_PATH_ROWS = 6
 
 
 def lines_by_points(

@@ -37,6 +37,18 @@ from redetect.slam.recording import Recording
 
 # Lines with a less certain position have none.
 _LEAST_SIGMA_M = 0.5
+# Standard deviations of a step of the path and of a match of two stretches (rad, m).
+_STEP_SIGMA = (0.005, 0.01)
+_MATCH_SIGMA = (0.02, 0.05)
+# Largest squared error of a loop with random errors of odometry; largest systematic error of each
+# step, in standard deviations.
+_MOST_SQUARED = float(chdtri(3, 1e-6))
+_SYSTEMATIC_SIGMAS = 2.0
+# Weight of a lost step: just enough to keep the equations solvable.
+_LOST_WEIGHT = 1e-3
+NO_STEPS = np.zeros(0, dtype=np.int64)
+# Labels farther apart than this are not compared.
+_FARTHEST_M = 0.35
 
 
 class LabelledMap(NamedTuple):
@@ -105,20 +117,6 @@ def solve_path(
     found = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance).at
     places[known] = found.line_xy
     return LabelledMap(found.poses, found.disc_xy, places)
-
-
-# Standard deviations of a step of the path and of a match of two stretches (rad, m).
-_STEP_SIGMA = (0.005, 0.01)
-_MATCH_SIGMA = (0.02, 0.05)
-# Largest squared error of a loop with random errors of odometry; largest systematic error of each
-# step, in standard deviations.
-_MOST_SQUARED = float(chdtri(3, 1e-6))
-_SYSTEMATIC_SIGMAS = 2.0
-# Weight of a lost step: just enough to keep the equations solvable.
-_LOST_WEIGHT = 1e-3
-NO_STEPS = np.zeros(0, dtype=np.int64)
-# Labels farther apart than this are not compared.
-_FARTHEST_M = 0.35
 
 
 def seen_together(frames: IntArray, labels: IntArray) -> list[set[int]]:

@@ -31,6 +31,17 @@ _NEIGHBOURS = 5
 _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
 #: Largest distance of landmarks that agree (m).
 REACH_M = 0.12
+# A constellation covers the area within this distance of its landmarks.
+_COVER_M = 0.6
+# Spacing at which the area is measured.
+_GRID_M = 0.15
+#: Number of frames whose landmarks form a constellation, and from one constellation to the next.
+STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
+#: Most landmarks of a constellation that is compared with others, at the cost of their number to
+#: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
+MOST_COMPARED = 80
+#: Stretches that share at least this many landmarks are known to be the same place.
+SHARED_BY_ONE_PLACE = 3
 
 
 class Search(NamedTuple):
@@ -175,18 +186,6 @@ def _best_motion(
     if best_count < search.least_agreeing:
         best_count = 0
     return best_turn, best_x, best_y, best_count, tried
-
-
-# A constellation covers the area within this distance of its landmarks.
-_COVER_M = 0.6
-_GRID_M = 0.15
-#: Number of frames whose landmarks form a constellation, and from one constellation to the next.
-STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
-#: Most landmarks of a constellation that is compared with others, at the cost of their number to
-#: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
-MOST_COMPARED = 80
-#: Stretches that share at least this many landmarks are known to be the same place.
-SHARED_BY_ONE_PLACE = 3
 
 
 @dataclass(frozen=True, eq=False)

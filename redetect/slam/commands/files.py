@@ -19,6 +19,8 @@ from redetect.slam.options import RunFlags
 from redetect.slam.recording import Recording, landmark_files, read_recording
 from redetect.storage import write_bytes
 
+MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
+
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
     """The landmark files of a run, of the kinds that a command names."""
@@ -84,9 +86,6 @@ def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) ->
 def default_output(run: Path, name: str = "") -> Path:
     """Folder for a command's results: `slam/<name>` beside the run's landmarks."""
     return (run if run.is_dir() else run.parent) / "slam" / name
-
-
-MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
 
 
 def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:

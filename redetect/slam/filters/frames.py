@@ -31,6 +31,14 @@ from redetect.slam.models import disc_in_robot, move, move_jacobians, tilt_jacob
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 NO_CAMERA = np.zeros(2)
+POSE_SIZE = 3
+_POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
+#: A row shows a new disc if its distance from all known discs is this many times the gate.
+NEW_DISC_GATES = 4.0
+#: Largest distance at which lines are expected to be visible (m), since walls hide others.
+FARTHEST_LINE_M = 15.0
+# Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
+_NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
 
 class FrameRows(NamedTuple):
@@ -111,10 +119,6 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
             recording.circles.only(slice(discs[k], discs[k + 1])),
             recording.lines.only(slice(lines[k], lines[k + 1])),
         )
-
-
-POSE_SIZE = 3
-_POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
 
 
 class Filter(ABC):
@@ -341,14 +345,6 @@ def numbers_from(slots: ArrayLike, size: int) -> IntArray:
 
 
 Association = Literal["known", "nearest", "joint"]
-
-#: A row shows a new disc if its distance from all known discs is this many times the gate.
-NEW_DISC_GATES = 4.0
-#: Largest distance at which lines are expected to be visible (m), since walls hide others.
-FARTHEST_LINE_M = 15.0
-
-# Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
-_NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,14 @@ LARGEST_NUMBER = 2**31 - 1
 _LARGEST_BYTES = 1 << 28
 # Less has no finite inverse (m^-2, rad^-2).
 _LEAST_INFORMATION = 1e-100
+_POSE, _DISC, _STEP, _SIGHT, _FIX = "VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX"
+# For each kind of row: its number of vertices, and its numbers.
+_KINDS = {
+    _POSE: (1, ("x", "y", "theta")),
+    _DISC: (1, ("x", "y")),
+    _STEP: (2, ("dx", "dy", "dphi", "I11", "I12", "I13", "I22", "I23", "I33")),
+    _SIGHT: (2, ("x", "y", "I11", "I12", "I22")),
+}
 
 
 class RunGraph(NamedTuple):
@@ -125,16 +133,6 @@ def _inverses(matrices: FloatArray) -> FloatArray:
 
 def _numbers(values: FloatArray) -> str:
     return " ".join(map(repr, values.tolist()))
-
-
-_POSE, _DISC, _STEP, _SIGHT, _FIX = "VERTEX_SE2", "VERTEX_XY", "EDGE_SE2", "EDGE_SE2_XY", "FIX"
-# For each kind of row: its number of vertices, and its numbers.
-_KINDS = {
-    _POSE: (1, ("x", "y", "theta")),
-    _DISC: (1, ("x", "y")),
-    _STEP: (2, ("dx", "dy", "dphi", "I11", "I12", "I13", "I22", "I23", "I33")),
-    _SIGHT: (2, ("x", "y", "I11", "I12", "I22")),
-}
 
 
 class _Row(NamedTuple):

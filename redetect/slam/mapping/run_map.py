@@ -33,6 +33,13 @@ from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
 
+# Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
+_FEWEST_SHARED = 2
+# Tolerance before the final optimisation.
+_COARSE = 1e-3
+# Multiples of the scale of a non-convex loss, from nearly least squares down.
+_GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
+
 
 @dataclass(frozen=True)
 class ChiSquared:
@@ -109,13 +116,6 @@ def as_json(table: ChiSquared) -> dict[str, float | int | None]:
 
 
 Solver = Literal["separable", "gtsam"]
-
-# Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
-_FEWEST_SHARED = 2
-# Tolerance before the final optimisation.
-_COARSE = 1e-3
-# Multiples of the scale of a non-convex loss, from nearly least squares down.
-_GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 
 @dataclass(frozen=True)
