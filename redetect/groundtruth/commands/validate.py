@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.fusion.clock import ClockModel, read_clock
+from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
@@ -65,12 +65,23 @@ def perform(options: Validate) -> int:
         raise GroundTruthError(f"{session / 'distances.csv'}: no distances in it")
     poses = read_planar_poses(options.poses)
     files = [session / "fiducials.json", session / "distances.csv", options.poses]
-    refinement = _Refinement()
+    onboard: list[Onboard] = []
+    clock, segments, clock_path = None, None, None
     if options.refine == "scans":
-        refinement = _read_refinement(session, options.clock)
-    segments, clock = refinement.segments, refinement.clock
+        map_file = find_building(session)
+        segments = read_building(map_file)
+        onboard, scan_files = _onboard(session)
+        beside = session / "clock.json"
+        clock_path = options.clock or (beside if beside.is_file() else None)
+        if onboard and clock_path is None:
+            print(
+                "warning: no clock.json: the times of the on-board scans are not corrected",
+                file=sys.stderr,
+            )
+        clock = None if clock_path is None else read_clock(clock_path)
+        files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     solved = poses_from_distances(survey, measured)
-    references, refused = reference_poses(solved, refinement.onboard, segments, clock)
+    references, refused = reference_poses(solved, onboard, segments, clock)
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
@@ -86,9 +97,9 @@ def perform(options: Validate) -> int:
     if score.normalised:
         figures["normalised_band"] = normalised_band(score.normalised)
     content = {
-        **provenance({"refine": options.refine}, [*files, *refinement.files]),
+        **provenance({"refine": options.refine}, files),
         "poses": str(options.poses.name),
-        "clock": None if clock is None else refinement.files[-1].name,
+        "clock": None if clock_path is None else clock_path.name,
         "figures": figures,
         "published": [asdict(published) for published in PUBLISHED],
         "refused": [asdict(r) for r in (*refused, *without)],
@@ -200,33 +211,6 @@ def summary_lines(
             f"{p.angle_sigma_deg:.2f} (published)"
         )
     return lines
-
-
-class _Refinement(NamedTuple):
-    """What reference poses are refined with: nothing by default."""
-
-    onboard: Sequence[Onboard] = ()
-    segments: FloatArray | None = None  # of the map
-    clock: ClockModel | None = None
-    files: Sequence[Path] = ()  # those read; the clock's last, if there is one
-
-
-def _read_refinement(session: Path, clock_path: Path | None) -> _Refinement:
-    map_file = find_building(session)
-    segments = read_building(map_file)
-    onboard, files = _onboard(session)
-    beside = session / "clock.json"
-    if clock_path is None and beside.is_file():
-        clock_path = beside
-    if clock_path is not None:
-        clock = read_clock(clock_path)
-        return _Refinement(onboard, segments, clock, (map_file, *files, clock_path))
-    if onboard:
-        print(
-            "warning: no clock.json: the times of the on-board scans are not corrected",
-            file=sys.stderr,
-        )
-    return _Refinement(onboard, segments, None, (map_file, *files))
 
 
 def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
