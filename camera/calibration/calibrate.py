@@ -152,6 +152,10 @@ def calibrate(
         Width and height of the pictures, pixels.
     settings : CalibrationSettings, optional
 
+    Returns
+    -------
+    Calibration
+
     Raises
     ------
     CalibrationError
