@@ -165,6 +165,10 @@ def convert_to_foreign(
     free : int, optional
         Number of the model's first coefficients that may differ from 0; by default all.
 
+    Returns
+    -------
+    Converted
+
     Raises
     ------
     ConversionError
