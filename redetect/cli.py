@@ -28,6 +28,11 @@ DIRECT = ("compare", "draw", "view", "report", "tune", "export", "explain", "dem
 
 _QUIET = ("-q", "--quiet")
 
+_HEAD = (
+    "Landmarks with covariances from a calibrated camera's images, and their uses.\n\n"
+    "Example: redetect detect all images/e"
+)
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
@@ -67,12 +72,6 @@ def _help() -> str:
     for name in DIRECT:
         lines.append(f"  {name:12} {(direct[name].__doc__ or '').splitlines()[0]}")
     return "\n".join([*lines, "", FOR_ALL, ""])
-
-
-_HEAD = (
-    "Landmarks with covariances from a calibrated camera's images, and their uses.\n\n"
-    "Example: redetect detect all images/e"
-)
 
 
 def _write_completion(words: list[str]) -> None:

@@ -114,6 +114,9 @@ _COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
 #: Working space of fits, reused from one to the next. Its contents need not be initialised.
 WORK = np.dtype([("patch", PATCH), ("rows", np.float32, (_TERMS, CAPACITY))])
 
+#: One working space per thread: memory allocated anew for every image would cause page faults.
+_kept = threading.local()
+
 
 class Scene(NamedTuple):
     """An image and what its fits need."""
@@ -610,10 +613,6 @@ def _covariance_by_parts(
         xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
     scale = _INFLATION * (count - _STRETCH) / (count * _STRETCH)
     return scale * xx + noise[0], scale * xy + noise[1], scale * yy + noise[2]
-
-
-#: One working space per thread: memory allocated anew for every image would cause page faults.
-_kept = threading.local()
 
 
 def working_space() -> NDArray[Any]:

@@ -50,6 +50,35 @@ SHARE, BY_BLUR_1, BY_BLUR_2, BY_RADIUS, BY_X, BY_Y = range(6)
 
 PIXEL_VARIANCE = 1.0 / 12.0
 
+#: Domain of the polynomial Q, and its coefficients: rows are powers of z, columns powers of t.
+Z_LIMIT, T_LIMIT = 4.0, 0.4
+BEND = (
+    (-1.764051e-01, 9.261172e-01, -9.298910e-01),
+    (-1.769709e-01, -1.028644e00, 1.689269e00),
+    (6.787577e-01, -3.150550e00, 3.804857e00),
+    (-2.493398e-01, 2.102750e00, -3.483120e00),
+    (-2.104200e-01, 9.209596e-01, -7.555281e-01),
+    (2.401504e-02, -2.055932e-01, 2.540854e-01),
+)
+((_Q00, _Q01, _Q02), (_Q10, _Q11, _Q12), (_Q20, _Q21, _Q22),
+ (_Q30, _Q31, _Q32), (_Q40, _Q41, _Q42), (_Q50, _Q51, _Q52)) = (
+    tuple(F32(q) for q in row) for row in BEND
+)  # fmt: skip
+_3, _4, _5 = F32(3.0), F32(4.0), F32(5.0)
+_Z_LIMIT, _T_LIMIT = F32(Z_LIMIT), F32(T_LIMIT)
+#: The domain is cut off at the disc's centre, z = -1 / t.
+_Z_PER_T = F32((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
+_ASIDE = F32(1e-6)
+#: Gauss-Legendre quadrature at four nodes, two to either side of the middle.
+_NEAR_NODE, _FAR_NODE = F32(0.3399810436), F32(0.8611363116)
+_NEAR_WEIGHT, _FAR_WEIGHT = F32(0.6521451549), F32(0.3478548451)
+#: The kernel across the chords: its reach in deviations, and its height.
+_KERNEL_REACH = math.sqrt(7.0)
+_KERNEL_HEIGHT = F32(15.0 / 16.0)
+#: Steps along the chords get longer or shorter by at most this share over the blur.
+_MOST_BEND = F32(0.7)
+_SMALLEST = F32(1e-6)
+
 
 class Disc(NamedTuple):
     """A disc, relative to its candidate and in nominal radii."""
@@ -114,27 +143,6 @@ def arcsine(x: float) -> float:
     return signed
 
 
-#: Domain of the polynomial Q, and its coefficients: rows are powers of z, columns powers of t.
-Z_LIMIT, T_LIMIT = 4.0, 0.4
-BEND = (
-    (-1.764051e-01, 9.261172e-01, -9.298910e-01),
-    (-1.769709e-01, -1.028644e00, 1.689269e00),
-    (6.787577e-01, -3.150550e00, 3.804857e00),
-    (-2.493398e-01, 2.102750e00, -3.483120e00),
-    (-2.104200e-01, 9.209596e-01, -7.555281e-01),
-    (2.401504e-02, -2.055932e-01, 2.540854e-01),
-)
-((_Q00, _Q01, _Q02), (_Q10, _Q11, _Q12), (_Q20, _Q21, _Q22),
- (_Q30, _Q31, _Q32), (_Q40, _Q41, _Q42), (_Q50, _Q51, _Q52)) = (
-    tuple(F32(q) for q in row) for row in BEND
-)  # fmt: skip
-_3, _4, _5 = F32(3.0), F32(4.0), F32(5.0)
-_Z_LIMIT, _T_LIMIT = F32(Z_LIMIT), F32(T_LIMIT)
-#: The domain is cut off at the disc's centre, z = -1 / t.
-_Z_PER_T = F32((Z_LIMIT - 1.0 / T_LIMIT) / T_LIMIT)
-_ASIDE = F32(1e-6)
-
-
 @kernel(forceinline=True, fastmath=FASTMATH)
 def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
     """W from the profile of a curved edge, for the first n pixels.
@@ -191,17 +199,6 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         shares[BY_RADIUS, i] = -per_radius - by_t * t * per_r0
         shares[BY_X, i] = -per_radius * nx
         shares[BY_Y, i] = -per_radius * ny
-
-
-#: Gauss-Legendre quadrature at four nodes, two to either side of the middle.
-_NEAR_NODE, _FAR_NODE = F32(0.3399810436), F32(0.8611363116)
-_NEAR_WEIGHT, _FAR_WEIGHT = F32(0.6521451549), F32(0.3478548451)
-#: The kernel across the chords: its reach in deviations, and its height.
-_KERNEL_REACH = math.sqrt(7.0)
-_KERNEL_HEIGHT = F32(15.0 / 16.0)
-#: Steps along the chords get longer or shorter by at most this share over the blur.
-_MOST_BEND = F32(0.7)
-_SMALLEST = F32(1e-6)
 
 
 class _Pixel(NamedTuple):

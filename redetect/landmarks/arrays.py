@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.records import CircleLandmark
 
+IndexArray = NDArray[np.intp]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleArrays:
@@ -96,9 +98,6 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
     sane = np.all(scale > 0.0, axis=-1) & np.all(np.isfinite(correlation), axis=(-2, -1))
     correlation = np.where(sane[..., None, None], correlation, 0.0)
     return np.asarray(sane & (np.linalg.eigvalsh(correlation)[..., 0] > least))
-
-
-IndexArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,6 +27,8 @@ from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
 
+_PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
+
 
 @dataclass(frozen=True, eq=False)
 class NetworkEstimate:
@@ -83,9 +85,6 @@ def estimate_network(
         adjusted,
         views,
     )
-
-
-_PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
 def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:

@@ -36,6 +36,8 @@ _REJECT_COST = 15.0
 _MOST_LEFT_OUT = 3
 _ROUNDING = 1e-6
 
+_Step = tuple[int, int, float]
+
 
 @dataclass(frozen=True, eq=False)
 class TrackedTime:
@@ -229,9 +231,6 @@ def choose_candidates(
         decided = margin >= np.log(settings.ambiguity_odds)
         choices.append(Choice(int(order[0]), "resolved" if decided else "unresolved", margin))
     return choices
-
-
-_Step = tuple[int, int, float]
 
 
 def _steps(

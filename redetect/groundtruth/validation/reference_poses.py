@@ -46,6 +46,10 @@ _LARGEST_SIGMA_M, _LARGEST_SIGMA_DEG = 0.1, 5.0
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
 FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
 
+Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
+#: Two fiducials and the measured distance between them (m).
+FiducialDistance = tuple[str, str, float]
+
 
 @dataclass(frozen=True, eq=False)
 class Survey:
@@ -106,9 +110,6 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
         if not np.all(np.abs(point) < _FARTHEST_M):
             raise entries.wrong(name, f"less than {_FARTHEST_M:g} m")
     return points
-
-
-Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,10 +268,6 @@ class Dimension(NamedTuple):
     name: str
     drawn_m: float
     measured_m: float
-
-
-#: Two fiducials and the measured distance between them (m).
-FiducialDistance = tuple[str, str, float]
 
 
 class SurveyedFiducials(NamedTuple):

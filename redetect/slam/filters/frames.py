@@ -40,6 +40,8 @@ FARTHEST_LINE_M = 15.0
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
+Association = Literal["known", "nearest", "joint"]
+
 
 class FrameRows(NamedTuple):
     """Measurements of one frame."""
@@ -342,9 +344,6 @@ class Filter(ABC):
 def numbers_from(slots: ArrayLike, size: int) -> IntArray:
     """(n, size) indices of the state from (n,) slots on."""
     return np.asarray(slots, dtype=np.int64).reshape(-1, 1) + np.arange(size)
-
-
-Association = Literal["known", "nearest", "joint"]
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,8 @@ _COARSE = 1e-3
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
+Solver = Literal["separable", "gtsam"]
+
 
 @dataclass(frozen=True)
 class ChiSquared:
@@ -113,9 +115,6 @@ def as_json(table: ChiSquared) -> dict[str, float | int | None]:
         name: None if isinstance(value, float) and math.isnan(value) else value
         for name, value in asdict(table).items()
     }
-
-
-Solver = Literal["separable", "gtsam"]
 
 
 @dataclass(frozen=True)
