@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +14,8 @@ from tools.simulator.single_disc import DiscCrop, render_disc
 FLOOR = 90.0
 LIGHT = 200.0
 DARK = 25.0
+#: Of a door or a cupboard before a disc.
+DOOR = 140.0
 
 FloatArray = NDArray[np.float64]
 
@@ -64,6 +65,16 @@ class PaintedFloor:
         self.grey[v0:v1, u0:u1] += (grey - self.floor) * share
         return self
 
+    def door(self, floor_xy: ArrayLike, share: float, radius_m: float = 0.10) -> PaintedFloor:
+        """Hide what lies to the right of a share of a disc's radius from its middle."""
+        place = np.asarray(floor_xy)
+        u, _ = self.camera.project_floor(place)
+        ends = place + np.array([[-radius_m, 0.0], [radius_m, 0.0]])
+        left, right = self.camera.project_floor(ends)[:, 0]
+        first = round(u + share * abs(right - left) / 2.0)
+        self.grey[:, first : first + 80] = DOOR
+        return self
+
     def image(self, noise: float = 1.5, seed: int = 0) -> NDArray[np.uint8]:
         noisy = self.grey + np.random.default_rng(seed).normal(0.0, noise, self.grey.shape)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
@@ -76,23 +87,3 @@ def _rendered(
 ) -> DiscCrop:  # fmt: skip
     """Half of all discs of the tests are painted more than once."""
     return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px, rounded=False)
-
-
-def mirrored_camera(camera: Camera) -> Camera:
-    """The camera that sees the world mirrored in robot X as the mirrored image.
-
-    With D = diag(-1, 1, 1) a point at p in the camera frame is mirrored to D p there and from P to
-    D P in the robot frame: P = R p + t becomes D P = (D R D) (D p) + D t.
-    """
-    flip = np.diag([-1.0, 1.0, 1.0])
-    pose = flip @ np.hstack([camera.rotation @ flip, camera.centre[:, None]])
-    a, b, c = (tuple(float(x) for x in row) for row in pose)
-    return replace(
-        camera,
-        offset_x=camera.width - 1 - camera.offset_x,
-        robot_from_camera=(
-            (a[0], a[1], a[2], a[3]),
-            (b[0], b[1], b[2], b[3]),
-            (c[0], c[1], c[2], c[3]),
-        ),
-    )

@@ -1,9 +1,10 @@
-"""The best centres, and the map they are the peaks of, against plain computations of the same."""
+"""Quality and contrast of centres against exact arithmetic and plain computations of the same."""
 
 from __future__ import annotations
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 from camera import Camera, parse_camera, read_camera
 from detect.circles import detect_circles, disc_shape
 from detect.discs.quality import (
-    Centres,
     Limits,
     centres_of,
     least_part_quality,
@@ -26,7 +26,7 @@ from detect.discs.quality import (
 )
 from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
-from lut import DiscShape, DiscTable, build_disc_table
+from lut import DiscShape, DiscTable, build_disc_table, ring
 from tests.camera.strategies import cameras
 from tests.reference.centres import (
     PlainOutlines,
@@ -34,16 +34,15 @@ from tests.reference.centres import (
     plain_outlines,
     plain_quality,
 )
+from tools.benchmark.material import scaled_camera
 from tools.published_camera import PUBLISHED_CAM
 
 GreyImage = NDArray[np.uint8]
 
 PUBLISHED_CAMERA = parse_camera(PUBLISHED_CAM)
 #: An eighth of it: outlines leave the image everywhere.
-SMALL_CAMERA = dataclasses.replace(
-    PUBLISHED_CAMERA, width=96, height=36, scale_x=464.762 / 8,
-    scale_y=232.381 / 8, offset_x=48.0, offset_y=18.0,
-)  # fmt: skip
+SMALL_CAMERA = scaled_camera(PUBLISHED_CAMERA, 1 / 8)
+SHAPE = DiscShape(0.2, 0.5, samples=7, border_px=0, far_limit_m_per_px=0.5)
 POLARITIES: list[Polarity] = ["any", "light", "dark"]
 KINDS = ["random", "binary", "saturated", "constant", "nearly constant", "blocks", "stripes"]
 
@@ -99,14 +98,56 @@ def assert_centres(
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("samples", [3, 4, 5, 8, 13, 16, 30, 64, 128])
 def test_centres_are_those_of_a_plain_computation(samples: int, kind: str) -> None:
-    shape = DiscShape(0.2, 0.5, samples=samples, border_px=0, far_limit_m_per_px=0.5)
-    table, outlines = both(SMALL_CAMERA, shape)
+    table, outlines = both(SMALL_CAMERA, dataclasses.replace(SHAPE, samples=samples))
     assert (table.samples == SMALL_CAMERA.width * SMALL_CAMERA.height).any()
     image = image_of(kind, (36, 96), seed=samples)
     assert_quality(image, table, outlines)
     for threshold in (0.05, 0.4, 0.6, 1.0):
         for sign in (-1, 0, 1):
             assert_centres(image, table, outlines, threshold, sign)
+
+
+def exact_quality(image: GreyImage, outlines: PlainOutlines) -> list[tuple[Fraction, Fraction]]:
+    """Quality and contrast of each centre by their definition, in fractions."""
+    values, samples = image.ravel().tolist(), outlines.index.shape[1] // 2
+    found = []
+    for index in outlines.index.tolist():
+        of_index = index[:samples], index[samples:]
+        inner, outer = ([values[i] for i in part if i < image.size] for part in of_index)
+        grey = inner + outer
+        mean = Fraction(sum(grey), len(grey))
+        means = [Fraction(sum(part), len(part)) for part in (inner, outer)]
+        between = sum(len(p) * (m - mean) ** 2 for p, m in zip((inner, outer), means))
+        total = sum((value - mean) ** 2 for value in grey)
+        found.append((between / total if total else Fraction(0), means[0] - means[1]))
+    return found
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_quality_and_contrast_are_exact_to_the_last_bit(kind: str) -> None:
+    table, outlines = both(SMALL_CAMERA, SHAPE)
+    assert len(outlines.rows) > 500
+    image = image_of(kind, (36, 96), seed=1)
+    exact = np.array(exact_quality(image, outlines), np.float64)
+    for found, expected in zip(quality_of_centres(image, table), exact.T):
+        own = found[outlines.rows, outlines.columns]
+        np.testing.assert_array_equal(own, expected.astype(found.dtype))
+
+
+@pytest.mark.parametrize("stride", [0.05, 0.3, 1.0, 2.5])
+def test_centres_at_strides_are_found_as_on_the_map(stride: float) -> None:
+    every = build_disc_table(SMALL_CAMERA, SHAPE)
+    some = build_disc_table(SMALL_CAMERA, dataclasses.replace(SHAPE, stride_m=stride))
+    assert np.all(every.usable[some.usable])
+    image = image_of("blocks", (36, 96), seed=1)
+    quality, contrast = quality_of_centres(image, every)
+    found = centres_of(image, some, Limits(0.3, contrast=20.0))
+    expected = some.usable & (quality >= 0.3) & (abs(contrast) > 20.0)
+    rows, columns = np.nonzero(expected)
+    assert len(rows) > 5
+    np.testing.assert_array_equal(found.pixels, np.column_stack([columns, rows]))
+    np.testing.assert_array_equal(found.quality, quality[expected])
+    np.testing.assert_array_equal(found.contrast, contrast[expected])
 
 
 @given(
@@ -143,8 +184,6 @@ def test_any_camera_image_and_threshold(
 
 
 def _samples_are_clear(camera: Camera, shape: DiscShape, table: DiscTable) -> bool:
-    from lut import ring
-
     rows, columns = np.nonzero(table.usable)
     rings = np.concatenate(
         [ring(radius, shape.samples) for radius in (shape.inner_radius_m, shape.outer_radius_m)]
@@ -202,8 +241,9 @@ def test_photographs(group: str, shared_data: Path) -> None:
 # -- what goes in ---------------------------------------------------------------------------------
 
 
-def found_in(image: GreyImage, table: DiscTable) -> Centres:
-    return centres_of(image, table, Limits(0.3))
+def found_in(image: GreyImage, table: DiscTable) -> tuple[NDArray[Any], ...]:
+    """Pixels, quality and contrast of the best, and the maps of both."""
+    return (*centres_of(image, table, Limits(0.3)), *quality_of_centres(image, table))
 
 
 def test_an_image_whose_memory_is_not_contiguous_or_read_only_is_the_same_image() -> None:
@@ -221,18 +261,19 @@ def test_threads_do_not_disturb_each_other() -> None:
     table, _ = both(PUBLISHED_CAMERA, disc_shape(REPORT))
     images = [image_of("blocks", (288, 768), seed) for seed in range(12)]
     expected = [found_in(image, table) for image in images]
-    assert len({len(found.pixels) for found in expected}) > 3
+    assert len({len(pixels) for pixels, *_ in expected}) > 3
     with ThreadPoolExecutor(4) as pool:
         for found, right in zip(pool.map(lambda i: found_in(i, table), images), expected):
-            np.testing.assert_array_equal(found.quality, right.quality)
+            np.testing.assert_array_equal(found[1], right[1])
 
 
 def test_an_empty_table_finds_nothing() -> None:
     nothing = build_disc_table(SMALL_CAMERA, DiscShape(far_limit_m_per_px=1e-9))
-    pixels, quality, contrast = found_in(image_of("random", (36, 96)), nothing)
+    pixels, quality, contrast, *maps = found_in(image_of("random", (36, 96)), nothing)
     assert (pixels.shape, quality.shape, contrast.shape) == ((0, 2), (0,), (0,))
     assert pixels.dtype == np.int64
     assert contrast.dtype == np.float32
+    assert not np.any(maps)
 
 
 @pytest.mark.parametrize(
@@ -244,8 +285,7 @@ def test_an_empty_table_finds_nothing() -> None:
     ],
 )
 def test_an_image_that_is_not_the_table_s_is_refused(image: Any, complaint: str) -> None:
-    shape = DiscShape(0.2, 0.5, samples=16, border_px=0, far_limit_m_per_px=0.5)
-    table, _ = both(SMALL_CAMERA, shape)
+    table, _ = both(SMALL_CAMERA, SHAPE)
     with pytest.raises(FrameError, match=complaint):
         centres_of(image, table, Limits(0.5))
     with pytest.raises(FrameError, match=complaint):

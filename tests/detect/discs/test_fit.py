@@ -7,12 +7,12 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import refined_covariance, vote_shape
+from detect.circles import refined_covariance
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
 from detect.seen import image_positions
 from detect.settings import CircleSettings
-from lut import VoteTable, build_vote_table
+from lut import VoteTable
 from tests.detect.discs.single_fits import fit_discs
 from tests.detect.painted_floor import PaintedFloor
 from tests.reference.discs import Expected, Pixels, fitted_disc, pixels_within_reach
@@ -23,11 +23,6 @@ PAINTED_RATIO = 1.0
 BLUR_PX, BLUR_SIGMA = 0.6, 0.7
 
 PLACES = [(0.1, -0.95), (-0.6, -1.6), (0.4, -2.4), (-0.3, -3.6), (0.8, -5.2)]
-
-
-@pytest.fixture(scope="module")
-def table(published_camera: Camera) -> VoteTable:
-    return build_vote_table(published_camera, vote_shape(CircleSettings()))
 
 
 def nearest(camera: Camera, place: tuple[float, float]) -> NDArray[np.int64]:

@@ -8,23 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera import Camera
-from detect.circles import vote_shape
 from detect.discs.model import Disc
 from detect.discs.patch import EDGE, PATCH, SECTORS, Candidate, Reach, gather
 from detect.discs.placing import EDGE_ALONE, WHOLE
-from detect.settings import CircleSettings
-from lut import VoteTable, build_vote_table
+from lut import VoteTable
 from redetect.array_types import IntArray
 from tests.reference.discs import pixels_within_reach
 
 RADIUS = 0.1
 NOMINAL = Disc(0.0, 0.0, 1.0)
-
-
-@pytest.fixture(scope="module")
-def table(published_camera: Camera) -> VoteTable:
-    return build_vote_table(published_camera, vote_shape(CircleSettings()))
 
 
 def gathered(

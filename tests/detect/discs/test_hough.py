@@ -14,11 +14,6 @@ from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 PLACES = np.array([(0.3, -1.2), (-0.5, -2.0), (0.5, -3.2)])
 
 
-@pytest.fixture(scope="module")
-def table(published_camera: Camera) -> VoteTable:
-    return build_vote_table(published_camera, VoteShape())
-
-
 @pytest.mark.parametrize(("grey", "sign"), [(LIGHT, 1), (DARK, -1)])
 @pytest.mark.parametrize("half", [False, True])
 def test_the_best_candidates_are_the_discs(

@@ -10,21 +10,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import detect_circles, vote_shape
+from detect.circles import detect_circles
 from detect.discs.fit import eliminate
 from detect.discs.placing import size_of_disc
 from detect.discs.rim import DIRECTIONS, best_circle
 from detect.settings import CircleSettings
-from lut import VoteTable, build_vote_table
-from tests.detect.discs.test_rim import PLACES, door_over
+from lut import VoteTable
+from tests.detect.discs.test_rim import PLACES
 from tests.detect.painted_floor import LIGHT, PaintedFloor
 
 SETTINGS = CircleSettings(tilt_sigma_deg=0.0)
-
-
-@pytest.fixture(scope="module")
-def table(published_camera: Camera) -> VoteTable:
-    return build_vote_table(published_camera, vote_shape(SETTINGS))
 
 
 @pytest.mark.parametrize("share", [0.4, 0.6])
@@ -35,8 +30,7 @@ def test_a_door_over_a_disc_does_not_move_it(
     off_px, squares = [], []
     for seed in range(40):
         place = PLACES[seed % len(PLACES)] + rng.uniform(-0.05, 0.05, 2)
-        floor = PaintedFloor(published_camera).disc(place, LIGHT)
-        door_over(published_camera, floor, place, share)
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).door(place, share)
         found = detect_circles(floor.image(seed=seed), published_camera, table, SETTINGS)
         distance = np.hypot(*(found.floor_xy - place).T)
         if distance.min(initial=1.0) > 0.05:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.circles import CircleDetections, detect_circles, vote_shape
 from detect.discs.rim import (
     DIRECTIONS,
     RADIUS_SIGMA,
@@ -18,37 +17,16 @@ from detect.discs.rim import (
     follow_rim,
     profiles,
 )
-from detect.settings import CircleSettings
-from lut import VoteTable, build_vote_table
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
-SETTINGS = CircleSettings()
 PLACES = np.array([(0.0, -1.2), (0.5, -1.5), (-0.6, -1.9), (0.4, -2.3)])
 RADIUS = 0.1
-#: Of a door or a cupboard before a disc.
-DOOR = 140.0
-
-
-@pytest.fixture(scope="module")
-def table(published_camera: Camera) -> VoteTable:
-    return build_vote_table(published_camera, vote_shape(SETTINGS))
 
 
 def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Rim:
     numbers = camera_numbers(camera)
     seen = profiles(image, numbers, near[0], near[1], RADIUS)
     return follow_rim(image, numbers, seen, grey - FLOOR)
-
-
-def door_over(
-    camera: Camera, floor: PaintedFloor, place: NDArray[np.float64], share: float
-) -> None:
-    """Hide what lies to the right of a share of the disc's radius from its middle."""
-    u, _ = camera.project_floor(place)
-    ends = camera.project_floor(place + np.array([[-RADIUS, 0.0], [RADIUS, 0.0]]))
-    half_width = abs(ends[1, 0] - ends[0, 0]) / 2.0
-    first = round(u + share * half_width)
-    floor.grey[:, first : first + 80] = DOOR
 
 
 @pytest.mark.parametrize("grey", [LIGHT, DARK])
@@ -64,8 +42,7 @@ def test_a_whole_rim_lies_on_one_circle(published_camera: Camera, grey: float) -
 
 def test_a_door_takes_a_stretch_of_the_rim_and_leaves_the_circle(published_camera: Camera) -> None:
     for seed, place in enumerate(PLACES):
-        floor = PaintedFloor(published_camera).disc(place, LIGHT)
-        door_over(published_camera, floor, place, 0.4)
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).door(place, 0.4)
         rim = rim_of(published_camera, floor.image(seed=seed), place + np.array([0.02, 0.0]), LIGHT)
         assert 0.5 < rim.agreeing < 0.9
         assert rim.runs <= 1
@@ -115,38 +92,15 @@ def test_a_step_to_the_circle_is_that_of_the_normal_equations() -> None:
         )
 
 
-def found_in(camera: Camera, table: VoteTable, floor: PaintedFloor, seed: int) -> CircleDetections:
-    return detect_circles(floor.image(seed=seed), camera, table, SETTINGS)
-
-
-def test_a_disc_behind_a_door_is_found_where_it_is(
-    published_camera: Camera, table: VoteTable
-) -> None:
-    for seed, place in enumerate(PLACES):
-        floor = PaintedFloor(published_camera).disc(place, LIGHT)
-        door_over(published_camera, floor, place, 0.5)
-        off = np.linalg.norm(
-            found_in(published_camera, table, floor, seed).floor_xy - place, axis=1
-        )
-        assert off.min(initial=1.0) < 0.025, place
-
-
 def test_covariances_of_the_rim_cover_its_errors(published_camera: Camera) -> None:
     rng = np.random.default_rng(5)
     squares = []
     for seed in range(80):
         place = PLACES[seed % len(PLACES)] + rng.uniform(-0.05, 0.05, 2)
-        floor = PaintedFloor(published_camera).disc(place, LIGHT)
-        door_over(published_camera, floor, place, 0.4)
+        floor = PaintedFloor(published_camera).disc(place, LIGHT).door(place, 0.4)
         rim = rim_of(published_camera, floor.image(seed=seed), place, LIGHT)
         error = np.array([rim.x, rim.y]) - place
         covariance = np.array([[rim.cov_xx, rim.cov_xy], [rim.cov_xy, rim.cov_yy]])
         squares.append(error @ np.linalg.solve(covariance, error) / 2.0)
     # They place discs only where sectors of the edge disagree: there they are worse than here.
     assert 0.1 < np.median(squares) / np.log(2.0) < 1.6
-
-
-def test_a_larger_plate_is_not_found(published_camera: Camera, table: VoteTable) -> None:
-    for seed, place in enumerate(PLACES):
-        floor = PaintedFloor(published_camera).disc(place, LIGHT, 0.14)
-        assert len(found_in(published_camera, table, floor, seed)) == 0
