@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
-
 from detect.cli import main
+from tests.detect.commands import Captured
 from tests.detect.demo_frames import demo_frames
-
-Captured = pytest.CaptureFixture[str]
 
 KINDS = ("lines", "tilt", "circles", "log.json")
 FRAMES = 24
@@ -31,10 +29,6 @@ def results(folder: Path) -> dict[str, bytes]:
     }
 
 
-def hidden(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir() if path.name.startswith(".")}
-
-
 def command(run: Path, output: Path, *flags: str) -> list[str]:
     return ["all", str(run), "-o", str(output), "--force", *flags]
 
@@ -47,11 +41,46 @@ def journalled(folder: Path) -> int:
         return 0
 
 
-def resumed(run: Path, output: Path, capsys: Captured, *flags: str) -> int:
-    """Resume a run; gives how many frames were taken over."""
-    capsys.readouterr()
-    assert main(command(run, output, "--resume", *flags)) == 3
-    shown = capsys.readouterr()
-    assert f"{FRAMES} frames" in shown.out
-    taken = [line for line in shown.err.splitlines() if "are reused" in line]
-    return int(taken[0].split()[0]) if taken else 0
+@dataclass(frozen=True)
+class Trial:
+    """A run, a folder for its results, and what it writes when nothing happens to it."""
+
+    run: Path
+    output: Path
+    undisturbed: dict[str, bytes]
+    capsys: Captured
+
+    def command(self, *flags: str) -> list[str]:
+        return command(self.run, self.output, *flags)
+
+    def results(self) -> dict[str, bytes]:
+        return results(self.output)
+
+    def hidden(self) -> set[str]:
+        return {path.name for path in self.output.iterdir() if path.name.startswith(".")}
+
+    def journalled(self) -> int:
+        return journalled(self.output)
+
+    def lay_previous(self) -> dict[str, bytes]:
+        for kind in KINDS:
+            (self.output / f"detected.{kind}").write_bytes(PREVIOUS)
+        return self.results()
+
+    def said(self) -> str:
+        """What was said on standard error since the last time."""
+        return self.capsys.readouterr().err
+
+    def resumed(self, *flags: str) -> int:
+        """Resume the run; gives how many frames were taken over."""
+        self.capsys.readouterr()
+        assert main(self.command("--resume", *flags)) == 3
+        shown = self.capsys.readouterr()
+        assert f"{FRAMES} frames" in shown.out
+        taken = [line for line in shown.err.splitlines() if "are reused" in line]
+        return int(taken[0].split()[0]) if taken else 0
+
+    def assert_complete(self) -> None:
+        """The results are those of the undisturbed run, and nothing else is there."""
+        assert self.results() == self.undisturbed
+        assert self.hidden() == set()

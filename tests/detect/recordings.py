@@ -9,7 +9,10 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
+
+from tests.pictures import read_grey
 
 BagKind = Literal["mcap", "mcap folder", "sqlite", "ros1"]
 BAG_KINDS: tuple[BagKind, ...] = ("mcap", "mcap folder", "sqlite", "ros1")
@@ -150,6 +153,20 @@ class Ros:
         if self.kind == "mcap":
             return (path / f"{path.name}.mcap").rename(path.with_suffix(".mcap"))
         return path
+
+
+def write_bag(path: Path, images: Sequence[NDArray[np.uint8]]) -> Path:
+    """A bag of grey images, one a second from 1 s on; skips the test without `rosbags`."""
+    pytest.importorskip("rosbags", reason="the extra [bags] is not installed")
+    ros = Ros()
+    return ros.write(
+        path, [Said("/i", k, ros.image(image, "mono8", k)) for k, image in enumerate(images, 1)]
+    )
+
+
+def images_of(run: Path) -> list[NDArray[np.uint8]]:
+    """The images of a run folder, in order."""
+    return [read_grey(path) for path in sorted((run / "images").iterdir())]
 
 
 def write_video(

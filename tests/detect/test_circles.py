@@ -322,7 +322,7 @@ def mirrored_rows(found: CircleDetections, width: int) -> CircleDetections:
     )
 
 
-@settings(max_examples=10, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=6, phases=[Phase.explicit, Phase.generate])
 @given(seed=st.integers(0, 2**32 - 1), shift=st.floats(-0.2, 0.2))
 def test_mirrored_image_and_camera_give_mirrored_rows(
     published_camera: Camera, seed: int, shift: float

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -13,31 +11,10 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from redetect.landmarks import read_frames, read_steps
+from redetect.landmarks import read_frames
+from tests.detect.commands import Captured, assert_refused, files_in, output_of
 from tests.detect.conftest import SMALL_RUN_DISCS
-
-Captured = pytest.CaptureFixture[str]
-
-
-def files_in(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def assert_refused(arguments: list[str], run: Path, names: str, captured: Captured) -> str:
-    """Exit code 1, one line that names the file, and nothing written or changed."""
-    before = files_in(run)
-    assert main(arguments) == 1
-    shown = captured.readouterr()
-    assert shown.out == ""
-    (line,) = shown.err.splitlines()
-    assert line.startswith("error: ")
-    assert names in line
-    assert files_in(run) == before
-    return line
+from tests.pictures import read_grey
 
 
 def settings_of(output: Path) -> dict[str, str]:
@@ -46,15 +23,6 @@ def settings_of(output: Path) -> dict[str, str]:
 
 
 # -- circles --------------------------------------------------------------------------------
-
-
-def test_run_is_detected(small_run: Path, capsys: Captured) -> None:
-    assert main(["circles", str(small_run)]) == 0
-    output = small_run / "detected.circles"
-    assert f"{output}: 3 discs in 3 frames" in capsys.readouterr().out
-    frames = list(read_frames(output))
-    assert [len(frame.circles) for frame in frames] == [len(d) for d in SMALL_RUN_DISCS.values()]
-    assert [frame.step for frame in frames] == list(read_steps(small_run / "s.txt"))
 
 
 def test_flat_folder_and_named_files(small_run: Path, tmp_path: Path) -> None:
@@ -108,9 +76,8 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in drawings.iterdir()) == [f"{p}.png" for p in SMALL_RUN_DISCS]
     for frame in frames:
         name = f"{frame['frame']}.png"
-        image = cv2.imread(str(small_run / "images" / name), cv2.IMREAD_GRAYSCALE)
+        image = read_grey(small_run / "images" / name)
         drawn = cv2.imread(str(drawings / name), cv2.IMREAD_COLOR)
-        assert image is not None
         assert drawn is not None
         # Words follow below the image.
         marked = np.any(drawn[: len(image)] != image[:, :, None], axis=2)
@@ -120,14 +87,6 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
             assert marked[v - 40 : v + 41, u - 60 : u + 61].sum() > 100
             marked[v - 40 : v + 41, u - 60 : u + 61] = False
         assert not marked.any()
-
-
-def test_image_of_another_size_is_listed(small_run: Path, capsys: Captured) -> None:
-    bad = small_run / "images" / "s.0000.png"
-    assert cv2.imwrite(str(bad), np.zeros((576, 768), np.uint8))
-    assert main(["circles", str(small_run)]) == 3
-    expected = f"{bad}: is 768x576 px: expected 768x288, the calibration's size"
-    assert expected in capsys.readouterr().err
 
 
 def test_long_lists_of_bad_images_are_cut(small_run: Path, capsys: Captured) -> None:
@@ -146,16 +105,6 @@ def test_images_without_step_are_told(small_run: Path, capsys: Captured) -> None
     (small_run / "s.txt").write_text("\n".join(rows[:-1]) + "\n")
     assert main(["circles", str(small_run)]) == 0
     assert "1 images are not named by a STEP row" in capsys.readouterr().out
-
-
-def test_no_such_run(small_run: Path, capsys: Captured) -> None:
-    assert_refused(["circles", str(small_run / "t")], small_run, str(small_run / "t"), capsys)
-
-
-def test_missing_calibration(small_run: Path, capsys: Captured) -> None:
-    (small_run / "s.cam").unlink()
-    line = assert_refused(["circles", str(small_run)], small_run, str(small_run), capsys)
-    assert "expected a .cam file" in line
 
 
 def test_missing_named_calibration(small_run: Path, capsys: Captured) -> None:
@@ -185,15 +134,24 @@ def test_malformed_odometry(small_run: Path, capsys: Captured, row: str, told: s
     assert_refused(["circles", str(small_run)], small_run, told, capsys)
 
 
-@pytest.mark.parametrize("flag", ["-o", "--json"])
-def test_existing_output_stays(small_run: Path, capsys: Captured, flag: str) -> None:
-    precious = small_run / "precious"
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["circles", "RUN", "-o", "RUN/precious"], "precious"),
+        (["circles", "RUN", "--json", "RUN/precious"], "precious"),
+        (["circles", "RUN"], "detected.circles.log.json"),
+        (["lines", "RUN"], "detected.tilt"),
+    ],
+)
+def test_existing_output_stays(
+    small_run: Path, capsys: Captured, arguments: list[str], name: str
+) -> None:
+    precious = small_run / name
     precious.write_text("precious")
-    line = assert_refused(
-        ["circles", str(small_run), flag, str(precious)], small_run, str(precious), capsys
-    )
+    words = [word.replace("RUN", str(small_run)) for word in arguments]
+    line = assert_refused(words, small_run, f"{precious}: exists already", capsys)
     assert "--force" in line
-    assert main(["circles", str(small_run), flag, str(precious), "--force"]) == 0
+    assert main([*words, "--force"]) == 0
     assert precious.read_text() != "precious"
 
 
@@ -389,23 +347,18 @@ def test_malformed_reference(compared_run: Path, capsys: Captured) -> None:
 # -- help -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", [[], ["circles"], ["compare"]])
-def test_help_needs_nothing_heavy(command: list[str]) -> None:
+def test_help_needs_nothing_heavy() -> None:
     program = (
         "import sys\n"
         "from detect.cli import main\n"
-        "try:\n"
-        f"    main({[*command, '--help']!r})\n"
-        "except SystemExit as end:\n"
-        "    heavy = {'numba', 'cv2', 'scipy', 'skimage', 'pycolmap'} & set(sys.modules)\n"
-        "    print('exit', end.code, 'heavy', sorted(heavy))\n"
+        "for command in ([], ['circles'], ['compare']):\n"
+        "    try:\n"
+        "        main([*command, '--help'])\n"
+        "    except SystemExit as end:\n"
+        "        assert end.code == 0\n"
+        "print({'numba', 'cv2', 'scipy', 'skimage', 'pycolmap'} & set(sys.modules))\n"
     )
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
-    )
-    assert done.stderr == ""
-    assert done.stdout.splitlines()[-1] == "exit 0 heavy []"
-    wanted = {"": ["circles", "compare"], "circles": ["--preset", "--radius-m", "--evidence"]}
-    for word in wanted.get(" ".join(command), ["--min-recall", "--reference"]):
-        assert word in done.stdout
+    shown = output_of(program)
+    assert shown.splitlines()[-1] == "set()"
+    for word in ("circles", "compare", "--preset", "--radius-m", "--min-recall", "--reference"):
+        assert word in shown

@@ -8,7 +8,6 @@ their last digits differ.
 from __future__ import annotations
 
 import ast
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,35 +38,37 @@ def _kernels(root: Path) -> tuple[_Kernel, ...]:
     return tuple(found)
 
 
-@cache
-def _called(kernel: _Kernel, kernels: tuple[_Kernel, ...]) -> list[_Kernel]:
-    """The kernels that one calls: those of its own file, and those that this imports."""
-    imported = {
+def _imports(path: Path) -> set[tuple[str, str]]:
+    """Modules and names that a file imports."""
+    return {
         (node.module.split(".")[-1], name.name)
-        for node in ast.walk(ast.parse(kernel.path.read_text("utf-8")))
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
         if isinstance(node, ast.ImportFrom) and node.module
         for name in node.names
     }
-    return [
-        other
-        for other in kernels
-        if other.name in kernel.calls
-        and (other.path == kernel.path or (other.path.stem, other.name) in imported)
-    ]
-
-
-def _sums_in_any_order(kernel: _Kernel, kernels: tuple[_Kernel, ...]) -> bool:
-    """Whether the code of a kernel, with what is inlined, sums in any order."""
-    return kernel.any_order or any(
-        other.inlined and _sums_in_any_order(other, kernels) for other in _called(kernel, kernels)
-    )
 
 
 def test_sums_in_any_order_are_inlined_up_to_the_kernel_that_python_calls(
     project_root: Path,
 ) -> None:
     kernels = _kernels(project_root / "detect")
-    free = {kernel for kernel in kernels if _sums_in_any_order(kernel, kernels)}
+    imported = {path: _imports(path) for path in {kernel.path for kernel in kernels}}
+    #: Of each kernel those that it calls: of its own file, and those that this imports.
+    called = {
+        kernel: [
+            other
+            for other in kernels
+            if other.name in kernel.calls
+            and (
+                other.path == kernel.path or (other.path.stem, other.name) in imported[kernel.path]
+            )
+        ]
+        for kernel in kernels
+    }
+    # With what is inlined, their code sums in any order.
+    free = {kernel for kernel in kernels if kernel.any_order}
+    while more := {k for k in kernels if any(c.inlined and c in free for c in called[k])} - free:
+        free |= more
     assert {"place_discs", "fit_disc", "gather", "edge_shares"} <= {each.name for each in free}
-    called = {other for kernel in kernels for other in _called(kernel, kernels)}
-    assert {str(kernel) for kernel in free & called if not kernel.inlined} == set()
+    called_ones = {other for others in called.values() for other in others}
+    assert {str(kernel) for kernel in free & called_ones if not kernel.inlined} == set()

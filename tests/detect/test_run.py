@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera, CameraError
-from detect.errors import DetectError, FrameError
+from detect.errors import FrameError
 from detect.sources.interface import RunFrame, read_image
 from detect.sources.opening import open_run
-from redetect.landmarks import LandmarkFileError, Step
+from redetect.landmarks import Step
 
 ZEROS = (0.0,) * 9
 TEXTURE = np.random.default_rng(3).integers(0, 256, (288, 768)).astype(np.uint8)
@@ -36,10 +36,6 @@ def run_folder(tmp_path: Path, published_cam_text: str) -> Path:
     folder.mkdir()
     (folder / "k.cam").write_text(published_cam_text)
     return folder
-
-
-def prefixes(folder: Path) -> list[str]:
-    return [frame.step.prefix for frame in open_run(folder).frames]
 
 
 def test_run_folder_of_the_data_set(run_folder: Path, published_camera: Camera) -> None:
@@ -74,16 +70,7 @@ def test_flat_folder_of_images(run_folder: Path) -> None:
 
 def test_images_folder_goes_before_loose_images(run_folder: Path) -> None:
     touch(run_folder, "images/a.png", "preview.png")
-    assert prefixes(run_folder) == ["a"]
-
-
-def test_names_are_in_natural_order(run_folder: Path) -> None:
-    names = ["img10", "img9", "img1", "img100", "img2", "img010", "a5b10", "a5b9", "a05b9"]
-    touch(run_folder, *[f"{name}.png" for name in names])
-    found = prefixes(run_folder)
-    assert sorted(found) == sorted(names)
-    plain = [name for name in found if "0" not in name[:4] or name in ("img10", "img100")]
-    assert plain == ["a5b9", "a5b10", "img1", "img2", "img9", "img10", "img100"]
+    assert [frame.step.prefix for frame in open_run(run_folder).frames] == ["a"]
 
 
 def test_white_space_in_names_does_not_break_rows(run_folder: Path) -> None:
@@ -98,28 +85,6 @@ def test_names_that_are_no_words_of_a_row_cost_no_run(run_folder: Path) -> None:
     run = open_run(run_folder)
     assert [frame.step.prefix for frame in run.frames] == ["_1", "a_2", "b_", "c_d"]
     assert [frame.failure for frame in run.frames] == [None] * 4
-
-
-@pytest.mark.parametrize(
-    "prefix",
-    ["k.0007", "k.0007.jpg", "images/k.0007", "../k/images/k.0007.jpg", "images\\k.0007.jpg"],
-)
-def test_prefixes_name_images(run_folder: Path, prefix: str) -> None:
-    touch(run_folder, "images/k.0007.jpg", "images/k.0008.jpg")
-    (run_folder / "k.txt").write_text(step_row(prefix))
-    run = open_run(run_folder)
-    assert [frame.image for frame in run.frames] == [run_folder / "images" / "k.0007.jpg"]
-    assert next(iter(run.frames)).step.prefix == prefix
-    assert run.frames.left_out == 1
-
-
-def test_step_without_image(run_folder: Path, published_camera: Camera) -> None:
-    touch(run_folder, "images/k.0000.jpg")
-    (run_folder / "k.txt").write_text(step_row("k.0000") + step_row("k.0001"))
-    _, missing = open_run(run_folder).frames
-    assert missing.image is None
-    with pytest.raises(FrameError, match=r"^k\.0001: no image of that name in the run$"):
-        read_image(missing, published_camera)
 
 
 def test_odometry_of_the_landmark_file(run_folder: Path) -> None:
@@ -144,35 +109,6 @@ def test_own_odometry_goes_before_the_landmark_file(run_folder: Path) -> None:
     (run_folder / "k.txt").write_text(step_row("k.0000", 0.75))
     (run_folder / "map.circles").write_text(step_row("k.0000", 0.5))
     assert next(iter(open_run(run_folder).frames)).step.dx == 0.75
-
-
-def test_malformed_step_is_named_by_file_and_line(run_folder: Path) -> None:
-    touch(run_folder, "images/k.0000.jpg")
-    (run_folder / "k.txt").write_text(step_row("k.0000") + "STEP k.0001 0.1 oops 0 1 0 1 0 0 1\n")
-    with pytest.raises(LandmarkFileError, match=r"k\.txt:2\b.*oops"):
-        open_run(run_folder)
-
-
-def test_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(DetectError, match=r"expected a run folder, a folder of images") as e:
-        open_run(tmp_path / "nowhere")
-    assert "nowhere" in str(e.value)
-    with pytest.raises(DetectError, match=r"file: no video .*: expected a run folder, images"):
-        open_run(tmp_path / "file")
-
-
-def test_no_images(run_folder: Path) -> None:
-    touch(run_folder, "notes.md")
-    with pytest.raises(DetectError, match=r"no images: expected a run folder, or .*\.jpg .*\.png"):
-        open_run(run_folder)
-
-
-def test_no_calibration(run_folder: Path) -> None:
-    touch(run_folder, "a.png")
-    (run_folder / "k.cam").unlink()
-    with pytest.raises(DetectError, match=r"no calibration: expected a \.cam .*--camera"):
-        open_run(run_folder)
 
 
 def test_the_only_calibration_may_have_any_name(run_folder: Path, published_camera: Camera) -> None:
@@ -200,13 +136,6 @@ def test_named_calibration_goes_before_the_runs_own(
     other = tmp_path / "other.cam"
     other.write_text(published_cam_text.replace("offsetX: 384", "offsetX: 380"))
     assert open_run(run_folder, other).camera.offset_x == 380
-
-
-def test_calibration_that_cannot_be_read(run_folder: Path) -> None:
-    touch(run_folder, "a.png")
-    (run_folder / "k.cam").write_text("{ SmRadialDistortedCamera width: many }")
-    with pytest.raises(CameraError, match=r"k\.cam"):
-        open_run(run_folder)
 
 
 # -- images ---------------------------------------------------------------------------------
@@ -252,12 +181,6 @@ def test_colours_become_their_brightness(tmp_path: Path, published_camera: Camer
     image = read_image(frame_of(written(tmp_path / "a.png", colours)), published_camera)
     luma = colours @ np.array([0.114, 0.587, 0.299])
     assert np.abs(image - luma).max() <= 1.1
-
-
-def test_sixteen_bits_become_eight(tmp_path: Path, published_camera: Camera) -> None:
-    deep = TEXTURE.astype(np.uint16) * 256 + 100
-    image = read_image(frame_of(written(tmp_path / "a.png", deep)), published_camera)
-    assert np.abs(image.astype(int) - TEXTURE).max() <= 1
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])

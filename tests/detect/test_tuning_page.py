@@ -93,7 +93,7 @@ def test_detects_as_the_command_does(
     assert status == 200
     rows = tmp_path / "rows.circles"
     run = str(project_root / "images" / "e")
-    assert main(["circles", run, "--threshold", "0.6", "-o", str(rows)]) == 0
+    assert main(["circles", run, "--frames", "2", "--threshold", "0.6", "-o", str(rows)]) == 0
     frame = list(read_frames(rows))[1]
     assert [(d["x"], d["y"]) for d in found["discs"]] == [
         pytest.approx((row.px, row.py), abs=1e-5) for row in frame.circles

@@ -6,15 +6,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from detect.cli import main
 from detect.seen import summed_steps
 from redetect.landmarks import Step, read_frames
-from tests.detect.recordings import write_video
-from tests.detect.test_cli import assert_refused
+from tests.detect.commands import assert_refused
+from tests.detect.recordings import images_of, write_video
 
 Captured = pytest.CaptureFixture[str]
 
@@ -97,10 +96,7 @@ def test_recording_holds_frames_rows_and_path(
 @pytest.mark.long
 def test_times_of_a_video_are_in_its_recording(small_run: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    images = [
-        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((small_run / "images").iterdir())
-    ]
+    images = images_of(small_run)
     video = write_video(tmp_path / "s.avi", images)
     camera = ["--camera", str(small_run / "s.cam")]
     assert main(["circles", str(video), *camera]) == 0

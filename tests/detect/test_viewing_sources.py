@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from detect.cli import main
-from tests.detect.recordings import Ros, Said, write_video
-from tests.detect.test_cli import assert_refused
-
-Images = list[NDArray[np.uint8]]
-
-
-def as_video(folder: Path, images: Images) -> Path:
-    return write_video(folder / "s.avi", images)
-
-
-def as_bag(folder: Path, images: Images) -> Path:
-    pytest.importorskip("rosbags")
-    ros = Ros()
-    said = [Said("/i", k, ros.image(image, "mono8", k)) for k, image in enumerate(images, 1)]
-    return ros.write(folder / "s", said)
+from tests.detect.commands import assert_refused
+from tests.detect.recordings import images_of, write_bag, write_video
 
 
 @pytest.fixture(scope="module")
@@ -64,25 +50,22 @@ def expected(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("record", [as_video, as_bag], ids=["video", "bag"])
+@pytest.mark.parametrize(("record", "name"), [(write_video, "s.avi"), (write_bag, "s")])
 def test_the_same_pictures_page_and_table(
     small_run: Path,
     rows: list[str],
     expected: dict[str, bytes],
     tmp_path: Path,
-    record: Callable[[Path, Images], Path],
+    record: Callable[[Path, Sequence[NDArray[np.uint8]]], Path],
+    name: str,
 ) -> None:
-    images = [
-        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((small_run / "images").iterdir())
-    ]
     folder = tmp_path / "recorded" / "s"
     folder.mkdir(parents=True)
     shutil.copy(small_run / "s.cam", folder / "s.cam")
-    found = looked_at(record(folder, images), rows, tmp_path / "output")
+    found = looked_at(record(folder / name, images_of(small_run)), rows, tmp_path / "output")
     assert sorted(found) == sorted(expected)
-    for name, content in found.items():
-        assert content == expected[name], name
+    for file, content in found.items():
+        assert content == expected[file], file
 
 
 @pytest.mark.parametrize("command", ["draw", "view", "report", "tune"])

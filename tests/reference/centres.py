@@ -78,11 +78,8 @@ def plain_quality(
     return quality, contrast
 
 
-def plain_maxima(quality: FloatArray, threshold: float) -> list[tuple[int, int]]:
-    """(u, v) of the maxima, in scan order; of a plateau the one nearest to its centroid.
-
-    The first of those equally near, counted from the plateau's first pixel outwards.
-    """
+def plain_maxima(quality: FloatArray, threshold: float) -> list[list[tuple[int, int]]]:
+    """Of each maximum the pixels (u, v) that are nearest to its centroid, exactly equally near."""
     height, width = quality.shape
     visited = np.zeros(quality.shape, bool)
     found = []
@@ -100,22 +97,20 @@ def plain_maxima(quality: FloatArray, threshold: float) -> list[tuple[int, int]]
                         visited[vn, un] = True
                         plateau.append((vn, un))
         if highest:
-            mean_v = mean_u = 0.0
-            for vp, up in plateau:
-                mean_v += vp / len(plateau)
-                mean_u += up / len(plateau)
-            distance = [(vp - mean_v) ** 2 + (up - mean_u) ** 2 for vp, up in plateau]
-            found.append(plateau[distance.index(min(distance))])
-    return [(u, v) for v, u in sorted(found)]
+            n, sum_v, sum_u = len(plateau), *map(sum, zip(*plateau, strict=True))
+            off = {(u, v): (n * v - sum_v) ** 2 + (n * u - sum_u) ** 2 for v, u in plateau}
+            found.append([place for place in off if off[place] == min(off.values())])
+    return found
 
 
 def plain_best_centres(
     image: NDArray[np.uint8], outlines: PlainOutlines, threshold: float, polarity: Polarity = "any"
 ) -> tuple[IntArray, FloatArray, NDArray[np.float32]]:
-    """The plain maxima, of one polarity."""
+    """The plain maxima, of one polarity, in scan order; each has one nearest pixel."""
     quality, contrast = plain_quality(image, outlines)
     if polarity != "any":
         quality[contrast * (1.0 if polarity == "light" else -1.0) <= 0.0] = 0.0
-    pixels = np.array(plain_maxima(quality, threshold), np.int64).reshape(-1, 2)
+    maxima = [place for (place,) in plain_maxima(quality, threshold)]
+    pixels = np.array(sorted(maxima, key=lambda place: place[::-1]), np.int64).reshape(-1, 2)
     u, v = pixels.T
     return pixels, quality[v, u], contrast[v, u]

@@ -39,26 +39,27 @@ def test_an_image_that_is_one_plateau_has_one_maximum_in_its_middle() -> None:
     assert rows[0] in (143, 144)
 
 
+def assert_maxima(quality: NDArray[np.float64], threshold: float) -> int:
+    """Each plateau is found once, at one of the pixels nearest to its middle; gives how many."""
+    columns, rows = local_maxima(quality, threshold)
+    found, expected = set(zip(columns.tolist(), rows.tolist())), plain_maxima(quality, threshold)
+    assert [len(found.intersection(nearest)) for nearest in expected] == [1] * len(found)
+    return len(found)
+
+
 @settings(max_examples=300)
 @given(MAPS, st.sampled_from([0.0, 0.25, 0.5, 0.75]))
-def test_of_pixels_equally_near_to_the_middle_the_same_is_taken_every_time(
+def test_every_plateau_is_found_once_at_its_middle(
     levels: NDArray[np.int8], threshold: float
 ) -> None:
-    quality = levels / 4.0
-    columns, rows = local_maxima(quality, threshold)
-    assert list(zip(columns.tolist(), rows.tolist())) == plain_maxima(quality, threshold)
+    assert_maxima(levels / 4.0, threshold)
 
 
 @pytest.mark.parametrize("levels", [1, 2, 30])
 def test_large_plateaus_and_many_of_them(levels: int) -> None:
     rng = np.random.default_rng(levels)
     few = rng.integers(1, levels + 1, (12, 20)) * rng.integers(0, 2, (12, 20))
-    quality = np.asarray(np.kron(few / 30.0, np.ones((5, 7))), np.float64)
-    found = np.array(local_maxima(quality, 0.01)).T
-    assert len(found) > 1
-    # Of the four pixels in the middle, rounding decides.
-    for place in plain_maxima(quality, 0.01):
-        assert np.abs(found - place).max(axis=1).min() <= 1
+    assert assert_maxima(np.asarray(np.kron(few / 30.0, np.ones((5, 7))), np.float64), 0.01) > 1
 
 
 def plain_suppression(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +12,7 @@ from detect.circles import detect_circles, disc_table
 from detect.discs.fit import working_space
 from detect.discs.patch import CAPACITY
 from detect.settings import CircleSettings
+from tests.pictures import read_grey
 
 
 @pytest.mark.parametrize("left", [np.nan, 1e30, -7.0])
@@ -22,7 +22,7 @@ def test_what_is_left_in_the_memory_of_fits_does_not_matter(
     camera, settings = read_camera(project_root / "images" / "e" / "e.cam"), CircleSettings()
     table = disc_table(camera, settings)
     file = project_root / "images" / "e" / "images" / "e.0010.jpg"
-    image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE), np.uint8)
+    image = read_grey(file)
     work = working_space()
     found = []
     for number in (0.0, left):

@@ -25,8 +25,9 @@ from redetect.landmarks import (
     Step,
     circle_landmarks,
 )
+from tests.detect.commands import assert_refused
 from tests.detect.drawing.test_detections import changed
-from tests.detect.test_cli import assert_refused
+from tests.pictures import read_grey
 
 Captured = pytest.CaptureFixture[str]
 FloatArray = NDArray[np.float64]
@@ -175,10 +176,9 @@ def test_rows_are_drawn_without_detecting_again(small_run: Path, tmp_path: Path)
     assert names == ["s.0000.png", "s.0001.png", "s.0002.png"]
     for name in names:
         picture = cv2.imread(str(tmp_path / "d" / name))
-        grey = cv2.imread(str(small_run / "images" / name), cv2.IMREAD_GRAYSCALE)
+        grey = read_grey(small_run / "images" / name)
         assert picture is not None
-        assert grey is not None
-        marked = changed(np.asarray(picture[:288], np.uint8), np.asarray(grey, np.uint8))
+        marked = changed(np.asarray(picture[:288], np.uint8), grey)
         assert marked.any() == (name == "s.0001.png")
     again = tmp_path / "again"
     assert main(["draw", str(small_run), "-o", str(again)]) == 0

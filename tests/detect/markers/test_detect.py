@@ -20,6 +20,7 @@ from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from detect.settings import MarkerSettings
 from tests.detect.markers.rendering import View, exposed, render, view_corners
+from tests.pictures import read_grey
 
 FloatArray = NDArray[np.float64]
 
@@ -377,10 +378,9 @@ def test_unknown_dictionaries_and_ids_and_sizes_are_refused(published_camera: Ca
 
 def real_frame(shared_data: Path) -> tuple[NDArray[np.uint8], FloatArray]:
     stem = shared_data / "rawseeds" / "markers" / "image_320_240_8_marker_id_simple_nr031"
-    image = cv2.imread(f"{stem}.png", cv2.IMREAD_GRAYSCALE)
-    assert image is not None
+    image = read_grey(Path(f"{stem}.png"))
     truth = json.loads(Path(f"{stem}.truth.json").read_text())
-    return np.asarray(image, np.uint8), np.array(truth["markers"][0]["corners_TL_TR_BR_BL"])
+    return image, np.array(truth["markers"][0]["corners_TL_TR_BR_BL"])
 
 
 def test_the_real_frame(shared_data: Path) -> None:
@@ -409,11 +409,8 @@ def test_tags_outdoors(shared_data: Path) -> None:
     # Of 47 tags, all of the same number, OpenCV's detector with sub-pixel refinement finds 36.
     listed = 0
     for path in sorted((shared_data / "apriltag").glob("*.jpg")):
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
-        found = detect_markers(
-            np.asarray(image, np.uint8), MarkerSettings(dictionary="apriltag_36h11")
-        )
+        image = read_grey(path)
+        found = detect_markers(image, MarkerSettings(dictionary="apriltag_36h11"))
         assert set(found.ids.tolist()) == {0}
         for line in path.with_suffix(".txt").read_text().splitlines():
             numbers = [float(word.strip("(),")) for word in line.split()]
@@ -430,6 +427,5 @@ def test_photographs_without_markers(shared_data: Path, name: str) -> None:
     paths = sorted((shared_data / "york").glob("**/images/*.jpg"))[::9]
     assert paths
     for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
-        assert len(detect_markers(np.asarray(image, np.uint8), settings)) == 0, path
+        image = read_grey(path)
+        assert len(detect_markers(image, settings)) == 0, path

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from detect.errors import DetectError
 from detect.markers.dictionaries import dictionary_names, marker_dictionary, simple_patterns
+from tests.pictures import read_grey
 
 
 def _sampled(picture: NDArray[np.uint8], centres: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -32,8 +32,7 @@ def test_the_simple_code_is_that_of_the_published_drawings(
     drawings = sorted((shared_data / "rawseeds" / "markers" / folder).glob(f"{stem}_*.png"))
     assert len(drawings) >= 8
     for path in drawings:
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert picture is not None
+        picture = read_grey(path)
         rows, columns = np.nonzero(picture < 128)
         square = picture[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         assert square.shape[0] == square.shape[1]

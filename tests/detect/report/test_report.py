@@ -20,7 +20,7 @@ from detect.options import CompareOptions
 from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
-from tests.detect.test_cli import assert_refused
+from tests.detect.commands import assert_refused
 
 Captured = pytest.CaptureFixture[str]
 

@@ -7,19 +7,14 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from tests.detect.interrupted_runs import a_run, results
+from tests.detect.commands import Captured
+from tests.detect.interrupted_runs import Trial, a_run, results
 
 
 @pytest.fixture(scope="session")
 def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that is not to be changed."""
     return a_run(project_root, tmp_path_factory.mktemp("run") / "e")
-
-
-@pytest.fixture
-def own_run(project_root: Path, tmp_path: Path) -> Path:
-    """A run that may be changed."""
-    return a_run(project_root, tmp_path / "e")
 
 
 @pytest.fixture(scope="session")
@@ -31,7 +26,9 @@ def undisturbed(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> d
 
 
 @pytest.fixture
-def output(tmp_path: Path) -> Path:
-    folder = tmp_path / "output"
-    folder.mkdir()
-    return folder
+def trial(
+    run_folder: Path, undisturbed: dict[str, bytes], tmp_path: Path, capsys: Captured
+) -> Trial:
+    """The run with an empty folder for its results."""
+    (tmp_path / "output").mkdir()
+    return Trial(run_folder, tmp_path / "output", undisturbed, capsys)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
+from tests.detect.commands import files_in
 from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import ForkedRuns, StopAfter, forked_runs, started
-from tests.detect.test_cli import files_in
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0

@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from detect.lines import detect_lines
 from detect.markers.detect import detect_markers
 from detect.settings import CircleSettings, MarkerSettings
 from lut import build_vertical_table
+from tests.pictures import read_grey
 
 Image = NDArray[np.uint8]
 
@@ -53,8 +53,7 @@ def test_the_same_image_gives_the_same_bytes(project_root: Path, kind: str) -> N
     folder, detect = _detector(project_root, kind)
     rng = np.random.default_rng(3)
     for path in sorted(folder.iterdir())[:2]:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
+        image = read_grey(path)
         seen = set()
         for _ in range(6):
             # What stays allocated and what is freed decides where later arrays will lie, and what

@@ -20,6 +20,7 @@ from redetect.landmarks import read_frames, read_steps
 from redetect.storage import demand_writable
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
+from tests.pictures import read_grey
 
 Captured = pytest.CaptureFixture[str]
 NOBODY = 65534
@@ -60,8 +61,7 @@ def spoilt_run(small_run: Path) -> Path:
     """A good frame, then one of each kind with the good one after it, then those converted."""
     images = small_run / "images"
     good = images / "s.0000.png"
-    grey = cv2.imread(str(good), cv2.IMREAD_GRAYSCALE)
-    assert grey is not None
+    grey = read_grey(good)
     contents = {
         "empty.png": b"",
         "truncated-jpeg.jpg": encoded(".jpg", grey)[:9000],
@@ -139,16 +139,6 @@ def test_the_log_of_a_good_run(small_run: Path, tmp_path: Path) -> None:
     assert logs[0] == logs[1]
     log = json.loads(logs[0])
     assert (log["failures"], log["failed"], log["exit_code"], log["frames"]) == ([], 0, 0, 3)
-
-
-def test_a_log_is_replaced_as_other_results_are(small_run: Path, capsys: Captured) -> None:
-    log = small_run / "detected.circles.log.json"
-    log.write_text("notes of my own")
-    assert main(["circles", str(small_run)]) == 1
-    assert f"{log}: exists already" in capsys.readouterr().err
-    assert log.read_text() == "notes of my own"
-    assert main(["circles", str(small_run), "--force"]) == 0
-    assert json.loads(log.read_text())["frames"] == 3
 
 
 def test_strict_stops_at_the_first_bad_frame(small_run: Path, capsys: Captured) -> None:

@@ -67,7 +67,10 @@ def test_prefixes_do_not_lead_out(run: Path, prefix: str, why: str) -> None:
 )  # fmt: skip
 def test_prefixes_that_stay_are_followed(run: Path, prefix: str) -> None:
     (run / "s.txt").write_text(STEP.format(prefix))
-    (frame,) = open_run(run).frames
+    opened = open_run(run)
+    (frame,) = opened.frames
+    assert frame.step.prefix == prefix
+    assert opened.frames.left_out == 2
     assert frame.image == run / "images" / "s.0000.png"
 
 

@@ -119,14 +119,6 @@ def test_frames_that_count_as_level_are_told(
     assert "the other 1 are assumed exactly level" in capsys.readouterr().out
 
 
-def test_existing_outputs_are_kept(short_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (short_run / "detected.tilt").write_text("mine")
-    assert main(["lines", str(short_run)]) == 1
-    assert "detected.tilt: exists already" in capsys.readouterr().err
-    assert (short_run / "detected.tilt").read_text() == "mine"
-    assert not (short_run / "detected.lines").exists()
-
-
 @pytest.mark.parametrize(
     ("pitch_deg", "roll_deg", "blind"), [(80.0, 0.0, True), (0.0, 90.0, True), (30.0, 5.0, False)]
 )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from tests.detect.forked_runs import started
-from tests.detect.recordings import Ros, Said, write_video
+from tests.detect.recordings import Ros, Said, images_of, write_video
+from tools.benchmark.material import scaled_camera
 
 Images = Sequence[NDArray[np.uint8]]
 
@@ -31,6 +31,7 @@ PROGRAM = """
 import re, resource, sys
 from pathlib import Path
 from detect.cli import main
+from tests.pictures import read_grey
 
 if __name__ == "__main__":
     jobs, *runs = sys.argv[1:]
@@ -68,19 +69,13 @@ def test_memory_is_flat(
     record: Callable[[Path, Images, int], Path],
     jobs: str,
 ) -> None:
-    k, full = _REDUCED, published_camera
-    small = replace(
-        full, width=full.width // k, height=full.height // k, scale_x=full.scale_x / k,
-        scale_y=full.scale_y / k, offset_x=full.offset_x / k, offset_y=full.offset_y / k,
-    )  # fmt: skip
+    small = scaled_camera(published_camera, 1 / _REDUCED)
     write_camera(small, tmp_path / "small.cam")
-    images = []
-    for number in range(4):
-        path = project_root / "images" / "e" / "images" / f"e.{number:04d}.jpg"
-        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert grey is not None
-        size = (small.width, small.height)
-        images.append(np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8))
+    size = (small.width, small.height)
+    images = [
+        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for image in images_of(project_root / "images" / "e")[:4]
+    ]
     short, long = (str(record(tmp_path, images, count)) for count in _FRAMES)
     # Workers begin with the memory of this process, which the first run of all increases.
     runs = [short, short, long]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,45 +14,35 @@ from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from lut import TableError
-
-
-def python(program: str, root: Path) -> str:
-    """What a program prints that ends well."""
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
-    )
-    return done.stdout
-
+from tests.detect.commands import output_of
 
 # -- the process that has them --------------------------------------------------------------
 
 
 @pytest.mark.long
-def test_who_has_others_work_loads_no_compiler(small_run: Path, project_root: Path) -> None:
+def test_who_has_others_work_loads_no_compiler(small_run: Path) -> None:
     """It would begin half a second later."""
-    said = python(
+    said = output_of(
         "import sys\n"
         "from detect.cli import main\n"
         "if __name__ == '__main__':\n"
         f"    code = main(['circles', {str(small_run)!r}, '--jobs', '2'])\n"
         "    heavy = {'numba', 'scipy', 'skimage', 'lut'} & set(sys.modules)\n"
-        "    print('exit', code, 'heavy', sorted(heavy))\n",
-        project_root,
+        "    print('exit', code, 'heavy', sorted(heavy))\n"
     )
     assert said.splitlines()[-1] == "exit 0 heavy []"
 
 
-def test_workers_load_no_command_line(project_root: Path) -> None:
+def test_workers_load_no_command_line() -> None:
     """They import the program before they know what for."""
-    said = python(
-        "import sys, detect.__main__; print({'tyro', 'detect.cli', 'numpy'} & set(sys.modules))",
-        project_root,
+    said = output_of(
+        "import sys, detect.__main__; print({'tyro', 'detect.cli', 'numpy'} & set(sys.modules))"
     )
     assert said == "set()\n"
 
 
-def test_an_interrupt_while_the_program_is_imported(project_root: Path) -> None:
-    said = python(
+def test_an_interrupt_while_the_program_is_imported() -> None:
+    said = output_of(
         "import sys\n"
         "from detect.__main__ import main\n"
         "class Interrupting:\n"
@@ -62,8 +50,7 @@ def test_an_interrupt_while_the_program_is_imported(project_root: Path) -> None:
         "        if name == 'detect.cli':\n"
         "            raise KeyboardInterrupt\n"
         "sys.meta_path.insert(0, Interrupting())\n"
-        "print(main())\n",
-        project_root,
+        "print(main())\n"
     )
     assert said == "130\n"
 

@@ -18,8 +18,8 @@ from detect.settings import CircleSettings
 from detect.sources.interface import Frames, RunFrame
 from detect.sources.opening import open_run
 from redetect.landmarks import read_frames, read_tilts
+from tests.detect.commands import files_in
 from tests.detect.demo_frames import demo_frames
-from tests.detect.test_cli import files_in
 
 LIGHT = CircleSettings(polarity="light")
 FRAMES = 7

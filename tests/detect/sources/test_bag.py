@@ -25,17 +25,14 @@ from detect.sources.interface import gray_of_pixels, read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
 from redetect.landmarks.times import read_times
+from tests.detect.commands import Captured, rows_in
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
+from tests.pictures import read_grey
 
-Captured = pytest.CaptureFixture[str]
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 START_S = 1_700_000_000.0
 #: The covariance of a movement in (forward, left, turn), and how far it goes.
 STEP_COVARIANCE = np.array([[2e-4, 1e-5, 2e-6], [1e-5, 5e-5, -3e-6], [2e-6, -3e-6, 4e-4]])
-
-
-def rows(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
 
 
 def poses_of_steps(steps: list[Step]) -> list[tuple[float, float, float]]:
@@ -57,7 +54,7 @@ def recorded(ros: Ros, run: Path, compressed: bool = False) -> list[Said]:
     for k, pose in enumerate(poses_of_steps(list(read_steps(run / "s.txt")))):
         time_s = START_S + 0.2 * k
         file = run / "images" / f"{PREFIXES[k]}.png"
-        image = np.asarray(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE))
+        image = read_grey(file)
         if compressed:
             message = ros.compressed(file.read_bytes(), "mono8; png compressed", time_s)
         else:
@@ -81,8 +78,8 @@ def test_a_bag_gives_the_rows_of_its_images(
     assert main(["circles", str(small_run), "-o", str(expected)]) == 0
     camera = ["--camera", str(small_run / "s.cam")]
     assert main(["circles", str(path), *camera, "-o", str(found)]) == 0
-    landmarks = [row for row in rows(expected) if row.startswith("LANDMARK_C")]
-    assert [row for row in rows(found) if row.startswith("LANDMARK_C")] == landmarks
+    landmarks = [row for row in rows_in(expected) if row.startswith("LANDMARK_C")]
+    assert [row for row in rows_in(found) if row.startswith("LANDMARK_C")] == landmarks
     steps = [frame.step for frame in read_frames(found)]
     assert steps[0].dx == steps[0].dy == steps[0].cxx == 0.0  # before the first there is nothing
     for step, wanted in zip(steps[1:], list(read_steps(small_run / "s.txt"))[1:], strict=True):
@@ -412,7 +409,7 @@ def test_a_calibration_beside_the_bag(small_run: Path, tmp_path: Path) -> None:
     expected = b"".join(
         format_frame(Frame(frame.step)) for frame in open_source(path).frames
     ).decode()
-    assert rows(tmp_path / "s_bag.detected.markers") == expected.splitlines()
+    assert rows_in(tmp_path / "s_bag.detected.markers") == expected.splitlines()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from camera.formats.yaml_files import ROS_NAMES
 from detect.errors import DetectError
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
-from tests.detect.recordings import BagKind, Ros, Said
+from tests.detect.recordings import BagKind, Ros, Said, images_of
 
 OPTICAL = "front_optical"
 
@@ -48,11 +48,10 @@ def info(ros: Ros, camera: ForeignCamera, **changed: Any) -> Any:
 
 
 def recorded(run: Path, ros: Ros, said: list[Said]) -> list[Said]:
-    images = []
-    for k in range(3):
-        image = cv2.imread(str(run / "images" / f"s.{k:04d}.png"), cv2.IMREAD_GRAYSCALE)
-        message = ros.image(np.asarray(image), "mono8", 10.0 + k)
-        images.append(Said("/front/image_raw", 10.0 + k, message))
+    images = [
+        Said("/front/image_raw", 10.0 + k, ros.image(image, "mono8", 10.0 + k))
+        for k, image in enumerate(images_of(run))
+    ]
     return [*said, *images]
 
 

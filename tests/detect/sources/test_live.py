@@ -21,7 +21,8 @@ from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.times import read_times
-from tests.detect.recordings import write_video
+from tests.detect.recordings import images_of, write_video
+from tests.pictures import read_grey
 
 
 class Played:
@@ -96,9 +97,8 @@ def test_an_interrupt_finishes_cleanly(
     plugged: Plugged, small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first interrupt ends the stream; what was seen is written, and the exit code is 0."""
-    image = cv2.imread(str(small_run / "images" / "s.0000.png"), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
-    opened = plugged([np.asarray(image, np.uint8)])
+    image = read_grey(small_run / "images" / "s.0000.png")
+    opened = plugged([image])
     output = tmp_path / "live.circles"
     framed = live.LiveCamera.__iter__
 
@@ -145,10 +145,7 @@ def test_the_number_is_opencvs_and_frames_come_as_from_a_device(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    images = [
-        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((small_run / "images").iterdir())
-    ]
+    images = images_of(small_run)
     film = write_video(tmp_path / "device.avi", images)
     plain, asked = cv2.VideoCapture, []
 

@@ -12,25 +12,16 @@ import pytest
 
 from camera import Camera
 from detect.cli import main
-from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.times import read_times
-from tests.detect.recordings import write_video
+from tests.detect.commands import Captured, assert_refused, rows_in
+from tests.detect.recordings import images_of, write_bag, write_video
+from tests.pictures import read_grey
 
-Captured = pytest.CaptureFixture[str]
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
-
-
-def images_of(run: Path) -> list[np.ndarray]:
-    found = [cv2.imread(str(run / "images" / f"{p}.png"), cv2.IMREAD_GRAYSCALE) for p in PREFIXES]
-    return [np.asarray(image, np.uint8) for image in found if image is not None]
-
-
-def rows(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
 
 
 @pytest.fixture
@@ -45,7 +36,7 @@ def video(small_run: Path, tmp_path: Path) -> Path:
 def expected_rows(small_run: Path, tmp_path: Path) -> list[str]:
     output = tmp_path / "expected.circles"
     assert main(["circles", str(small_run), "-o", str(output)]) == 0
-    return rows(output)
+    return rows_in(output)
 
 
 # -- video ----------------------------------------------------------------------------------
@@ -59,16 +50,12 @@ def test_a_video_gives_the_rows_of_its_images(
     output = video.parent / "s.detected.circles"
     assert f"{output}: 3 discs in 3 frames" in capsys.readouterr().out
     landmarks = [row for row in expected_rows if row.startswith("LANDMARK_C")]
-    assert [row for row in rows(output) if row.startswith("LANDMARK_C")] == landmarks
+    assert [row for row in rows_in(output) if row.startswith("LANDMARK_C")] == landmarks
+    steps = [frame.step for frame in read_frames(output)]
+    assert [step.prefix for step in steps] == PREFIXES
+    assert all(step.dx == step.cxx == 0.0 for step in steps)
     times = read_times(f"{output}.times")
     assert times == pytest.approx({p: 0.1 * k for k, p in enumerate(PREFIXES)}, abs=1e-6)
-
-
-def test_without_odometry_steps_are_zero(video: Path) -> None:
-    assert main(["circles", str(video)]) == 0
-    found = list(read_frames(video.parent / "s.detected.circles"))
-    assert [frame.step.prefix for frame in found] == PREFIXES
-    assert all(frame.step.dx == frame.step.cxx == 0.0 for frame in found)
 
 
 def test_all_of_a_video_is_named_after_it(video: Path) -> None:
@@ -97,19 +84,9 @@ def test_any_number_of_frames(video: Path) -> None:
 @pytest.mark.parametrize("kind", ["video", "bag"])
 def test_workers_write_the_same_bytes(project_root: Path, tmp_path: Path, kind: str) -> None:
     source = project_root / "images" / "e"
-    images = [
-        np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
-        for path in sorted((source / "images").glob("*.jpg"))[:20]
-    ]
-    if kind == "video":
-        path = write_video(tmp_path / "e.avi", images)
-    else:
-        pytest.importorskip("rosbags")
-        from tests.detect.recordings import Ros, Said
-
-        ros = Ros()
-        said = [Said("/i", k, ros.image(image, "mono8", k)) for k, image in enumerate(images, 1)]
-        path = ros.write(tmp_path / "e", said)
+    images = [read_grey(path) for path in sorted((source / "images").glob("*.jpg"))[:20]]
+    write = write_bag if kind == "bag" else write_video
+    path = write(tmp_path / ("e" if kind == "bag" else "e.avi"), images)
     arguments = ["all", str(path), "--camera", str(source / "e.cam")]
     written = []
     for jobs in (1, 2):
@@ -147,7 +124,7 @@ def test_a_video_that_is_cut_off_says_so(video: Path, caplog: pytest.LogCaptureF
 def test_a_pattern_takes_what_it_matches(small_run: Path, expected_rows: list[str]) -> None:
     pattern = small_run / "images" / "s.000[01].png"
     assert main(["circles", str(pattern), "--odometry", str(small_run / "s.txt")]) == 3
-    assert rows(small_run / "detected.circles") == [
+    assert rows_in(small_run / "detected.circles") == [
         *expected_rows[: expected_rows.index(next(r for r in expected_rows if "s.0002" in r))],
         next(row for row in expected_rows if "s.0002" in row),
     ]
@@ -174,11 +151,6 @@ def test_deep_images_by_their_significant_bits(tmp_path: Path, deep: int, signif
     assert cv2.imwrite(str(tmp_path / "b.tiff"), values)
     for frame in open_source(tmp_path).frames:
         np.testing.assert_array_equal(read_image(frame, None), values >> (significant - 8))
-
-
-def test_numbers_of_frames_that_there_cannot_be() -> None:
-    with pytest.raises(DetectError, match="frames is -1"):
-        SourceOptions(frames=-1)
 
 
 def test_a_description_of_images_makes_no_bag(small_run: Path) -> None:
@@ -236,17 +208,6 @@ REFUSED: dict[str, tuple[Callable[[Path, Path], list[str]], str]] = {
 def test_refusals_tell_what_to_do(
     small_run: Path, tmp_path: Path, capsys: Captured, case: str
 ) -> None:
-    arguments, told = REFUSED[case]
-    assert main(["circles", *arguments(tmp_path, small_run)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
-    assert told in line
-
-
-@pytest.mark.parametrize("command", ["circles", "lines", "markers", "all"])
-def test_help_shows_an_example(command: str, capsys: Captured) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    shown = capsys.readouterr().out
-    assert f"Example: detect {command} images/" in " ".join(shown.split())
-    assert "--odometry" in shown
+    make, told = REFUSED[case]
+    arguments = make(tmp_path, small_run)
+    assert_refused(["circles", *arguments], small_run, told, capsys)

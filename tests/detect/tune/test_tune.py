@@ -25,8 +25,8 @@ from detect.tune import (
     pareto_front,
 )
 from redetect.landmarks import read_frames
+from tests.detect.commands import assert_refused
 from tests.detect.conftest import SMALL_RUN_DISCS
-from tests.detect.test_cli import assert_refused
 
 Captured = pytest.CaptureFixture[str]
 

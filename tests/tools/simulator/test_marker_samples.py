@@ -12,6 +12,7 @@ import pytest
 
 from camera import read_camera
 from detect.markers.dictionaries import marker_dictionary
+from tests.pictures import read_grey
 from tools.simulator.__main__ import main
 from tools.simulator.markers.samples import (
     SampleSettings,
@@ -174,8 +175,7 @@ def test_frames_on_disk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert [frame["index"] for frame in truth["frames"]] == [0, 1, 2, 3]
     settings = SampleSettings(width=320, height=240)
     for row in truth["frames"]:
-        image = cv2.imread(str(folder / "images" / f"{row['image']}.png"), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
+        image = read_grey(folder / "images" / f"{row['image']}.png")
         frame = sample_frame(settings, 7, row["index"])
         np.testing.assert_array_equal(image, frame.image)
         camera = read_camera(folder / row["camera"])

@@ -25,6 +25,7 @@ from redetect.groundtruth.trajectories.transforms import (
     transform,
 )
 from redetect.landmarks.times import read_times
+from tests.pictures import read_grey
 from tools.simulator.__main__ import main
 from tools.simulator.driving import planar_transform
 from tools.simulator.markers.calibration_set import (
@@ -143,8 +144,7 @@ def test_markers_are_in_the_image_where_the_truth_says(folder: Path) -> None:
     checked = 0
     for row in truth["frames"]:
         path = folder / row["camera"] / "images" / f"{row['image']}.png"
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
+        image = read_grey(path)
         for marker in row["markers"]:
             if marker["visible"] < 1.0 or marker["rim_visible"] < 1.0 or marker["slant_deg"] > 55:
                 continue
@@ -271,8 +271,7 @@ def test_calibration_set(tmp_path: Path) -> None:
         points = apply(inverse(network.world_from_camera[camera]) @ pose, board.points)
         corners = np.array(known["corners"])
         np.testing.assert_allclose(network.cameras[camera].project(points), corners, atol=1e-3)
-        image = cv2.imread(str(tmp_path / "network" / row["image"]), cv2.IMREAD_GRAYSCALE)
-        assert image is not None
+        image = read_grey(tmp_path / "network" / row["image"])
         start = corners.astype(np.float32).reshape(-1, 1, 2).copy()
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
         fitted = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), criteria).reshape(-1, 2)
@@ -326,8 +325,7 @@ def test_demo_session_comes_out_again(project_root: Path) -> None:
     plan = plan_session(DEMO)
     for name, camera, frame in (("a", 0, 2), ("b", 1, 11)):
         path = folder / name / "images" / f"m.{frame:04d}.jpg"
-        committed = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        assert committed is not None
+        committed = read_grey(path)
         image = view_frame(plan, camera, frame).image
         # JPEG, and other machines may round differently in the last digit.
         assert np.abs(image.astype(int) - committed.astype(int)).mean() < 2.0

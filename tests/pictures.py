@@ -1,0 +1,16 @@
+"""Pictures on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """The grey values of a picture that is there."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None, path
+    return np.asarray(image, np.uint8)
