@@ -55,15 +55,13 @@ def test_sums_in_any_order_are_inlined_up_to_the_kernel_that_python_calls(
     imported = {path: _imports(path) for path in {kernel.path for kernel in kernels}}
     #: Of each kernel those that it calls: of its own file, and those that this imports.
     called = {
-        kernel: [
+        own: [
             other
             for other in kernels
-            if other.name in kernel.calls
-            and (
-                other.path == kernel.path or (other.path.stem, other.name) in imported[kernel.path]
-            )
+            if other.name in own.calls
+            and (other.path == own.path or (other.path.stem, other.name) in imported[own.path])
         ]
-        for kernel in kernels
+        for own in kernels
     }
     # With what is inlined, their code sums in any order.
     free = {kernel for kernel in kernels if kernel.any_order}

@@ -21,6 +21,8 @@ from detect.seen import leaning_camera
 from detect.settings_files import read_settings
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
 
+Rows = list[NDArray[np.float64]]
+
 #: A calibration is wrong by so much, degrees.
 LEANS = [(2.3, 0.0), (-2.3, 0.8)]
 
@@ -31,14 +33,14 @@ def wrong_by(camera: Camera, lean_deg: tuple[float, float]) -> Camera:
     return leaning_camera(camera, (float(pitch), float(roll)))
 
 
-def level_rows(circles: Path) -> list[NDArray[np.float64]]:
+def level_rows(circles: Path) -> Rows:
     return [
         np.array([(row.px, row.py) for row in frame.circles]).reshape(-1, 2)
         for frame in read_frames(circles)
     ]
 
 
-def found_again(rows: list[NDArray[np.float64]], others: list[NDArray[np.float64]]) -> float:
+def found_again(rows: Rows, others: Rows) -> float:
     """Share of rows near one of the others, within 15 cm."""
     near = [
         bool(len(there)) and bool(np.hypot(*(there - xy).T).min() < 0.15)
@@ -49,9 +51,7 @@ def found_again(rows: list[NDArray[np.float64]], others: list[NDArray[np.float64
 
 
 @pytest.fixture(scope="module")
-def right(
-    project_root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> list[NDArray[np.float64]]:
+def right(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
     """The discs of the demo run by its own calibration."""
     output = tmp_path_factory.mktemp("right")
     assert main(["all", str(project_root / "images" / "e"), "-o", str(output)]) == 0
@@ -60,7 +60,7 @@ def right(
 
 @pytest.mark.parametrize("lean_deg", LEANS)
 def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
-    project_root: Path, tmp_path: Path, right: list[NDArray[np.float64]],
+    project_root: Path, tmp_path: Path, right: Rows,
     lean_deg: tuple[float, float],
 ) -> None:  # fmt: skip
     run = project_root / "images" / "e"
@@ -93,7 +93,7 @@ def test_what_is_said_of_positions_that_are_not_levelled(
     run = project_root / "images" / "e"
     camera = tmp_path / "wrong.cam"
     write_camera(wrong_by(read_camera(run / "e.cam"), (2.3, 0.0)), camera)
-    rest = ["--camera", str(camera), "--frames", "30", "-o", str(tmp_path / "some")]
+    rest = ["--camera", str(camera), "--jobs", "1", "-o", str(tmp_path / "some")]
     assert main(["circles", str(run), *rest]) == 0
     assert "positions are not levelled: pitch and roll" in capsys.readouterr().out
     assert main(["all", str(run), *rest[:-1], str(tmp_path / "all"), "--tilt", "frame"]) == 0
