@@ -1,7 +1,8 @@
-"""Commands that are refused, and the files of results."""
+"""Commands and other programs, what they say, and the files of their results."""
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,19 @@ def output_of(program: str, *arguments: str) -> str:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def in_browser(address: str, profile: Path, *flags: str) -> tuple[str, str]:
+    """What a browser makes of a page, and what it says."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium on this machine")
+    usual = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0")
+    shown = subprocess.run(
+        [browser, *usual, *flags, f"--user-data-dir={profile}", "--dump-dom", address],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    return shown.stdout, shown.stderr
 
 
 def rows_in(path: Path) -> list[str]:

@@ -13,11 +13,7 @@ from camera import Camera
 from tests.detect.painted_floor import PaintedFloor
 
 #: The discs in the three images of the small run.
-SMALL_RUN_DISCS = {
-    "s.0000": [(0.1, -1.2), (-0.5, -1.9)],
-    "s.0001": [(0.3, -1.5)],
-    "s.0002": [],
-}
+SMALL_RUN_DISCS = {"s.0000": [(0.1, -1.2), (-0.5, -1.9)], "s.0001": [(0.3, -1.5)], "s.0002": []}
 
 SMALL_RUN_STEPS = """\
 # Odometry of the small run.

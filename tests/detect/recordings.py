@@ -47,9 +47,7 @@ class Ros:
     def header(self, time_s: float) -> Any:
         nanoseconds = round(time_s * 1e9)
         stamp = self.make(
-            "builtin_interfaces/msg/Time",
-            sec=nanoseconds // 10**9,
-            nanosec=nanoseconds % 10**9,
+            "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9
         )
         extra = {"seq": 0} if self.is1 else {}
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="frame", **extra)

@@ -18,6 +18,7 @@ from detect.seen import level_seen
 from detect.verticals.tilt import Verticals
 from redetect.landmarks import read_frames
 from tests.camera.test_uncertainty import moved
+from tests.detect.commands import Captured
 from tests.detect.verticals.stages import consensus
 
 SIGMAS = np.array(
@@ -73,7 +74,7 @@ def rows(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("command", ["circles", "all"])
 def test_rows_state_it_and_the_command_says_its_share(
-    small_run: Path, command: str, capsys: pytest.CaptureFixture[str]
+    small_run: Path, command: str, capsys: Captured
 ) -> None:
     (calibration,) = small_run.glob("*.cam")
     write_camera(exact(read_camera(calibration)), calibration, overwrite=True)
@@ -101,9 +102,7 @@ def test_rows_state_it_and_the_command_says_its_share(
     assert "covariances include the calibration's" in head
 
 
-def test_what_a_calibration_does_not_state_is_assumed(
-    published_camera: Camera,
-) -> None:
+def test_what_a_calibration_does_not_state_is_assumed(published_camera: Camera) -> None:
     """Positions of pixels that are wrong by so much have this covariance."""
     pixels = published_camera.project_floor(FLOOR)
     rng = np.random.default_rng(4)
@@ -117,9 +116,7 @@ def test_what_a_calibration_does_not_state_is_assumed(
 
 
 @pytest.mark.parametrize("command", ["circles", "all"])
-def test_rows_state_what_is_assumed(
-    small_run: Path, command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_state_what_is_assumed(small_run: Path, command: str, capsys: Captured) -> None:
     (calibration,) = small_run.glob("*.cam")
     unstated = replace(read_camera(calibration), covariance=None)
     write_camera(unstated, calibration, overwrite=True)

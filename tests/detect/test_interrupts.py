@@ -21,6 +21,7 @@ from redetect.interrupts import (
     raise_if_interrupt_waits,
     raise_if_interrupted,
 )
+from tests.detect.commands import Captured
 
 
 @pytest.fixture
@@ -34,10 +35,7 @@ def caught() -> Iterator[None]:
 @pytest.mark.usefixtures("caught")
 @pytest.mark.parametrize("other", [SystemError, ValueError, OSError])
 def test_what_an_interrupt_turned_into(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    other: type[Exception],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured, other: type[Exception]
 ) -> None:
     def disguise(_: object) -> int:
         try:
@@ -145,7 +143,7 @@ def test_an_ignored_interrupt_stays_ignored() -> None:
 
 
 def test_nowhere_to_keep_kernels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
     """What Numba says of a read-only program without a cache folder is no help to its user."""
     from numba.core.caching import FunctionCache

@@ -20,6 +20,7 @@ from detect.runs.frame import lean_of_frame
 from detect.seen import leaning_camera
 from detect.settings_files import read_settings
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
+from tests.detect.commands import Captured
 
 Rows = list[NDArray[np.float64]]
 
@@ -88,7 +89,7 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
 
 
 def test_what_is_said_of_positions_that_are_not_levelled(
-    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    project_root: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     run = project_root / "images" / "e"
     camera = tmp_path / "wrong.cam"

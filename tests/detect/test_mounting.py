@@ -21,6 +21,7 @@ from detect.mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import LEAST_FRAMES, FrameTilts
 from detect.seen import image_positions, level_seen
 from redetect.storage import OutputExistsError
+from tests.detect.commands import Captured
 
 HEIGHT_M = 1.5
 #: How pitch by outlines goes with the height: linear, and a little bent.
@@ -122,9 +123,7 @@ def test_without_a_covariance_the_remounted_camera_states_none(published_camera:
 
 
 @pytest.mark.long
-def test_the_demos_camera_comes_back(
-    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_demos_camera_comes_back(project_root: Path, tmp_path: Path, capsys: Captured) -> None:
     """A calibration that is 5 cm too low and leans by 2 degrees is put right."""
     run = project_root / "images" / "e"
     true = read_camera(run / "e.cam")
@@ -152,7 +151,7 @@ def test_the_demos_camera_comes_back(
 
 
 def test_images_of_another_size_are_told_once(
-    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    project_root: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     run = project_root / "images" / "e"
     for name in ("a.png", "b.png"):

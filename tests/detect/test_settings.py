@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -11,39 +11,42 @@ from hypothesis import strategies as st
 
 from detect.circles import disc_shape
 from detect.errors import DetectError
-from detect.settings import PUBLISHED, REPORT, CircleSettings
-
-NONSENSE = [
-    ("threshold", 0.0),
-    ("threshold", -0.1),
-    ("threshold", 1.5),
-    ("threshold", math.nan),
-    ("radius_m", 0.0),
-    ("radius_m", -0.1),
-    ("radius_m", math.nan),
-    ("separation", -0.01),
-    ("separation", math.inf),
-    ("separation", math.nan),
-    ("noise_floor", -1.0),
-    ("noise_floor", math.nan),
-    ("systematic_px", -0.1),
-    ("tilt_sigma_deg", math.nan),
-    ("evidence", math.nan),
-    ("evidence", math.inf),
-]
+from detect.line_settings import LineSettings
+from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
 
 
-@pytest.mark.parametrize(("name", "value"), NONSENSE)
-def test_nonsense_is_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(DetectError) as refusal:
-        CircleSettings(**{name: value})  # type: ignore[arg-type]
-    assert str(refusal.value).startswith(f"{name} is {value:g}: expected ")
-
-
-@pytest.mark.parametrize(("name", "value"), [("inner_ring", 1.0), ("outer_ring", 1.0)])
-def test_a_disc_lies_between_its_outlines(name: str, value: float) -> None:
-    with pytest.raises(DetectError, match=rf"{name} is 1: expected (less|more) than 1, the disc"):
-        CircleSettings(**{name: value})  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("settings", "changes", "told"),
+    [
+        (CircleSettings, {"threshold": 0.0}, "threshold is 0: expected"),
+        (CircleSettings, {"threshold": 1.5}, "threshold is 1.5: expected"),
+        (CircleSettings, {"radius_m": 0.0}, "radius_m is 0: expected"),
+        (CircleSettings, {"inner_ring": 1.0}, "inner_ring is 1: expected less than 1, the disc"),
+        (CircleSettings, {"outer_ring": 1.0}, "outer_ring is 1: expected more than 1, the disc"),
+        (LineSettings, {"threshold": 0.0}, "threshold is 0: expected"),
+        (LineSettings, {"regulariser": 0.0}, "regulariser is 0: expected"),
+        (LineSettings, {"least_rows": 2}, "least_rows is 2: expected"),
+        (LineSettings, {"refine_steps_px": ((0.0, 1.0),)}, "refine_steps_px is .*: expected"),
+        (
+            LineSettings,
+            {"blurred_widths": (1.0,)},
+            "blurred_widths is 1: expected a number",
+        ),
+        (LineSettings, {"blurred_widths": (2.0, 11.0)}, "blurred_widths is 11: expected a number"),
+        (MarkerSettings, {"thresholds": ()}, "thresholds"),
+        (MarkerSettings, {"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),
+        (MarkerSettings, {"least_holes": 5, "most_holes": 2}, "least_holes"),
+        (MarkerSettings, {"least_explained": 2.0}, "least_explained"),
+        (MarkerSettings, {"area_factor": 0.5}, "area_factor"),
+        (MarkerSettings, {"least_white": 4.0}, "least_white"),
+    ],
+)
+def test_nonsense_is_refused_by_name(
+    settings: type[Any], changes: dict[str, Any], told: str
+) -> None:
+    """Besides what no number of any settings may be: `tests/storage/test_bounds.py`."""
+    with pytest.raises(DetectError, match=told):
+        settings(**changes)
 
 
 @given(st.floats(0.0, 1.0, exclude_min=True))
@@ -54,12 +57,7 @@ def test_every_quality_can_be_the_threshold(threshold: float) -> None:
 def test_lengths_go_with_the_radius() -> None:
     for preset in (PUBLISHED, REPORT, CircleSettings()):
         half = replace(preset, radius_m=0.05)
-        for name in (
-            "inner_radius_m",
-            "outer_radius_m",
-            "far_limit_m_per_px",
-            "separation_m",
-        ):
+        for name in ("inner_radius_m", "outer_radius_m", "far_limit_m_per_px", "separation_m"):
             assert getattr(half, name) == pytest.approx(0.5 * getattr(preset, name))
         shape, small = disc_shape(preset), disc_shape(half)
         assert small.stride_m == pytest.approx(0.5 * shape.stride_m)

@@ -16,6 +16,7 @@ from detect.line_settings import LineSettings
 from detect.options import All, Circles
 from detect.settings import PRESETS, CircleSettings, MarkerSettings
 from detect.settings_files import read_settings, settings_text
+from tests.detect.commands import Captured
 
 
 @settings(max_examples=25)
@@ -87,7 +88,7 @@ def test_refusals(tmp_path: Path, content: str, words: str) -> None:
     assert json.dumps(str(told.value))
 
 
-def test_a_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_file_is_one_line(tmp_path: Path, capsys: Captured) -> None:
     missing = str(tmp_path / "none.json")
     assert main(["circles", "run", "--settings", missing]) == 1
     assert capsys.readouterr().err.startswith(f"error: {missing}: cannot be read")

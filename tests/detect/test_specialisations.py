@@ -23,18 +23,11 @@ from detect.levelling import levelled
 from detect.settings import CircleSettings
 from lut import DiscShape, cached_disc_table, cached_vertical_table
 from redetect.landmarks import FrameTilt
+from tools.benchmark.material import scaled_camera
 from tools.published_camera import PUBLISHED_CAM
 
 FLOOR_XY = np.array([[0.0, -1.0], [1.1, -2.0]])
 COVARIANCE = np.stack([1e-4 * np.eye(2)] * 2)
-
-
-def small(camera: Camera) -> Camera:
-    """At an eighth of its size: tables in milliseconds."""
-    return dataclasses.replace(
-        camera, width=96, height=36, scale_x=464.762 / 8, scale_y=232.381 / 8, offset_x=48.0,
-        offset_y=18.0,
-    )  # fmt: skip
 
 
 def kinds_of(table: Any) -> dict[str, str]:
@@ -48,7 +41,7 @@ def test_tables_that_are_built_and_read_are_of_one_kind(
     published_camera: Camera, tmp_path: Path, kind: str
 ) -> None:
     def table() -> Any:
-        camera = small(published_camera)
+        camera = scaled_camera(published_camera, 1 / 8)  # tables in milliseconds
         if kind == "verticals":
             return cached_vertical_table(camera, folder=tmp_path)
         return cached_disc_table(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import shutil
-import subprocess
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,6 +20,7 @@ from detect.settings_files import read_settings
 from detect.sources.opening import open_run
 from detect.tuning_page import TuningServer, TuningSession
 from redetect.landmarks import read_frames
+from tests.detect.commands import in_browser
 
 FRAMES = 3
 
@@ -180,16 +179,8 @@ def test_files_of_others_are_not_replaced(server: TuningServer, tmp_path: Path) 
 
 @pytest.mark.long
 def test_a_browser_shows_the_discs(server: TuningServer, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium on this machine")
     post(server, "/detect", {"frame": 0, "settings": {}})  # compiles
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0"]
-    flags += ["--virtual-time-budget=10000", f"--user-data-dir={tmp_path / 'profile'}"]
-    shown = subprocess.run(
-        [browser, *flags, "--dump-dom", server.address],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    assert "rejected, " in shown.stdout
-    assert "e.0000 (1 of 3)" in shown.stdout
-    assert "CONSOLE" not in shown.stderr
+    shown, said = in_browser(server.address, tmp_path / "profile", "--virtual-time-budget=10000")
+    assert "rejected, " in shown
+    assert "e.0000 (1 of 3)" in shown
+    assert "CONSOLE" not in said

@@ -12,10 +12,8 @@ import pytest
 from detect.cli import main
 from detect.seen import summed_steps
 from redetect.landmarks import Step, read_frames
-from tests.detect.commands import assert_refused
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.recordings import images_of, write_video
-
-Captured = pytest.CaptureFixture[str]
 
 
 def test_steps_round_a_square_come_back() -> None:

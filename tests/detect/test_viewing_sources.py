@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.cli import main
-from tests.detect.commands import assert_refused
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.recordings import images_of, write_bag, write_video
 
 
@@ -70,7 +70,7 @@ def test_the_same_pictures_page_and_table(
 
 @pytest.mark.parametrize("command", ["draw", "view", "report", "tune"])
 def test_a_live_camera_shows_something_else_by_now(
-    command: str, small_run: Path, capsys: pytest.CaptureFixture[str]
+    command: str, small_run: Path, capsys: Captured
 ) -> None:
     if command == "view":
         pytest.importorskip("rerun")

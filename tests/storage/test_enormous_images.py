@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -19,27 +20,19 @@ from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.storage.bounded import MOST_PIXELS, claimed_size
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 
-CONTENTS = (jpeg(SIDE, SIDE), png(SIDE, SIDE))
 
-
-@pytest.mark.parametrize("content", CONTENTS, ids=["jpeg", "png"])
-def test_pictures_for_a_calibration(tmp_path: Path, content: bytes) -> None:
+@pytest.mark.parametrize("make", [jpeg, png])
+def test_pictures_for_calibrations_and_of_boards(
+    tmp_path: Path, make: Callable[[int, int], bytes], published_camera: Camera
+) -> None:
     path = tmp_path / "a.jpg"
-    path.write_bytes(content)
-    said = f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
-    with pytest.raises(CameraError, match=re.escape(said)):
+    path.write_bytes(make(SIDE, SIDE))
+    said = re.escape(f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels")
+    with pytest.raises(CameraError, match=said):
         read_grey(path)
-
-
-@pytest.mark.parametrize("content", CONTENTS, ids=["jpeg", "png"])
-def test_pictures_of_boards(tmp_path: Path, content: bytes, published_camera: Camera) -> None:
-    path = tmp_path / "a.jpg"
-    path.write_bytes(content)
-    said = f"{path}: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
-    with pytest.raises(GroundTruthError, match=re.escape(said)):
-        find_boards(
-            BoardImage("a", "b", 0, path), Board("checkerboard", 5, 4, 0.1), published_camera
-        )
+    board = Board("checkerboard", 5, 4, 0.1)
+    with pytest.raises(GroundTruthError, match=said):
+        find_boards(BoardImage("a", "b", 0, path), board, published_camera)
 
 
 @pytest.mark.parametrize("deep", [False, True])

@@ -320,9 +320,7 @@ DISCS = st.lists(
 
 @given(DISCS, DISCS, st.booleans())
 def test_rows_are_accounted_for_whatever_they_are(
-    reference: list[CircleLandmark],
-    detected: list[CircleLandmark],
-    only_identified: bool,
+    reference: list[CircleLandmark], detected: list[CircleLandmark], only_identified: bool
 ) -> None:
     options = CompareOptions(only_identified=only_identified)
     found = compare([frame("e", *reference)], [frame("e", *detected)], options)

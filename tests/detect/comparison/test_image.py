@@ -30,6 +30,7 @@ from redetect.landmarks import (
     write_frames,
 )
 from redetect.storage import write_whole
+from tests.detect.commands import Captured
 from tests.detect.comparison.formatting import format_text
 
 FloatArray = NDArray[np.float64]
@@ -197,9 +198,7 @@ def test_rows_that_are_levelled_alike_have_no_second_figures(published_camera: C
     json.loads(nothing.to_json())
 
 
-def test_without_a_calibration_the_floor_is_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_calibration_the_floor_is_compared(tmp_path: Path, capsys: Captured) -> None:
     row = CircleLandmark(0.0, -1.0, 0.9, 1e-4, 0.0, 1e-4, (1,))
     for name in ("map.circles", "detected.circles"):
         write_frames(tmp_path / name, [Frame(Step("s.0000", *[0.0] * 9), (row,))])

@@ -18,14 +18,7 @@ from detect.cli import main
 from detect.comparison.compare import compare_line_frames
 from detect.comparison.result import LineComparison
 from detect.options import CompareOptions
-from redetect.landmarks import (
-    CircleLandmark,
-    Frame,
-    Landmark,
-    LineLandmark,
-    Step,
-    write_frames,
-)
+from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, write_frames
 from tests.detect.comparison.formatting import format_text
 
 STANDARD = CompareOptions()
@@ -48,9 +41,7 @@ def frame(name: str, *rows: Landmark) -> Frame:
 
 
 def compare(
-    reference: Sequence[Frame],
-    detected: Sequence[Frame],
-    options: CompareOptions = STANDARD,
+    reference: Sequence[Frame], detected: Sequence[Frame], options: CompareOptions = STANDARD
 ) -> LineComparison:
     return compare_line_frames(reference, detected, options)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -96,26 +98,30 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: V
     assert fit.fits[0].radius == pytest.approx(0.25, rel=2e-3)
 
 
-def test_refined_covariance_is_the_sum(published_camera: Camera) -> None:
+@pytest.mark.parametrize("tangential", [(0.0, 0.0), (2e-3, -3e-3)])
+def test_refined_covariance_is_the_sum(
+    published_camera: Camera, tangential: tuple[float, float]
+) -> None:
     """The fit's, J J^T per square pixel, and the tilt's, from the camera's own functions.
 
     Of the tilt by finite differences: the robot turns about its origin, what is seen is held to be
     level.
     """
+    camera = replace(published_camera, tangential=tangential)
     settings = CircleSettings(systematic_px=0.02, tilt_sigma_deg=0.4)
     places = np.array(PLACES)
     fitted = np.random.default_rng(1).normal(0.0, 1e-3, (len(places), 2, 2))
     fitted = fitted @ fitted.swapaxes(-1, -2)
-    jacobian = published_camera.floor_jacobian(published_camera.project_floor(places))
+    jacobian = camera.floor_jacobian(camera.project_floor(places))
     step = 1e-5
     ends = [
-        published_camera.floor_from_pixel(image_positions(published_camera, places, lean))
+        camera.floor_from_pixel(image_positions(camera, places, lean))
         for lean in ((step, 0.0), (-step, 0.0), (0.0, step), (0.0, -step))
     ]
     tilt = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * step)
     expected = fitted + 0.02**2 * jacobian @ jacobian.swapaxes(-1, -2)
     expected += np.radians(0.4) ** 2 * tilt @ tilt.swapaxes(-1, -2)
-    found = refined_covariance(published_camera, places, fitted, settings)
+    found = refined_covariance(camera, places, fitted, settings)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -17,6 +17,7 @@ from detect.discs.radius import find_radius
 from detect.options import All, Circles
 from detect.settings import CircleSettings
 from lut import build_vote_table
+from tests.detect.commands import Captured
 from tests.detect.painted_floor import PaintedFloor
 
 #: Every test tries the same radii with the same camera: their tables are made once.
@@ -81,9 +82,7 @@ def number_in(text: str, words: str) -> float:
     return float(found[1])
 
 
-def test_a_run_is_detected_at_the_radius_found(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_is_detected_at_the_radius_found(run: Path, capsys: Captured) -> None:
     assert main(["circles", str(run), "--radius-m", "auto"]) == 0
     said = capsys.readouterr()
     radius = number_in(said.err, "discs have a radius of")
@@ -100,15 +99,13 @@ def test_the_published_detector_takes_the_radius_found(run: Path) -> None:
     assert used == pytest.approx(0.06, rel=0.02)
 
 
-def test_another_radius_is_offered(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_radius_is_offered(run: Path, capsys: Captured) -> None:
     assert main(["circles", str(run)]) == 0
     offered = number_in(capsys.readouterr().err, "radius seems to be")
     assert offered == pytest.approx(0.06, rel=0.02)
 
 
-def test_where_there_are_no_discs_it_is_said_what_to_look_at(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_there_are_no_discs_it_is_said_what_to_look_at(run: Path, capsys: Captured) -> None:
     for path in (run / "images").iterdir():
         cv2.imwrite(str(path), np.full((288, 768), 100, np.uint8))
     assert main(["circles", str(run)]) == 0
@@ -118,7 +115,7 @@ def test_where_there_are_no_discs_it_is_said_what_to_look_at(
     shutil.rmtree(run / "images")
 
 
-def test_what_candidates_for_discs_fail(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_candidates_for_discs_fail(run: Path, capsys: Captured) -> None:
     for path in sorted((run / "images").iterdir())[3:]:
         path.unlink()
     command = ["circles", str(run), "--polarity", "dark", "--radius-m", "0.06"]

@@ -8,15 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import (
-    DIRECTIONS,
-    RADIUS_SIGMA,
-    Circle,
-    Rim,
-    fit_circle,
-    follow_rim,
-    profiles,
-)
+from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim, profiles
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 PLACES = np.array([(0.0, -1.2), (0.5, -1.5), (-0.6, -1.9), (0.4, -2.3)])

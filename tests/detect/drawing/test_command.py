@@ -25,11 +25,10 @@ from redetect.landmarks import (
     Step,
     circle_landmarks,
 )
-from tests.detect.commands import assert_refused
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.drawing.test_detections import changed
 from tests.pictures import read_grey
 
-Captured = pytest.CaptureFixture[str]
 FloatArray = NDArray[np.float64]
 
 SETTINGS = CircleSettings()

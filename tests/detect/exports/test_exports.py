@@ -13,8 +13,7 @@ from detect.cli import main
 from detect.ros_messages import TOPICS
 from redetect.landmarks import read_frames, read_tilts
 from redetect.landmarks.columns import TABLES, TableName, values_of
-
-Captured = pytest.CaptureFixture[str]
+from tests.detect.commands import Captured
 
 FILES = {
     "circles": """\
@@ -58,10 +57,7 @@ def expected_rows(path: Path) -> dict[TableName, list[tuple[Any, ...]]]:
     if path.suffix == ".tilt":
         (tilt,) = read_tilts(path).values()
         return {"tilts": [(1, tilt.prefix, *values_of(tilt))]}
-    rows: dict[TableName, list[tuple[Any, ...]]] = {
-        TABLE[path.suffix[1:]]: [],
-        "steps": [],
-    }
+    rows: dict[TableName, list[tuple[Any, ...]]] = {TABLE[path.suffix[1:]]: [], "steps": []}
     for number, frame in enumerate(read_frames(path)):
         for table, records in (("steps", [frame.step]), (path.suffix[1:], frame.landmarks)):
             for record in records:

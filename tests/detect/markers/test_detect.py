@@ -346,23 +346,6 @@ def test_expected_ids_and_width_narrow_the_search() -> None:
     assert len(detect_markers(image, MarkerSettings(dictionary="6x6_250", width_px=300.0))) == 0
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"thresholds": ()}, "thresholds"),
-        ({"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),
-        ({"width_px": -1.0}, "width_px is -1:"),
-        ({"least_holes": 5, "most_holes": 2}, "least_holes"),
-        ({"least_explained": 2.0}, "least_explained"),
-        ({"area_factor": 0.5}, "area_factor"),
-        ({"least_white": 4.0}, "least_white"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(wrong: dict[str, object], message: str) -> None:
-    with pytest.raises(DetectError, match=message):
-        MarkerSettings(**wrong)  # type: ignore[arg-type]
-
-
 def test_unknown_dictionaries_and_ids_and_sizes_are_refused(published_camera: Camera) -> None:
     image, _ = picture()
     with pytest.raises(DetectError, match="no such dictionary"):

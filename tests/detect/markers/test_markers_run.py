@@ -16,6 +16,7 @@ from detect.settings import MarkerSettings
 from detect.sources.interface import Run
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
+from tests.detect.commands import Captured
 from tests.detect.markers.rendering import View, exposed, render, view_corners
 
 POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -41,9 +42,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.lowest
-def test_rows_of_a_folder_without_a_calibration(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_of_a_folder_without_a_calibration(folder: Path, capsys: Captured) -> None:
     drawn = str(folder / "drawn")
     assert main(["markers", str(folder), "--draw", drawn, "--rejected"]) == 0
     assert "3 markers in 3 frames" in capsys.readouterr().out
@@ -87,9 +86,7 @@ def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
     assert summary.frames == 3
 
 
-def test_wrong_dictionaries_are_told_before_any_work(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_dictionaries_are_told_before_any_work(folder: Path, capsys: Captured) -> None:
     assert main(["markers", str(folder), "--dictionary", "9x9"]) == 1
     assert "no such dictionary" in capsys.readouterr().err
     assert not (folder / "detected.markers").exists()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 from collections.abc import Sequence
 from html.parser import HTMLParser
 from pathlib import Path
@@ -20,9 +19,7 @@ from detect.options import CompareOptions
 from detect.report.figures import binned, rates_over, whitened
 from detect.seen import Sight
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
-from tests.detect.commands import assert_refused
-
-Captured = pytest.CaptureFixture[str]
+from tests.detect.commands import Captured, assert_refused, in_browser
 
 GATE = CompareOptions(gate_m=0.1)
 Discs = list[tuple[list[CircleLandmark], list[CircleLandmark]]]
@@ -112,10 +109,7 @@ def test_errors_drawn_from_the_covariance_are_standard_normal() -> None:
 
 
 def test_residuals_of_bearings_are_wrapped_and_need_a_sigma() -> None:
-    lines = [
-        ([line(3.141, 0.01)], [line(-3.141, 0.002)]),
-        ([line(0.1, 0.01)], [line(0.101, 0.0)]),
-    ]
+    lines = [([line(3.141, 0.01)], [line(-3.141, 0.002)]), ([line(0.1, 0.01)], [line(0.101, 0.0)])]
     result = compared_lines(lines)
     np.testing.assert_allclose(result.pairs.error_rad, [2 * np.pi - 6.282, 0.001], atol=1e-12)
     np.testing.assert_allclose(whitened(result), [(2 * np.pi - 6.282) / 0.002])
@@ -306,19 +300,6 @@ def test_everything_from_files_is_escaped(hostile_run: tuple[Path, str], tmp_pat
     assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f]", words)
 
 
-def in_browser(page: Path, folder: Path) -> tuple[str, str]:
-    """What a browser made of a page, and what it said."""
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium on this machine")
-    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0")
-    shown = subprocess.run(
-        [browser, *flags, f"--user-data-dir={folder}", "--dump-dom", page.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    return shown.stdout, shown.stderr
-
-
 @pytest.mark.long
 def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: Path) -> None:
     """Not even if the browser took no notice of the page's own prohibition of scripts."""
@@ -326,11 +307,11 @@ def test_nothing_of_a_file_is_executed(hostile_run: tuple[Path, str], tmp_path: 
     text = (tmp_path / "r.html").read_text()
     prohibition = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
     (tmp_path / "r.html").write_text(prohibition.sub("", text))
-    shown, _ = in_browser(tmp_path / "r.html", tmp_path / "profile")
+    shown, _ = in_browser((tmp_path / "r.html").as_uri(), tmp_path / "profile")
     assert "<title>Detections of &lt;b&gt;&amp;run</title>" in shown
     # The same words as they are would be.
     (tmp_path / "x.html").write_text(f"<!DOCTYPE html><title>not in</title>{HOSTILE}")
-    shown, _ = in_browser(tmp_path / "x.html", tmp_path / "profile")
+    shown, _ = in_browser((tmp_path / "x.html").as_uri(), tmp_path / "profile")
     assert "<title>in</title>" in shown
 
 

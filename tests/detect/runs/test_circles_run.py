@@ -105,11 +105,7 @@ def test_bad_images_cost_their_frames_only(small_run: Path, tmp_path: Path) -> N
         ticks[0] += 1
 
     summary = detected(
-        open_run(small_run),
-        CircleSettings(),
-        output,
-        json_output=as_json,
-        on_progress=tick,
+        open_run(small_run), CircleSettings(), output, json_output=as_json, on_progress=tick
     )
     assert summary.frames == ticks[0] == 3
     assert summary.failed == 2

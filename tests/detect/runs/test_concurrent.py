@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from detect.cli import main
-from tests.detect.commands import files_in
+from tests.detect.commands import Captured, files_in
 from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import ForkedRuns, StopAfter, forked_runs, started
 from tools.soak.short_runs import repeat_short_runs
@@ -68,7 +68,7 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
 
 
 def test_the_same_command_twice_is_refused(
-    runs: ForkedRuns, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    runs: ForkedRuns, run_folder: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     output = folder_of(tmp_path / "output")
     arguments = ["all", str(run_folder), "-o", str(output)]

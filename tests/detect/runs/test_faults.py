@@ -18,11 +18,11 @@ import pytest
 from detect.cli import main
 from redetect.landmarks import read_frames, read_steps
 from redetect.storage import demand_writable
+from tests.detect.commands import Captured
 from tests.detect.conftest import SMALL_RUN_DISCS
 from tests.detect.runs.test_faults_images import SIDE, jpeg, png
 from tests.pictures import read_grey
 
-Captured = pytest.CaptureFixture[str]
 NOBODY = 65534
 
 #: Every way of being bad, and the words that say so.

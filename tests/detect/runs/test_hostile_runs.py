@@ -15,6 +15,7 @@ from detect.errors import FrameError
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from redetect.landmarks import read_frames
+from tests.detect.commands import Captured
 
 STEP = "STEP {} 0 0 0 1e-6 0 1e-6 0 0 1e-6\n"
 
@@ -108,9 +109,7 @@ def test_a_folder_of_images_may_be_a_link(run: Path, published_camera: Camera) -
         assert read_image(frame, published_camera).shape == (288, 768)
 
 
-def test_names_that_a_terminal_would_act_upon_are_escaped(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_names_that_a_terminal_would_act_upon_are_escaped(run: Path, capsys: Captured) -> None:
     name = "s.0000\x1b[2J\x1b]0;owned\x07\u202e"
     cv2.imwrite(str(run / "images" / f"{name}.png"), np.zeros((3, 3), np.uint8))
     (run / "s.txt").write_text(STEP.format(name) + STEP.format("s.0000") + STEP.format("\x1b[31m"))
@@ -146,7 +145,7 @@ UP = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.5]]
     ],
 )
 def test_impossible_mountings_are_refused(
-    run: Path, capsys: pytest.CaptureFixture[str], pose: list[list[float]], message: str
+    run: Path, capsys: Captured, pose: list[list[float]], message: str
 ) -> None:
     (run / "s.cam").write_text(mounted((run / "s.cam").read_text(), pose))
     assert main(["all", str(run)]) == 1
@@ -156,7 +155,7 @@ def test_impossible_mountings_are_refused(
 
 @pytest.mark.parametrize("pose", [DOWN, UP])
 def test_a_horizon_outside_the_image_means_no_verticals(
-    run: Path, pose: list[list[float]], capsys: pytest.CaptureFixture[str]
+    run: Path, pose: list[list[float]], capsys: Captured
 ) -> None:
     """And a camera that sees no floor finds no discs; neither is an error, nor a warning."""
     (run / "s.cam").write_text(mounted((run / "s.cam").read_text(), pose))
@@ -170,7 +169,7 @@ def test_a_horizon_outside_the_image_means_no_verticals(
 
 
 def test_a_lens_that_folds_in_the_corners_is_used_where_it_sees(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     text = (run / "s.cam").read_text()
     begin = text.index("coef:")
@@ -181,9 +180,7 @@ def test_a_lens_that_folds_in_the_corners_is_used_where_it_sees(
     assert main(["report", str(run), "-o", str(tmp_path / "report.html")]) == 0
 
 
-def test_a_distortion_that_folds_inside_the_image_is_refused(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_distortion_that_folds_inside_the_image_is_refused(run: Path, capsys: Captured) -> None:
     text = (run / "s.cam").read_text()
     begin = text.index("coef:")
     (run / "s.cam").write_text(text[:begin] + "coef: { 0 -0.9 0 0 0 } }\n")

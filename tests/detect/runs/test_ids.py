@@ -10,6 +10,7 @@ import pytest
 from detect.cli import main
 from detect.runs.plan import MapByImage
 from redetect.landmarks import CircleLandmark, LandmarkFileError, read_frames
+from tests.detect.commands import Captured
 from tests.detect.demo_frames import demo_frames
 
 FRAMES = 30
@@ -62,9 +63,7 @@ def test_ids_of_rows_and_of_a_map(
     assert len(by_map.keys() & own.keys()) > 0.97 * len(own)
 
 
-def test_a_map_needs_its_path(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_needs_its_path(run: Path, tmp_path: Path, capsys: Captured) -> None:
     (tmp_path / "map.csv").write_text("kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n")
     assert main(["circles", str(run), "--ids-from-map", str(tmp_path / "map.csv")]) == 1
     assert re.search("error: .*--path", capsys.readouterr().err)

@@ -17,6 +17,7 @@ from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
 from detect.sources.opening import open_run
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
+from tests.detect.commands import Captured
 from tests.detect.demo_frames import demo_frames
 from tests.detect.line_scene import pinhole
 
@@ -100,9 +101,7 @@ def test_frames_with_a_tilt_do_not_count_the_unknown_one(short_run: Path) -> Non
     np.testing.assert_array_equal(known, without)
 
 
-def test_frames_that_count_as_level_are_told(
-    short_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_count_as_level_are_told(short_run: Path, capsys: Captured) -> None:
     assert main(["all", str(short_run), "--tilt", "frame"]) == 0
     assert "the tilt of 4 frames\n" in capsys.readouterr().out
     (short_run / "images" / "e.0001.jpg").write_bytes(b"not an image")
@@ -123,11 +122,7 @@ def test_frames_that_count_as_level_are_told(
     ("pitch_deg", "roll_deg", "blind"), [(80.0, 0.0, True), (0.0, 90.0, True), (30.0, 5.0, False)]
 )
 def test_a_camera_that_can_see_no_verticals_is_told(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    pitch_deg: float,
-    roll_deg: float,
-    blind: bool,
+    tmp_path: Path, capsys: Captured, pitch_deg: float, roll_deg: float, blind: bool
 ) -> None:
     camera = pinhole(90, 60, 80.0, pitch_deg=pitch_deg, roll_deg=roll_deg)
     write_camera(camera, tmp_path / "a.cam", overwrite=False)

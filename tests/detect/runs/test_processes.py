@@ -14,7 +14,7 @@ from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
 from lut import TableError
-from tests.detect.commands import output_of
+from tests.detect.commands import Captured, output_of
 
 # -- the process that has them --------------------------------------------------------------
 
@@ -60,10 +60,7 @@ def test_an_interrupt_while_the_program_is_imported() -> None:
 
 @pytest.mark.long
 def test_one_of_them_makes_the_tables(
-    small_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Captured
 ) -> None:
     """The others wait for the cache, and find there what a process alone would have made."""
     arguments = ["all", str(small_run), "-o"]

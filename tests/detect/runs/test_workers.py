@@ -37,6 +37,7 @@ from detect.runs.workers import (
 )
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
+from tests.detect.commands import Captured
 from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import started
 
@@ -304,7 +305,7 @@ def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path
 
 
 def test_a_missing_package_is_named(
-    small_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    small_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
     real = builtins.__import__
 
@@ -321,15 +322,13 @@ def test_a_missing_package_is_named(
 
 
 @pytest.mark.parametrize("address", ["nonsense", "localhost:8786", "tcp://localhost", ":::"])
-def test_malformed_addresses(
-    small_run: Path, capsys: pytest.CaptureFixture[str], address: str
-) -> None:
+def test_malformed_addresses(small_run: Path, capsys: Captured, address: str) -> None:
     assert main(["lines", str(small_run), "--cluster", address]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert f"cluster is {address!r}: expected the scheduler's tcp://host:port" in line
 
 
-def test_jobs_or_a_cluster(small_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_jobs_or_a_cluster(small_run: Path, capsys: Captured) -> None:
     assert main(["all", str(small_run), "--jobs", "2", "--cluster", "tcp://127.0.0.1:1"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "--jobs and --cluster: expected one of them" in line

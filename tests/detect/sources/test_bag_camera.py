@@ -100,9 +100,7 @@ def test_a_decentred_lens_is_taken_over(small_run: Path, tmp_path: Path) -> None
     (tmp_path / "bag").mkdir()
     k = [460.0, 0, 384, 0, 230, 144, 0, 0, 1]
     d = [-0.05, 0.01, 4e-3, -5e-3, 0.0]
-    said = [
-        Said("/front/camera_info", 1.0, ros.camera_info(768, 288, "plumb_bob", d, k, OPTICAL)),
-    ]
+    said = [Said("/front/camera_info", 1.0, ros.camera_info(768, 288, "plumb_bob", d, k, OPTICAL))]
     run = open_source(ros.write(tmp_path / "bag" / "s", recorded(small_run, ros, said)))
     assert isinstance(run, Run)
     camera = run.camera

@@ -21,6 +21,7 @@ from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.times import read_times
+from tests.detect.commands import Captured
 from tests.detect.recordings import images_of, write_video
 from tests.pictures import read_grey
 
@@ -140,10 +141,7 @@ def test_a_second_interrupt_is_meant(
 
 @pytest.mark.long
 def test_the_number_is_opencvs_and_frames_come_as_from_a_device(
-    small_run: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Captured
 ) -> None:
     images = images_of(small_run)
     film = write_video(tmp_path / "device.avi", images)

@@ -198,11 +198,7 @@ def test_a_movements_covariance_is_what_random_drives_show() -> None:
     steps = rng.multivariate_normal(step, step_covariance, count)
     cos, sin = np.cos(starts[:, 2]), np.sin(starts[:, 2])
     ends = starts + np.column_stack(
-        [
-            cos * steps[:, 0] - sin * steps[:, 1],
-            sin * steps[:, 0] + cos * steps[:, 1],
-            steps[:, 2],
-        ]
+        [cos * steps[:, 0] - sin * steps[:, 1], sin * steps[:, 0] + cos * steps[:, 1], steps[:, 2]]
     )
     before = TimedPose(0.0, start[0], start[1], start[2], np.cov(starts.T))
     end = ends.mean(axis=0)

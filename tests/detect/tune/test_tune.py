@@ -16,20 +16,10 @@ from detect.cli import main
 from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
 from detect.settings import CircleSettings
-from detect.tune import (
-    combinations,
-    curve_picture,
-    knee,
-    marked,
-    parameter_values,
-    pareto_front,
-)
+from detect.tune import combinations, curve_picture, knee, marked, parameter_values, pareto_front
 from redetect.landmarks import read_frames
-from tests.detect.commands import assert_refused
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.conftest import SMALL_RUN_DISCS
-
-Captured = pytest.CaptureFixture[str]
-
 
 # -- curve and knee ---------------------------------------------------------------------------
 

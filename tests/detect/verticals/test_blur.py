@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from detect.errors import DetectError
-from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.line_settings import DEFAULT, PUBLISHED
 from detect.lines import detect_lines
 from detect.verticals.blur import blur_of_sharpness, median_sharpness, widened, width_for
 from detect.verticals.refinement import LineFits
@@ -112,9 +111,3 @@ def test_sharp_images_are_looked_at_once() -> None:
     again = detect_lines(image, TABLE, NEVER_WIDER)
     np.testing.assert_equal(found.lines, again.lines)
     np.testing.assert_array_equal(found.tracks.column, again.tracks.column)
-
-
-@pytest.mark.parametrize("widths", [(1.0,), (2.0, 11.0), (math.nan,)])
-def test_widths_without_sense_are_refused(widths: tuple[float, ...]) -> None:
-    with pytest.raises(DetectError, match=r"blurred_widths is .*: expected a number above 1"):
-        LineSettings(blurred_widths=widths)

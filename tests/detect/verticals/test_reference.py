@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.sources.interface import decode_gray
-from detect.verticals.refinement import (
-    Crossings,
-    newton_step,
-    step_filters,
-)
+from detect.verticals.refinement import Crossings, newton_step, step_filters
 from detect.verticals.response import line_response
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks

@@ -13,13 +13,7 @@ from scipy.ndimage import gaussian_filter
 from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
-from detect.verticals.tilt import (
-    TiltEstimate,
-    Verticals,
-    agree_on_tilt,
-    gather,
-    level_matrix,
-)
+from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, gather, level_matrix
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import consensus
@@ -30,10 +24,7 @@ ONE_BY_ONE = replace(SETTINGS, stray_share=0.0)
 
 
 def seen_normals(
-    rng: np.random.Generator,
-    count: int,
-    tilt_rad: tuple[float, float],
-    deviation_rad: np.ndarray,
+    rng: np.random.Generator, count: int, tilt_rad: tuple[float, float], deviation_rad: np.ndarray
 ) -> np.ndarray:
     """Normals of verticals over a view of +-40 deg, as a tilted camera measures them."""
     bearing = rng.uniform(-0.7, 0.7, count)
@@ -43,11 +34,7 @@ def seen_normals(
     return np.asarray(measured / np.linalg.norm(measured, axis=1, keepdims=True))
 
 
-@given(
-    pitch=st.floats(-4.9, 4.9),
-    roll=st.floats(-4.9, 4.9),
-    seed=st.integers(0, 2**31),
-)
+@given(pitch=st.floats(-4.9, 4.9), roll=st.floats(-4.9, 4.9), seed=st.integers(0, 2**31))
 def test_exact_verticals_give_the_tilt_back(pitch: float, roll: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     true = np.radians(pitch), np.radians(roll)

@@ -69,10 +69,7 @@ def test_errors_are_as_large_as_stated() -> None:
         normal, variance = building(rng, int(rng.integers(4, 8)), (true[0], true[1]))
         count = len(variance)
         given_ = Verticals(normal, variance, np.full(count, np.radians(0.9)), np.ones(count))
-        for chosen, into in (
-            (SETTINGS, squared),
-            (replace(SETTINGS, stray_share=0.0), one_by_one),
-        ):
+        for chosen, into in ((SETTINGS, squared), (replace(SETTINGS, stray_share=0.0), one_by_one)):
             tilt, _ = consensus(given_, chosen)
             if tilt is not None and tilt.lines >= 5:
                 error = np.array([tilt.pitch_rad, tilt.roll_rad]) - true
