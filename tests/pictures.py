@@ -1,4 +1,4 @@
-"""Pictures on disk."""
+"""Pictures: read from disk, and where they are bright."""
 
 from __future__ import annotations
 
@@ -14,3 +14,9 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None, path
     return np.asarray(image, np.uint8)
+
+
+def centroid(weight: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(u, v) of the centre of mass of a picture."""
+    v, u = np.indices(weight.shape)
+    return np.array([(u * weight).sum(), (v * weight).sum()], np.float64) / float(weight.sum())

@@ -15,11 +15,10 @@ from camera.uncertainty import with_covariance
 from detect.cli import main
 from detect.levelling import common_covariance
 from detect.seen import level_seen
-from detect.verticals.tilt import Verticals
 from redetect.landmarks import read_frames
 from tests.camera.test_uncertainty import moved
 from tests.detect.commands import Captured
-from tests.detect.verticals.stages import consensus
+from tests.detect.verticals.stages import consensus, verticals
 
 SIGMAS = np.array(
     [1.0, 0.5, 1.0, 0.7, *[1e-9] * 5, 1e-9, 1e-9, *[1e-9] * 3, *[2e-3] * 3, 3e-3, 3e-3, 2e-3]
@@ -55,7 +54,7 @@ def test_errors_are_as_large_as_stated(published_camera: Camera, by_verticals: b
         found = wrong.floor_from_pixel(pixels)
         if by_verticals:
             normal = normals_of_verticals(published_camera, wrong)
-            tilt, _ = consensus(Verticals(normal, np.full(25, 1e-8), np.full(25, 0.1), np.ones(25)))
+            tilt, _ = consensus(verticals(normal, 1e-8, 0.1, 1.0))
             assert tilt is not None
             found = level_seen(wrong, found, (tilt.pitch_rad, tilt.roll_rad))
         stated = common_covariance(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, tilt_of_run
+from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, RunTilt, tilt_of_run
 
 FloatArray = NDArray[np.float64]
 FRAMES = 600
@@ -41,6 +41,12 @@ def sequence(
     return true, measured, sigma**2
 
 
+def found_tilt(*of_frames: FrameTilts | FloatArray) -> RunTilt:
+    run = tilt_of_run(*of_frames)  # type: ignore[arg-type]
+    assert run is not None
+    return run
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("spread", [0.2, 0.5])
 @pytest.mark.parametrize(("strays", "jumps"), [(0.0, 0.0), (0.02, 0.03)])
@@ -48,10 +54,7 @@ def test_errors_are_as_large_as_stated(
     seed: int, spread: float, strays: float, jumps: float
 ) -> None:
     true, measured, variance = sequence(seed, spread, strays, jumps)
-
-    run = tilt_of_run(FrameTilts(measured, variance))
-
-    assert run is not None
+    run = found_tilt(FrameTilts(measured, variance))
     # The simulated lens has no error that all verticals share.
     normalised = np.mean((run.tilt - true) ** 2 / (run.variance - COMMON_RAD**2), axis=0)
     assert np.all((normalised > 0.3) & (normalised < 2.0)), normalised
@@ -61,10 +64,7 @@ def test_errors_are_as_large_as_stated(
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_is_nearer_than_the_frames_and_than_the_constant(seed: int) -> None:
     true, measured, variance = sequence(seed)
-
-    run = tilt_of_run(FrameTilts(measured, variance))
-
-    assert run is not None
+    run = found_tilt(FrameTilts(measured, variance))
     error = np.sqrt(np.nanmean((run.tilt - true) ** 2))
     assert error < 0.75 * np.sqrt(np.nanmean((measured - true) ** 2))
     assert error < 0.9 * np.sqrt(np.mean((run.lean - true) ** 2))
@@ -75,10 +75,7 @@ def test_verticals_that_lean_together_are_not_believed() -> None:
     true, measured, variance = sequence(4, strays=0.0, jumps=0.0)
     measured[300:320, 0] += np.radians(3.0)
     variance[300:320] = np.radians(1.0) ** 2
-
-    run = tilt_of_run(FrameTilts(measured, variance))
-
-    assert run is not None
+    run = found_tilt(FrameTilts(measured, variance))
     assert np.degrees(np.abs(run.tilt - true)[300:320, 0]).max() < 1.5
 
 
@@ -88,10 +85,7 @@ def test_a_sill_is_followed() -> None:
     true[300, 0] += np.radians(2.0)
     measured[300] = true[300]
     variance[300] = np.radians(0.1) ** 2
-
-    run = tilt_of_run(FrameTilts(measured, variance))
-
-    assert run is not None
+    run = found_tilt(FrameTilts(measured, variance))
     assert np.degrees(abs(run.tilt[300, 0] - true[300, 0])) < 1.0
     # A stray would look the same: the error that is stated allows for it.
     assert np.degrees(np.sqrt(run.variance[300, 0])) > 0.5
@@ -115,14 +109,10 @@ def test_the_lean_is_between_those_of_verticals_and_outlines(wrong: str) -> None
     off = np.radians([1.0, -0.5])
     measured = measured - off * {"verticals": 1.0, "outlines": 0.0, "both": 0.5}[wrong]
     outlines = outlines + off * {"verticals": 0.0, "outlines": 1.0, "both": 0.5}[wrong]
-
-    alone = tilt_of_run(FrameTilts(measured, variance))
-    run = tilt_of_run(
+    alone = found_tilt(FrameTilts(measured, variance))
+    run = found_tilt(
         FrameTilts(measured, variance), FrameTilts(outlines, np.full(true.shape, sigma**2))
     )
-
-    assert alone is not None
-    assert run is not None
     assert np.all(np.abs(run.lean - LEAN) < 0.5 * np.abs(off) + np.radians(0.1))
     assert np.all(np.abs(run.lean - LEAN) < 2.0 * run.lean_sigma)
     # Frames' deviations are nearer to the truth than by the verticals alone.
@@ -136,12 +126,8 @@ def test_few_outlines_are_left_out() -> None:
     true, measured, variance = sequence(8)
     outlines = np.full(true.shape, np.nan)
     outlines[: LEAST_FRAMES - 5] = 0.5
-
-    run = tilt_of_run(FrameTilts(measured, variance), FrameTilts(outlines, variance))
-    alone = tilt_of_run(FrameTilts(measured, variance))
-
-    assert run is not None
-    assert alone is not None
+    run = found_tilt(FrameTilts(measured, variance), FrameTilts(outlines, variance))
+    alone = found_tilt(FrameTilts(measured, variance))
     np.testing.assert_array_equal(run.tilt, alone.tilt)
 
 
@@ -154,10 +140,7 @@ def test_how_good_verticals_are_is_learned_by_outlines(seed: int, factor: float)
     sigma = np.radians(0.3)
     outlines = true + sigma * np.random.default_rng(seed).standard_normal(true.shape)
     stated = FrameTilts(outlines, np.full(true.shape, (2.0 * sigma) ** 2))
-
-    run = tilt_of_run(FrameTilts(measured, variance), stated)
-
-    assert run is not None
+    run = found_tilt(FrameTilts(measured, variance), stated)
     # Outlines and verticals agree, and no lens is wrong here.
     assert np.all(run.lean_sigma < 0.5 * COMMON_RAD)
     assert run.height_sigma < 0.002
@@ -175,10 +158,7 @@ def test_a_short_run_does_not_believe_too_much(seed: int) -> None:
     verticals = true + sigma * np.where(time % 8 == 0, 1.0, 0.3) * rng.standard_normal(true.shape)
     outlines = true + np.radians(0.1) * rng.standard_normal(true.shape)
     stated = np.full(true.shape, np.radians(0.3) ** 2)
-
-    run = tilt_of_run(FrameTilts(verticals, sigma**2), FrameTilts(outlines, stated), np.zeros(2))
-
-    assert run is not None
+    run = found_tilt(FrameTilts(verticals, sigma**2), FrameTilts(outlines, stated), np.zeros(2))
     assert np.mean((run.tilt - true) ** 2 / run.variance) < 1.5
     assert np.std(run.tilt - true) < 0.8 * np.std(verticals - true)
 
@@ -188,12 +168,9 @@ def test_outlines_that_disagree_leave_the_lens_in_doubt() -> None:
     sigma = np.radians(0.2)
     outlines = true + sigma * np.random.default_rng(1).standard_normal(true.shape)
     outlines[:, 0] += np.radians(1.0)
-
-    run = tilt_of_run(
+    run = found_tilt(
         FrameTilts(measured, variance), FrameTilts(outlines, np.full(true.shape, sigma**2))
     )
-
-    assert run is not None
     assert np.all(run.lean_sigma > 0.9 * COMMON_RAD)
     assert run.variance.min() > (0.9 * COMMON_RAD) ** 2
     # A pitch that is a degree off by a wrong height is that of one 4 % wrong, at the most.

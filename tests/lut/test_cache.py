@@ -311,7 +311,8 @@ def test_concurrent_writers_all_get_right_tables(
     built = build_disc_table(camera, SHAPE)
     right = hashlib.sha256(built.samples.tobytes() + built.floor_xy.tobytes()).hexdigest()
     write_camera(camera, tmp_path / "e.cam")
-    program = [sys.executable, "-W", "error", "-c", WRITER, tmp_path, tmp_path / "e.cam", "40"]
+    places = [str(tmp_path), str(tmp_path / "e.cam")]
+    program = [sys.executable, "-W", "error", "-c", WRITER, *places, "40"]
     pipe = subprocess.PIPE
     processes = [
         subprocess.Popen([*program, f"{k}"], cwd=project_root, stdout=pipe, stderr=pipe, text=True)

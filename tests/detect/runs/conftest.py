@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from detect.cli import main
 from tests.detect.commands import Captured
+from tests.detect.forked_runs import ForkedRuns, forked_runs
 from tests.detect.interrupted_runs import Trial, a_run, results
 
 
@@ -32,3 +34,12 @@ def trial(
     """The run with an empty folder for its results."""
     (tmp_path / "output").mkdir()
     return Trial(run_folder, tmp_path / "output", undisturbed, capsys)
+
+
+@pytest.fixture(scope="session")
+def runs(
+    run_folder: Path, undisturbed: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[ForkedRuns]:
+    """Starts runs in processes of their own; the kernels have been compiled."""
+    with forked_runs(run_folder, tmp_path_factory.mktemp("forked")) as started_runs:
+        yield started_runs

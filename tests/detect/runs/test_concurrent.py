@@ -4,37 +4,23 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from detect.cli import main
 from tests.detect.commands import Captured, files_in
-from tests.detect.demo_frames import demo_frames
-from tests.detect.forked_runs import ForkedRuns, StopAfter, forked_runs, started
+from tests.detect.forked_runs import ForkedRuns, StopAfter, started
+from tests.detect.interrupted_runs import FRAMES
 from tools.soak.short_runs import repeat_short_runs
 
 PATIENCE_S = 400.0
 DETECT = ("-m", "detect")
-FRAMES = 16
 
 pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(sys.platform == "win32", reason="files are locked as Unix does"),
 ]
-
-
-@pytest.fixture(scope="module")
-def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("run") / "e"
-    return demo_frames(project_root, run, [place % 8 for place in range(FRAMES)])
-
-
-@pytest.fixture(scope="module")
-def runs(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ForkedRuns]:
-    with forked_runs(run_folder, tmp_path_factory.mktemp("forked")) as started_runs:
-        yield started_runs
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -52,7 +38,7 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
     kinds = ("circles", "lines")
     alone, together = folder_of(tmp_path / "alone"), folder_of(tmp_path / "together")
     for kind in kinds:
-        assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 0
+        assert main([kind, str(run_folder), "-o", str(alone / f"rows.{kind}")]) == 3
     cold = {"REDETECT_CACHE": str(tmp_path / "tables")}
     processes = [
         started([*DETECT, kind, str(run_folder), "-o", str(together / f"rows.{kind}")], **cold)
@@ -60,7 +46,7 @@ def test_different_commands_on_one_folder(run_folder: Path, tmp_path: Path) -> N
     ]
     for process in processes:
         code, said = ended(process)
-        assert code == 0, said
+        assert code == 3, said
     assert files_in(together) == files_in(alone)
     tables = [path.name for path in (tmp_path / "tables").iterdir()]
     assert len(tables) == 2
@@ -80,7 +66,7 @@ def test_the_same_command_twice_is_refused(
             journal = output / ".detected.journal"
             assert line.startswith(f"error: {journal}: another run is writing")
         first.go_on()
-        assert first.wait() == 0, first.said()
+        assert first.wait() == 3, first.said()
     assert len(files_in(output)) == 5
 
 

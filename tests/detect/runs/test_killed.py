@@ -11,7 +11,6 @@ import random
 import shutil
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,21 +25,12 @@ from tests.detect.forked_runs import (
     ForkedRuns,
     Room,
     StopAfter,
-    forked_runs,
     started,
     wait_until_stopped,
 )
 from tests.detect.interrupted_runs import FRAMES, KINDS, Trial
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="kills as Linux does")
-
-
-@pytest.fixture(scope="module")
-def runs(
-    run_folder: Path, undisturbed: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[ForkedRuns]:
-    with forked_runs(run_folder, tmp_path_factory.mktemp("forked")) as started_runs:
-        yield started_runs
 
 
 def killed(runs: ForkedRuns, trial: Trial, frames: int, *flags: str) -> int:

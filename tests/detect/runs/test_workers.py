@@ -6,7 +6,6 @@ import builtins
 import json
 import multiprocessing
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -49,10 +48,27 @@ MANY_FRAMES = 3000
 PATIENCE_S = 600.0
 
 
-@pytest.fixture
-def run_folder(project_root: Path, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def run_folder(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Long enough to be disturbed: frames of the demo run, over and over."""
-    return demo_frames(project_root, tmp_path / "e", [place % 8 for place in range(FRAMES)])
+    run = tmp_path_factory.mktemp("run") / "e"
+    return demo_frames(project_root, run, [place % 8 for place in range(FRAMES)])
+
+
+@pytest.fixture(scope="module")
+def expected(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """What one process writes."""
+    return detected(run_folder, tmp_path_factory.mktemp("expected") / "one", local_workers(1))
+
+
+@pytest.fixture
+def long_run(project_root: Path, tmp_path: Path) -> Path:
+    """One image over and over; links that lead out of a run are refused."""
+    run = demo_frames(project_root, tmp_path / "e", [0])
+    image = (run / "images" / "e.0000.jpg").rename(run / "image.jpg")
+    for number in range(MANY_FRAMES):
+        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
+    return run
 
 
 def test_a_kernel_may_be_compiled_between_two_tasks(project_root: Path) -> None:
@@ -139,8 +155,9 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
 
 
 @pytest.mark.long
-def test_a_killed_process_costs_nothing(run_folder: Path, tmp_path: Path) -> None:
-    expected = detected(run_folder, tmp_path / "one", local_workers(1))
+def test_a_killed_process_costs_nothing(
+    run_folder: Path, expected: list[bytes], tmp_path: Path
+) -> None:
     plain = local_workers(2)
     killed: list[int | None] = []
     starts: list[FramePlan] = []
@@ -196,24 +213,14 @@ def wait_until(condition: Callable[[], bool], what: str) -> None:
         time.sleep(0.05)
 
 
-def make_long(run: Path) -> None:
-    """One image over and over; links that lead out of a run are refused."""
-    image = (run / "images" / "e.0000.jpg").rename(run / "image.jpg")
-    shutil.rmtree(run / "images")
-    (run / "images").mkdir()
-    for number in range(MANY_FRAMES):
-        (run / "images" / f"e.{number:04d}.jpg").symlink_to(image)
-
-
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
 @pytest.mark.parametrize(("jobs", "delay_s"), [(1, 0.5), (2, 0.3), (2, 1.5)])
-def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: float) -> None:
+def test_an_interrupt_ends_everything(long_run: Path, jobs: int, delay_s: float) -> None:
     """Control-C reaches the whole group of processes, at whatever they are."""
-    make_long(run_folder)
-    before = sorted(path.name for path in run_folder.iterdir())
-    with at_work(run_folder, jobs) as process:
-        wait_until(lambda: bool(list(run_folder.glob(".*.journal"))), "the run to begin")
+    before = sorted(path.name for path in long_run.iterdir())
+    with at_work(long_run, jobs) as process:
+        wait_until(lambda: bool(list(long_run.glob(".*.journal"))), "the run to begin")
         time.sleep(delay_s)
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -221,24 +228,23 @@ def test_an_interrupt_ends_everything(run_folder: Path, jobs: int, delay_s: floa
     assert out == ""
     assert err.splitlines()[-1] == "interrupted"
     assert "Traceback" not in err
-    left = {path.name for path in run_folder.iterdir()} - set(before)
+    left = {path.name for path in long_run.iterdir()} - set(before)
     assert left in (
         set(),
         {".detected.journal"},
     )  # whether a frame was done: `--resume` goes on after it
     assert ("--resume" in err) == bool(left)
-    wait_until(lambda: not processes_of(run_folder), "its processes to end")
+    wait_until(lambda: not processes_of(long_run), "its processes to end")
 
 
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks for processes in /proc")
-def test_processes_end_with_the_one_that_started_them(run_folder: Path) -> None:
-    make_long(run_folder)
-    with at_work(run_folder, 2) as process:
+def test_processes_end_with_the_one_that_started_them(long_run: Path) -> None:
+    with at_work(long_run, 2) as process:
         # Itself, both workers, and the one that Python has look after semaphores.
-        wait_until(lambda: len(processes_of(run_folder)) >= 4, "the workers")
+        wait_until(lambda: len(processes_of(long_run)) >= 4, "the workers")
         process.kill()
-    wait_until(lambda: not processes_of(run_folder), "its processes to end")
+    wait_until(lambda: not processes_of(long_run), "its processes to end")
 
 
 # -- a cluster ------------------------------------------------------------------------------
@@ -288,10 +294,11 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.P
 
 @pytest.mark.lowest
 @pytest.mark.long
-def test_a_cluster_writes_what_one_process_does(run_folder: Path, tmp_path: Path) -> None:
+def test_a_cluster_writes_what_one_process_does(
+    run_folder: Path, expected: list[bytes], tmp_path: Path
+) -> None:
     """Also when one of its workers is killed half-way."""
     distributed = pytest.importorskip("distributed")
-    expected = detected(run_folder, tmp_path / "one", local_workers(1))
     with cluster(tmp_path, workers=2) as (address, workers):
         with distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=PATIENCE_S)

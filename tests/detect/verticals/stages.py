@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals import starts
@@ -14,6 +14,7 @@ from detect.verticals.starts import LineStarts, StartBand, band_response, start_
 from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, with_error
 from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow_edges
 from lut.verticals import VerticalTable
+from redetect.array_types import FloatArray
 
 
 def start_response(
@@ -68,6 +69,17 @@ def judge_tracks(
         return judged
     tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
     return judged._replace(tilt=tilt)
+
+
+def verticals(
+    normal: FloatArray,
+    variance: ArrayLike,
+    tolerance_rad: ArrayLike = 0.01,
+    weight: ArrayLike = 1.0,
+) -> Verticals:
+    """Lines of these normals; what is given as a number is that of all."""
+    given = (variance, tolerance_rad, weight)
+    return Verticals(normal, *(np.array(np.broadcast_to(v, len(normal)), float) for v in given))
 
 
 def consensus(

@@ -88,19 +88,6 @@ def test_compensation_gives_the_bearing_of_a_vertical_back(
     assert level_bearings(normal, pitch, roll) == pytest.approx(bearing, abs=1e-9)
 
 
-def test_plane_normals_do_not_depend_on_where_the_ends_are(published_camera: Camera) -> None:
-    top, bottom = np.array([0.3, -0.55]), np.array([0.24, 0.1])
-    ends = np.array(
-        [
-            [*(top + s * (bottom - top)), *(top + t * (bottom - top))]
-            for s, t in ((0, 1), (0.2, 0.9))
-        ]
-    )
-    normal = plane_normals(ends, published_camera.rotation)
-    np.testing.assert_allclose(normal[0], normal[1], atol=1e-12)
-    assert inclinations(normal[0]) == pytest.approx(np.arcsin(normal[0, 2]))
-
-
 def joined(alpha: np.ndarray, sigma: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """Mean and deviation of a mixture, behind another one."""
     two = [np.concatenate([values[:1], values]) for values in (alpha, sigma, weight)]

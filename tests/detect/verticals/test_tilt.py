@@ -13,10 +13,10 @@ from scipy.ndimage import gaussian_filter
 from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
-from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, gather, level_matrix
+from detect.verticals.tilt import TiltEstimate, agree_on_tilt, gather, level_matrix
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
-from tests.detect.verticals.stages import consensus
+from tests.detect.verticals.stages import consensus, verticals
 
 SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
 #: The covariance is that of least squares: lines err one by one.
@@ -39,9 +39,7 @@ def test_exact_verticals_give_the_tilt_back(pitch: float, roll: float, seed: int
     rng = np.random.default_rng(seed)
     true = np.radians(pitch), np.radians(roll)
     normal = seen_normals(rng, 20, true, np.zeros(20))
-    tilt, consistent = consensus(
-        Verticals(normal, np.full(20, 1e-10), np.full(20, 0.01), np.full(20, 3.0)), SETTINGS
-    )
+    tilt, consistent = consensus(verticals(normal, 1e-10, 0.01, 3.0), SETTINGS)
     assert tilt is not None
     assert consistent.all()
     np.testing.assert_allclose([tilt.pitch_rad, tilt.roll_rad], true, atol=1e-4)
@@ -58,11 +56,11 @@ def test_normalised_error_is_one_among_outliers(true_deg: tuple[float, float]) -
         furniture = rng.normal(size=(4, 3)) * [1.0, 1.0, 0.15]
         furniture /= np.linalg.norm(furniture, axis=1, keepdims=True)
         tilt, consistent = consensus(
-            Verticals(
+            verticals(
                 np.concatenate([normal, furniture]),
                 np.radians(np.concatenate([deviation, np.full(4, 0.1)])) ** 2,
-                np.full(16, np.radians(0.9)),
-                np.full(16, 2.0),
+                np.radians(0.9),
+                2.0,
             ),
             ONE_BY_ONE,
         )
@@ -80,13 +78,7 @@ def test_largest_set_wins_over_the_smallest_tilt() -> None:
     tilted = seen_normals(rng, 8, (0.05, -0.04), np.zeros(8))
     upright = seen_normals(rng, 4, (0.0, 0.0), np.zeros(4))
     tilt, consistent = consensus(
-        Verticals(
-            np.concatenate([upright, tilted]),
-            np.full(12, 1e-8),
-            np.full(12, 0.01),
-            np.full(12, 3.0),
-        ),
-        SETTINGS,
+        verticals(np.concatenate([upright, tilted]), 1e-8, 0.01, 3.0), SETTINGS
     )
     assert tilt is not None
     assert (tilt.pitch_rad, tilt.roll_rad) == pytest.approx((0.05, -0.04), abs=5e-4)
@@ -97,11 +89,9 @@ def test_largest_set_wins_over_the_smallest_tilt() -> None:
 def test_order_of_lines_does_not_matter() -> None:
     rng = np.random.default_rng(2)
     normal = seen_normals(rng, 15, (0.02, 0.03), np.full(15, 2e-3))
-    variance, weight = np.full(15, 4e-6), rng.uniform(1.0, 3.0, 15)
-    tolerance = np.full(15, 0.015)
-    order = rng.permutation(15)
-    first, _ = consensus(Verticals(normal, variance, tolerance, weight), SETTINGS)
-    second, _ = consensus(Verticals(normal[order], variance, tolerance, weight[order]), SETTINGS)
+    weight, order = rng.uniform(1.0, 3.0, 15), rng.permutation(15)
+    first, _ = consensus(verticals(normal, 4e-6, 0.015, weight), SETTINGS)
+    second, _ = consensus(verticals(normal[order], 4e-6, 0.015, weight[order]), SETTINGS)
     assert isinstance(first, TiltEstimate)
     assert isinstance(second, TiltEstimate)
     assert second.pitch_rad == pytest.approx(first.pitch_rad, abs=1e-12)
@@ -111,9 +101,7 @@ def test_order_of_lines_does_not_matter() -> None:
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_lines_give_no_estimate(count: int) -> None:
     normal = seen_normals(np.random.default_rng(3), count, (0.0, 0.0), np.zeros(count))
-    tilt, consistent = consensus(
-        Verticals(normal, np.full(count, 1e-6), np.full(count, 0.01), np.ones(count)), SETTINGS
-    )
+    tilt, consistent = consensus(verticals(normal, 1e-6, 0.01, 1.0), SETTINGS)
     assert tilt is None
     assert consistent.all()
     assert len(consistent) == count
@@ -122,12 +110,7 @@ def test_too_few_lines_give_no_estimate(count: int) -> None:
 def test_lines_that_no_small_tilt_explains_give_none() -> None:
     normal = seen_normals(np.random.default_rng(4), 10, (0.3, 0.0), np.zeros(10))
     normal = normal[np.abs(normal[:, 1]) > 0.2]
-    tilt, consistent = consensus(
-        Verticals(
-            normal, np.full(len(normal), 1e-8), np.full(len(normal), 0.01), np.ones(len(normal))
-        ),
-        SETTINGS,
-    )
+    tilt, consistent = consensus(verticals(normal, 1e-8, 0.01, 1.0), SETTINGS)
     assert tilt is None or tilt.lines < len(normal)
     assert not consistent.all()
 
@@ -149,11 +132,10 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
 
     def told(place: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(place)
-        variance, weight = np.full(count, 1e-6), np.full(count, 2.0)
         evidence = rng.uniform(10.0, 20.0, count)
         normal = np.stack([np.cos(bearing), np.sin(bearing), -lean_], axis=-1)[which]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        lines = Verticals(normal, variance, np.full(count, 0.015), weight)
+        lines = verticals(normal, 1e-6, 0.015, 2.0)
         share_edges(lines, edges_at(place, evidence))
         tilt, _ = agree_on_tilt(lines, LineNumbers.of(DEFAULT).tilt)
         assert tilt.lines > 0
@@ -168,8 +150,7 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
 
 
 def test_edges_of_other_polarity_or_farther_away_are_not_the_same() -> None:
-    variance, weight = np.full(5, 1e-6), np.full(5, 3.0)
-    lines = Verticals(np.zeros((5, 3)), variance, np.ones(5), weight)
+    lines = verticals(np.zeros((5, 3)), 1e-6, 1.0, 3.0)
     edge = edges_at(
         np.array([0.0, 1e-3, 1e-3, 4e-3, 4.5e-3]),
         np.array([10.0, 12.0, 30.0, 9.0, 8.0]),

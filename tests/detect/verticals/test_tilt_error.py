@@ -14,12 +14,11 @@ from detect.verticals.tilt import (
     STRAY_RAD,
     TOGETHER_RAD,
     TiltEstimate,
-    Verticals,
     gather,
     merge_lines,
     with_error,
 )
-from tests.detect.verticals.stages import consensus
+from tests.detect.verticals.stages import consensus, verticals
 from tests.reference.verticals import tilt_error
 
 SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
@@ -36,7 +35,7 @@ def stated_error(
 ) -> np.ndarray:  # fmt: skip
     """The covariance of a tilt that has a prior of 0.035 rad."""
     settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
-    lines = Verticals(normal, variance, np.ones(len(weight)), weight)
+    lines = verticals(normal, variance, 1.0, weight)
     estimate = TiltEstimate(*tilt, np.eye(2), len(weight))
     return with_error(estimate, lines, edge, LineNumbers.of(settings).tilt).covariance
 
@@ -67,8 +66,7 @@ def test_errors_are_as_large_as_stated() -> None:
     for _ in range(800):
         true = np.radians(rng.normal(0.0, 1.0, 2))
         normal, variance = building(rng, int(rng.integers(4, 8)), (true[0], true[1]))
-        count = len(variance)
-        given_ = Verticals(normal, variance, np.full(count, np.radians(0.9)), np.ones(count))
+        given_ = verticals(normal, variance, np.radians(0.9), 1.0)
         for chosen, into in ((SETTINGS, squared), (replace(SETTINGS, stray_share=0.0), one_by_one)):
             tilt, _ = consensus(given_, chosen)
             if tilt is not None and tilt.lines >= 5:
@@ -113,9 +111,8 @@ def test_one_wall_tells_one_angle() -> None:
     rng = np.random.default_rng(5)
     bearing = np.linspace(-0.07, 0.07, 12)
     normal = normals(bearing, np.radians(0.05) * rng.standard_normal(12))
-    variance = np.full(12, np.radians(0.05) ** 2)
 
-    tilt, _ = consensus(Verticals(normal, variance, np.full(12, 0.015), np.ones(12)), SETTINGS)
+    tilt, _ = consensus(verticals(normal, np.radians(0.05) ** 2, 0.015), SETTINGS)
 
     assert tilt is not None
     pitch, roll = np.degrees(np.sqrt(np.diag(tilt.covariance)))
@@ -128,8 +125,7 @@ def test_clutter_is_believed_less_than_carpentry() -> None:
     off = np.radians(0.5) * np.array([1.0, -1.0, 0.6, -0.8] * 3)
     stated = []
     for scale in (0.05, 1.0):
-        normal, variance = normals(bearing, scale * off), np.full(12, np.radians(0.03) ** 2)
-        lines = Verticals(normal, variance, np.full(12, 0.02), np.ones(12))
+        lines = verticals(normals(bearing, scale * off), np.radians(0.03) ** 2, 0.02)
         tilt, _ = consensus(lines, SETTINGS)
         assert tilt is not None
         stated.append(np.sqrt(np.diag(tilt.covariance)))
@@ -147,9 +143,8 @@ def test_lines_are_gathered_round_the_strongest() -> None:
 
 def test_merged_lines_have_mean_normals() -> None:
     normal = normals(np.array([0.1, 0.2, 0.5]), np.array([0.01, 0.03, 0.0]))
-    variance = np.full(3, 1e-6)
 
-    lines = Verticals(normal, variance, np.ones(3), np.ones(3))
+    lines = verticals(normal, 1e-6)
     merged = merge_lines(lines, np.array([0, 0, 2]))
 
     np.testing.assert_allclose(merged[:, :3], [normal[:2].mean(axis=0), normal[2]])

@@ -12,6 +12,7 @@ from scipy.special import erf
 from camera import Camera
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from redetect.array_types import FloatArray
+from tests.pictures import centroid
 from tools.simulator.markers.rendering import (
     Imaging,
     exact_grey,
@@ -77,12 +78,6 @@ def _exact_coverage(camera: Camera, surface: Surface) -> FloatArray:
     return np.abs(polygon_coverage(pixels[:, 0].copy(), pixels[:, 1].copy(), WIDTH, HEIGHT))
 
 
-def _centroid(image: NDArray[np.floating]) -> FloatArray:
-    v, u = np.indices(image.shape)
-    total = float(image.sum())
-    return np.array([float((u * image).sum()) / total, float((v * image).sum()) / total])
-
-
 def test_rays_are_linear_within_a_pixel_to_a_thousandth(camera: Camera) -> None:
     rng = np.random.default_rng(4)
     v, u = rng.integers(0, HEIGHT, 500), rng.integers(0, WIDTH, 500)
@@ -113,7 +108,7 @@ def test_a_square_covers_its_exact_area(
     on_edge = (exact > 0.0) & (exact < 1.0)
     assert np.abs(light - exact).sum() < 0.2 / samples * on_edge.sum()
     np.testing.assert_allclose(light.sum(dtype=np.float64), exact.sum(), rtol=0.03 / samples)
-    off = _centroid(light.astype(np.float64)) - _centroid(exact)
+    off = centroid(light.astype(np.float64)) - centroid(exact)
     assert np.abs(off).max() < 0.15 / samples
 
 
@@ -143,7 +138,7 @@ def test_half_pixel_convention(pinhole: Camera) -> None:
     for blur in (0.0, 0.3, 0.79, 1.5, 3.0):
         settings = Imaging(blur_px=blur, black_level=0.0, gain=1.0)
         grey = exact_grey(fine if settings.fine else light, 1.0, settings)
-        np.testing.assert_allclose(_centroid(grey.astype(np.float64)), [104.5, 54.5], atol=1e-4)
+        np.testing.assert_allclose(centroid(grey.astype(np.float64)), [104.5, 54.5], atol=1e-4)
         np.testing.assert_allclose(grey.sum(dtype=np.float64), 100.0, rtol=1e-5)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from camera import Camera
 from redetect.slam.models import disc_in_robot
+from tests.pictures import centroid
 from tools.simulator.driving import planar_transform, tilted_camera
 from tools.simulator.ray_kernels import NOTHING, nearest_quad, points_visible
 from tools.simulator.renderer import Light, render_light, smeared
@@ -47,11 +47,6 @@ def _with_disc(x: float, y: float, radius: float = 0.1) -> Construction:
     return building
 
 
-def _centroid(weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    v, u = np.indices(weight.shape)
-    return np.asarray(np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum())
-
-
 @pytest.mark.parametrize(
     ("pose", "tilt"),
     [((0.0, 0.0, 0.0), (0.0, 0.0)), ((1.3, -0.4, 2.1), (0.04, -0.015))],
@@ -71,7 +66,7 @@ def test_disc_is_rendered_where_the_camera_projects_it(
     # The disc's surface carries a faint grain, which clipping takes away.
     share = np.clip((crop - GREY) / (0.9 * WHITE - GREY), 0.0, 1.0)
     # Pixels across the outline have 12 rays.
-    assert np.abs(_centroid(share) - _centroid(expected.grey)).max() < 0.03
+    assert np.abs(centroid(share) - centroid(expected.grey)).max() < 0.03
     assert share.sum() == pytest.approx(expected.grey.sum(), rel=0.05)
 
 
@@ -164,7 +159,7 @@ def test_turning_smears_sideways_by_the_angle(published_camera: Camera) -> None:
     width = float((profile > 0.03).sum() - (still[line] > 0.03).sum())
     assert width == pytest.approx(way, abs=3.0)
     assert profile.sum() == pytest.approx(still[line].sum(), rel=0.03)
-    np.testing.assert_allclose(_centroid(share), _centroid(still), atol=0.3)
+    np.testing.assert_allclose(centroid(share), centroid(still), atol=0.3)
 
 
 def test_standing_still_smears_nothing(published_camera: Camera) -> None:

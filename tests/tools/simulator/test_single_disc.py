@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
+from tests.pictures import centroid
 from tools.simulator.single_disc import polygon_coverage, render_disc
 
 RADIUS_M = 0.10
@@ -30,11 +31,6 @@ def _traced_share(
     return np.asarray(inside.reshape(shape[0], per_axis, shape[1], per_axis).mean(axis=(1, 3)))
 
 
-def _centroid(grey: NDArray[np.float64]) -> NDArray[np.float64]:
-    v, u = np.indices(grey.shape)
-    return np.asarray(np.array([(u * grey).sum(), (v * grey).sum()]) / grey.sum())
-
-
 @pytest.mark.parametrize(("floor_xy", "aperture"), [*zip(PLACES, [1.0, 0.5] * 3)])
 def test_share_is_that_of_traced_rays(
     published_camera: Camera, floor_xy: tuple[float, float], aperture: float
@@ -46,7 +42,7 @@ def test_share_is_that_of_traced_rays(
     traced = _traced_share(published_camera, floor_xy, share.shape, (u0, v0), 40, aperture)
     # 40 x 40 rays place the outline within 1/80 px.
     assert np.abs(share - traced).max() < 0.02
-    assert np.abs(_centroid(share) - _centroid(traced)).max() < 1e-3
+    assert np.abs(centroid(share) - centroid(traced)).max() < 1e-3
 
 
 @pytest.mark.parametrize("supersampling", [1, 3, 8])
@@ -63,7 +59,7 @@ def test_unblurred_share_does_not_depend_on_supersampling(
 
 
 @pytest.mark.parametrize("blur_px", [0.6, (1.2, 0.6), 2.0])
-def test_blur_keeps_area_and_centroid(
+def test_blur_keeps_area_andcentroid(
     published_camera: Camera, blur_px: float | tuple[float, float]
 ) -> None:
     sharp, blurred = (
@@ -76,7 +72,7 @@ def test_blur_keeps_area_and_centroid(
     assert blurred.max() <= 1.0
     assert np.abs(sharp - blurred).max() > 0.05
     assert blurred.sum() == pytest.approx(sharp.sum(), rel=1e-6)
-    np.testing.assert_allclose(_centroid(blurred), _centroid(sharp), atol=5e-4)
+    np.testing.assert_allclose(centroid(blurred), centroid(sharp), atol=5e-4)
 
 
 def test_blur_is_that_of_a_finer_grid(published_camera: Camera) -> None:
