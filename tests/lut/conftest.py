@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+
+import numpy as np
 import pytest
 
 from camera import Camera
@@ -9,6 +13,17 @@ from lut import DiscShape
 from tools.benchmark.material import scaled_camera
 
 SHAPE = DiscShape(samples=5, border_px=3, far_limit_m_per_px=0.2)
+
+
+def archive(**arrays: object) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def signed(payload: bytes, name: str) -> bytes:
+    """Content of a file of this name that is as sound as a hash can tell."""
+    return hashlib.sha256(name.encode() + b"\0" + payload).digest() + payload
 
 
 @pytest.fixture

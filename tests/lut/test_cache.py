@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import logging
 import pickle
 import subprocess
@@ -20,7 +19,7 @@ import pytest
 import lut.cache
 from camera import Camera, write_camera
 from lut import DiscShape, DiscTable, TableError, build_disc_table, cache_folder, cached_disc_table
-from tests.lut.conftest import SHAPE
+from tests.lut.conftest import SHAPE, archive, signed
 
 
 @pytest.fixture
@@ -139,27 +138,6 @@ class Dangerous:
         return (pytest.fail, ("unpickled a file of the cache",))
 
 
-@dataclasses.dataclass(frozen=True)
-class Signed:
-    """Content of a file that is as sound as a hash can tell, whatever the file's name."""
-
-    payload: bytes
-
-    def under(self, name: str) -> bytes:
-        """The file's bytes."""
-        return hashlib.sha256(name.encode() + b"\0" + self.payload).digest() + self.payload
-
-
-def signed(payload: bytes) -> Signed:
-    return Signed(payload)
-
-
-def archive(**arrays: object) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    return buffer.getvalue()
-
-
 def archive_of_version(version: int) -> bytes:
     """An archive that says it needs a program that there is not."""
     content = archive(samples=np.array(5))
@@ -170,39 +148,37 @@ def archive_of_version(version: int) -> bytes:
 @pytest.mark.parametrize(
     "damage",
     [
-        lambda content: b"",
-        lambda content: content[:10],
-        lambda content: content[: len(content) // 2],
-        lambda content: content[:-1],
-        lambda content: content + b"\0",
-        lambda content: bytes([content[0] ^ 1]) + content[1:],
-        lambda content: content[:2000] + bytes([content[2000] ^ 128]) + content[2001:],
-        lambda content: content[:-1] + bytes([content[-1] ^ 1]),
-        lambda content: content[32:],
-        lambda content: pickle.dumps(Dangerous()),
-        lambda content: signed(b""),
-        lambda content: signed(b"no archive"),
-        lambda content: signed(pickle.dumps(Dangerous())),
-        lambda content: signed(archive(samples=np.array([Dangerous()], dtype=object))),
-        lambda content: signed(archive(samples=np.array(5), copies=np.zeros(3))),
-        lambda content: signed(archive(unheard_of=np.zeros(3))),
-        lambda content: signed(archive(samples=np.zeros(3), copies=np.zeros(3))),
-        lambda content: signed(archive_of_version(97)),
+        lambda content, name: b"",
+        lambda content, name: content[:10],
+        lambda content, name: content[: len(content) // 2],
+        lambda content, name: content[:-1],
+        lambda content, name: content + b"\0",
+        lambda content, name: bytes([content[0] ^ 1]) + content[1:],
+        lambda content, name: content[:2000] + bytes([content[2000] ^ 128]) + content[2001:],
+        lambda content, name: content[:-1] + bytes([content[-1] ^ 1]),
+        lambda content, name: content[32:],
+        lambda content, name: pickle.dumps(Dangerous()),
+        lambda content, name: signed(b"", name),
+        lambda content, name: signed(b"no archive", name),
+        lambda content, name: signed(pickle.dumps(Dangerous()), name),
+        lambda content, name: signed(archive(samples=np.array([Dangerous()], dtype=object)), name),
+        lambda content, name: signed(archive(samples=np.array(5), copies=np.zeros(3)), name),
+        lambda content, name: signed(archive(unheard_of=np.zeros(3)), name),
+        lambda content, name: signed(archive(samples=np.zeros(3), copies=np.zeros(3)), name),
+        lambda content, name: signed(archive_of_version(97), name),
     ],
 )
 def test_damage_of_any_kind_is_noticed_and_repaired(
     tmp_path: Path,
     camera: Camera,
     computed: list[DiscShape],
-    damage: Callable[[bytes], bytes | Signed],
+    damage: Callable[[bytes, str], bytes],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     built = cached_disc_table(camera, SHAPE, tmp_path)
     path = only_file(tmp_path)
     sound = path.read_bytes()
-    damaged = damage(sound)
-    if isinstance(damaged, Signed):
-        damaged = damaged.under(path.name)
+    damaged = damage(sound, path.name)
     assert damaged != sound
     path.write_bytes(damaged)
     # That a table is computed may be told, whatever level other tests have left; no warning yet.

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import io
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +13,7 @@ import pytest
 import lut.cache
 from camera import Camera
 from lut import build_disc_table, cached_disc_table
-from tests.lut.conftest import SHAPE
+from tests.lut.conftest import SHAPE, archive, signed
 
 
 @pytest.fixture
@@ -29,10 +27,7 @@ def poisoned(tmp_path: Path, camera: Camera) -> Path:
     samples[0] = 0
     wrong = dataclasses.replace(table, samples=samples)
     fields = {field.name: getattr(wrong, field.name) for field in dataclasses.fields(wrong)}
-    buffer = io.BytesIO()
-    np.savez(buffer, **fields)
-    payload = buffer.getvalue()
-    path.write_bytes(hashlib.sha256(path.name.encode() + b"\0" + payload).digest() + payload)
+    path.write_bytes(signed(archive(**fields), path.name))
     assert trusted(camera, path)
     return path
 

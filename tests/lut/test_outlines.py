@@ -280,13 +280,11 @@ def test_samples_that_the_camera_cannot_see_at_all_do_not_vote() -> None:
 
 def test_a_camera_that_looks_up_gets_an_empty_table(published_camera: Camera) -> None:
     up = dataclasses.replace(
-        published_camera,
-        robot_from_camera=((-1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, -1.0, 1.5)),
+        published_camera, robot_from_camera=((-1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, -1.0, 1.5))
     )
     assert build_disc_table(up, DiscShape()).usable.any()  # straight down, the same mount
     up = dataclasses.replace(
-        published_camera,
-        robot_from_camera=((1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, 1.0, 1.5)),
+        published_camera, robot_from_camera=((1.0, 0, 0, 0.0), (0, 1.0, 0, 0.0), (0, 0, 1.0, 1.5))
     )
     table = build_disc_table(up, DiscShape())
     assert not table.usable.any()

@@ -21,16 +21,17 @@ def published_table(published_camera: Camera) -> VerticalTable:
     return build_vertical_table(published_camera)
 
 
-@pytest.fixture(scope="module")
-def decentred_camera(published_camera: Camera) -> Camera:
-    return dataclasses.replace(
-        published_camera, tangential=(2e-3, -3e-3), polynomial=(-0.05, 0.02, -0.004)
-    )
+@pytest.fixture(scope="module", params=["radial", "decentred"])
+def camera(request: pytest.FixtureRequest, published_camera: Camera) -> Camera:
+    if request.param == "radial":
+        return published_camera
+    terms = {"tangential": (2e-3, -3e-3), "polynomial": (-0.05, 0.02, -0.004)}
+    return dataclasses.replace(published_camera, **terms)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def decentred_table(decentred_camera: Camera) -> VerticalTable:
-    return build_vertical_table(decentred_camera)
+def table(camera: Camera) -> VerticalTable:
+    return build_vertical_table(camera)
 
 
 def strip_points(table: VerticalTable, c: int) -> np.ndarray:
@@ -38,49 +39,31 @@ def strip_points(table: VerticalTable, c: int) -> np.ndarray:
     return np.stack([table.column[rows, c].astype(np.float64), rows.astype(np.float64)], axis=-1)
 
 
-def test_horizon_is_where_directions_are_level(
-    published_camera: Camera, published_table: VerticalTable
-) -> None:
-    assert published_table.anchor_elevation_rad == 0.0
-    columns = np.arange(published_camera.width, dtype=np.float64)
-    seen = published_camera.directions_robot(
-        np.stack([columns, published_table.anchor_row], axis=-1)
-    )
+def test_horizon_is_where_directions_are_level(camera: Camera, table: VerticalTable) -> None:
+    assert table.anchor_elevation_rad == 0.0
+    columns = np.arange(camera.width, dtype=np.float64)
+    seen = camera.directions_robot(np.stack([columns, table.anchor_row], axis=-1))
     np.testing.assert_allclose(seen[:, 2] / np.hypot(*seen[:, :2].T), 0.0, atol=1e-9)
-    np.testing.assert_allclose(
-        np.arctan2(seen[:, 0], -seen[:, 1]), published_table.bearing_rad, atol=1e-12
-    )
+    np.testing.assert_allclose(np.arctan2(seen[:, 0], -seen[:, 1]), table.bearing_rad, atol=1e-12)
 
 
 @pytest.mark.parametrize("c", [5, 130, 384, 600, 760])
 def test_points_on_a_vertical_project_onto_its_columns(
-    published_camera: Camera, published_table: VerticalTable, c: int
+    camera: Camera, table: VerticalTable, c: int
 ) -> None:
-    bearing = published_table.bearing_rad[c]
-    rows = np.arange(published_table.first_row[c], published_table.last_row[c] + 1)
-    height = 2.5 * published_table.elevation_tan[rows, c].astype(np.float64)
-    foot = published_camera.centre[:2] + 2.5 * np.array([np.sin(bearing), -np.cos(bearing)])
-    points = np.column_stack(
-        [np.broadcast_to(foot, (len(rows), 2)), published_camera.centre[2] + height]
-    )
-    pixels = published_camera.project_robot(points)
+    bearing = table.bearing_rad[c]
+    rows = np.arange(table.first_row[c], table.last_row[c] + 1)
+    height = 2.5 * table.elevation_tan[rows, c].astype(np.float64)
+    foot = camera.centre[:2] + 2.5 * np.array([np.sin(bearing), -np.cos(bearing)])
+    points = np.column_stack([np.broadcast_to(foot, (len(rows), 2)), camera.centre[2] + height])
+    pixels = camera.project_robot(points)
     # Single precision of the table, at 45 deg of elevation.
     np.testing.assert_allclose(pixels[:, 1], rows, atol=5e-4)
-    np.testing.assert_allclose(pixels[:, 0], published_table.column[rows, c], atol=5e-4)
+    np.testing.assert_allclose(pixels[:, 0], table.column[rows, c], atol=5e-4)
     assert len(rows) > 150
 
 
-@pytest.mark.parametrize("c", [5, 130, 600])
-def test_points_on_a_vertical_project_onto_its_columns_through_a_decentred_lens(
-    decentred_camera: Camera, decentred_table: VerticalTable, c: int
-) -> None:
-    test_horizon_is_where_directions_are_level(decentred_camera, decentred_table)
-    test_points_on_a_vertical_project_onto_its_columns(decentred_camera, decentred_table, c)
-
-
-def test_vertical_passes_through_its_column_on_the_horizon(
-    published_table: VerticalTable,
-) -> None:
+def test_vertical_passes_through_its_column_on_the_horizon(published_table: VerticalTable) -> None:
     for c in np.flatnonzero(published_table.usable)[5:-5:37]:
         points = strip_points(published_table, int(c))
         at_horizon = np.interp(published_table.anchor_row[c], points[:, 1], points[:, 0])

@@ -35,7 +35,7 @@ ENDLESS = {
 
 #: Which may be negative.
 SIGNED = {
-    "CircleSettings": {"evidence"},  # log-odds
+    "CircleSettings": {"evidence"}  # log-odds
 }
 
 

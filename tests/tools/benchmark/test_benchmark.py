@@ -10,21 +10,8 @@ import pytest
 from camera import write_camera
 from detect.sources.opening import open_run
 from tools.benchmark.__main__ import main, measure_runs, perform
-from tools.benchmark.functions import (
-    ALL,
-    CIRCLES,
-    DECODING,
-    KERNEL,
-    LINES,
-    RESPONSE,
-    commands,
-)
-from tools.benchmark.material import (
-    repeated_run,
-    run_pictures,
-    scaled_camera,
-    scaled_picture,
-)
+from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, RESPONSE, commands
+from tools.benchmark.material import repeated_run, run_pictures, scaled_camera, scaled_picture
 from tools.evaluation.figures import StudyError
 
 

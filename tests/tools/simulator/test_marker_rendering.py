@@ -37,12 +37,7 @@ from tools.simulator.markers.surface import (
     pose_of,
     square_corners,
 )
-from tools.simulator.markers.truth import (
-    marker_corners,
-    mean_side_px,
-    slant_deg,
-    visible_shares,
-)
+from tools.simulator.markers.truth import marker_corners, mean_side_px, slant_deg, visible_shares
 from tools.simulator.single_disc import polygon_coverage
 
 WIDTH, HEIGHT = 320, 240

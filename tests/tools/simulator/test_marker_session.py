@@ -18,12 +18,7 @@ from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    inverse,
-    log_se3,
-    transform,
-)
+from redetect.groundtruth.trajectories.transforms import apply, inverse, log_se3, transform
 from redetect.landmarks.times import read_times
 from tests.pictures import read_grey
 from tools.simulator.__main__ import main
@@ -197,29 +192,28 @@ def test_markers_are_seen_by_several_cameras(full_plan: SessionPlan) -> None:
     assert 25.0 < np.median(widths) < 60.0
 
 
-def test_errors_have_the_covariance_that_the_files_state() -> None:
+def test_errors_have_the_covariance_that_the_files_state(full_plan: SessionPlan) -> None:
     errors = CalibrationErrors(0.02, 0.3, 0.004, 0.5, 0.002, 1.5)
-    plan = plan_session(SessionSettings())
     squared, focal, centre = [], [], []
     for seed in range(40):
-        network = disturbed_network(plan.network, errors, random_for(seed, "errors", 0))
-        rig = disturbed_rig(plan.rig, errors, random_for(seed, "errors", 1))
+        network = disturbed_network(full_plan.network, errors, random_for(seed, "errors", 0))
+        rig = disturbed_rig(full_plan.rig, errors, random_for(seed, "errors", 1))
         for true, said, covariance in (
-            (plan.network.world_from_camera, network.world_from_camera, network.covariance),
-            (plan.rig.robot_from_marker, rig.robot_from_marker, rig.covariance),
+            (full_plan.network.world_from_camera, network.world_from_camera, network.covariance),
+            (full_plan.rig.robot_from_marker, rig.robot_from_marker, rig.covariance),
         ):
             tangents = log_se3(inverse(said) @ true).ravel()
             squared.append(tangents @ np.linalg.solve(covariance, tangents))
-        pairs = list(zip(network.cameras, plan.network.cameras))
+        pairs = list(zip(network.cameras, full_plan.network.cameras))
         focal += [c.scale_x / t.scale_x - 1.0 for c, t in pairs]
         centre += [c.offset_x - t.offset_x for c, t in pairs]
     dof = 40 * (24 + 36)
     assert chi2.ppf(1e-4, dof) < np.sum(squared) < chi2.ppf(1.0 - 1e-4, dof)
     assert np.std(focal) == pytest.approx(0.002, rel=0.2)
     assert np.std(centre) == pytest.approx(1.5, rel=0.2)
-    exact = disturbed_network(plan.network, CalibrationErrors(), random_for(1, "errors", 0))
+    exact = disturbed_network(full_plan.network, CalibrationErrors(), random_for(1, "errors", 0))
     assert not exact.covariance.any()
-    np.testing.assert_allclose(exact.world_from_camera, plan.network.world_from_camera)
+    np.testing.assert_allclose(exact.world_from_camera, full_plan.network.world_from_camera)
 
 
 def test_images_do_not_depend_on_the_errors_in_the_files(tmp_path: Path, folder: Path) -> None:

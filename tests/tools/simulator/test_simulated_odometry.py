@@ -11,13 +11,7 @@ from scipy.stats import chi2
 
 from redetect.landmarks import Step, parse_record
 from redetect.plane import between
-from tools.simulator.driving import (
-    DriveStyle,
-    drive,
-    measured_steps,
-    robot_tilt,
-    step_covariance,
-)
+from tools.simulator.driving import DriveStyle, drive, measured_steps, robot_tilt, step_covariance
 
 PRINTED_STEPS = [
     "STEP e.0067 0.00391 -0.15602 -0.00218 0.000014424957 0.000000041534 0.000012538057 "

@@ -48,8 +48,7 @@ def _with_disc(x: float, y: float, radius: float = 0.1) -> Construction:
 
 
 @pytest.mark.parametrize(
-    ("pose", "tilt"),
-    [((0.0, 0.0, 0.0), (0.0, 0.0)), ((1.3, -0.4, 2.1), (0.04, -0.015))],
+    ("pose", "tilt"), [((0.0, 0.0, 0.0), (0.0, 0.0)), ((1.3, -0.4, 2.1), (0.04, -0.015))]
 )
 def test_disc_is_rendered_where_the_camera_projects_it(
     published_camera: Camera, pose: tuple[float, ...], tilt: tuple[float, float]
