@@ -16,6 +16,11 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
+def changed(picture: NDArray[np.uint8], grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where a picture in colour is not the grey one."""
+    return np.asarray(np.any(picture != grey[:, :, None], axis=2))
+
+
 def centroid(weight: NDArray[np.floating]) -> NDArray[np.float64]:
     """(u, v) of the centre of mass of a picture."""
     v, u = np.indices(weight.shape)

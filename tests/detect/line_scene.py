@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from camera import Camera
+from detect.lines import LineDetections
 
 FloatArray = NDArray[np.float64]
 
@@ -26,6 +27,17 @@ class Edge:
 
     bearing_rad: float
     contrast: float
+
+
+#: Light and dark ones all over the view.
+EDGES = (
+    Edge(0.45, 60.0),
+    Edge(0.30, -40.0),
+    Edge(0.14, 70.0),
+    Edge(-0.02, -90.0),
+    Edge(-0.21, 50.0),
+    Edge(-0.40, -35.0),
+)
 
 
 def pinhole(
@@ -67,6 +79,12 @@ def mirrored(camera: Camera) -> Camera:
         offset_x=camera.width - 1 - camera.offset_x,
         robot_from_camera=_pose(flip @ camera.rotation @ flip, flip @ camera.centre),
     )
+
+
+def tilt_of(found: LineDetections) -> FloatArray:
+    """Pitch and roll of the tilt that was found (rad)."""
+    assert found.tilt is not None
+    return np.array([found.tilt.pitch_rad, found.tilt.roll_rad])
 
 
 def edge_columns(camera: Camera, bearing_rad: float, rows: FloatArray) -> FloatArray:

@@ -18,6 +18,19 @@ DARK = 25.0
 DOOR = 140.0
 
 FloatArray = NDArray[np.float64]
+#: Which offsets (x, y), in metres, are inside.
+Shape = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
+
+#: What is no disc of 0.1 m.
+SHAPES: dict[str, Shape] = {
+    "square": lambda x, y: np.asarray(np.maximum(abs(x), abs(y)) < 0.10),
+    "ring": lambda x, y: np.asarray(abs(np.hypot(x, y) - 0.085) < 0.015),
+    "triangle": lambda x, y: np.asarray((y > -0.10) & (y < 0.10 - 2.0 * abs(x))),
+    "large disc": lambda x, y: np.asarray(np.hypot(x, y) < 0.14),
+    "small disc": lambda x, y: np.asarray(np.hypot(x, y) < 0.07),
+    "strip": lambda x, y: np.asarray((abs(x) < 0.07) & (abs(y) < 0.25)),
+    "corner": lambda x, y: np.asarray((x > -0.1) & (y > -0.1)),
+}
 
 _CELLS_PER_PIXEL = 6
 _REACH_M = 0.3
@@ -41,12 +54,7 @@ class PaintedFloor:
         self.grey[part] += crop.grey - self.floor
         return self
 
-    def shape(
-        self,
-        floor_xy: ArrayLike,
-        inside: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
-        grey: float = LIGHT,
-    ) -> PaintedFloor:
+    def shape(self, floor_xy: ArrayLike, inside: Shape, grey: float = LIGHT) -> PaintedFloor:
         """Anything within 0.3 m, given by which offsets (x, y) in metres are inside."""
         n = _CELLS_PER_PIXEL
         angle = np.linspace(0.0, 2.0 * np.pi, 64)

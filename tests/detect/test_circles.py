@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -26,7 +25,7 @@ from detect.errors import DetectError, FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscTable, VoteTable, cached_disc_table, ring
 from tests.detect.line_scene import mirrored
-from tests.detect.painted_floor import DARK, LIGHT, PaintedFloor
+from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
 from tools.evaluation.accuracy import Scene, measure_accuracy
 
 FloatArray = NDArray[np.float64]
@@ -201,52 +200,19 @@ def test_a_light_disc_in_a_saturated_image_cannot_be_seen(published_camera: Came
     assert len(detect(floor.disc((0.2, -1.5), 300.0).image(), published_camera)) == 0
 
 
-def _square(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return np.maximum(np.abs(x), np.abs(y)) < 0.10
-
-
-def _ring(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    radius = np.hypot(x, y)
-    return (radius > 0.07) & (radius < 0.10)
-
-
-def _triangle(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return (y > -0.10) & (y < 0.10 - 2.0 * np.abs(x))
-
-
-def _large_disc(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return np.hypot(x, y) < 0.14
-
-
-def _small_disc(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return np.hypot(x, y) < 0.07
-
-
-def _strip(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return (np.abs(x) < 0.07) & (np.abs(y) < 0.25)
-
-
-def _corner(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    return (x > -0.1) & (y > -0.1)
-
-
-@pytest.mark.parametrize(
-    "inside", [_square, _ring, _triangle, _large_disc, _small_disc, _strip, _corner]
-)
+@pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("place", [(0.2, -1.1), (-0.4, -1.8), (0.1, -2.4)])
 def test_what_is_no_disc_is_not_reported(
-    published_camera: Camera,
-    inside: Callable[[FloatArray, FloatArray], NDArray[np.bool_]],
-    place: tuple[float, float],
+    published_camera: Camera, shape: str, place: tuple[float, float]
 ) -> None:
     """Beside each a true disc, which is."""
     disc = np.array([place[0] - 0.7, place[1]])
-    floor = PaintedFloor(published_camera).shape(place, inside).disc(disc)
+    floor = PaintedFloor(published_camera).shape(place, SHAPES[shape]).disc(disc)
     assert_found_once(detect(floor.image(), published_camera), disc[None], within_m=0.004)
 
 
 def test_verification_is_what_drops_the_square(published_camera: Camera) -> None:
-    image = PaintedFloor(published_camera).shape((0.2, -1.1), _square).image()
+    image = PaintedFloor(published_camera).shape((0.2, -1.1), SHAPES["square"]).image()
     assert len(detect(image, published_camera, replace(DEFAULT, refine=False))) >= 1
     assert len(detect(image, published_camera)) == 0
 

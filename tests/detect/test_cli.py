@@ -14,7 +14,7 @@ from detect.cli import main
 from redetect.landmarks import read_frames
 from tests.detect.commands import Captured, assert_refused, files_in, output_of
 from tests.detect.conftest import SMALL_RUN_DISCS
-from tests.pictures import read_grey
+from tests.pictures import changed, read_grey
 
 
 def settings_of(output: Path) -> dict[str, str]:
@@ -80,7 +80,7 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
         drawn = cv2.imread(str(drawings / name), cv2.IMREAD_COLOR)
         assert drawn is not None
         # Words follow below the image.
-        marked = np.any(drawn[: len(image)] != image[:, :, None], axis=2)
+        marked = changed(np.asarray(drawn[: len(image)], np.uint8), image)
         assert marked.any() == bool(frame["discs"])
         for disc in frame["discs"]:
             u, v = disc["pixel"]

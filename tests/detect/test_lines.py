@@ -27,7 +27,16 @@ from detect.settings import CircleSettings
 from detect.sources.interface import decode_gray
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, LineLandmark, Step, parse_record
-from tests.detect.line_scene import Edge, edge_columns, mirrored, pinhole, render, tilted
+from tests.detect.line_scene import (
+    EDGES,
+    Edge,
+    edge_columns,
+    mirrored,
+    pinhole,
+    render,
+    tilt_of,
+    tilted,
+)
 from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks, tracks_again
 from tests.pictures import read_grey
 from tests.reference.verticals import compensated_bearings, inclinations, plane_normals
@@ -35,14 +44,6 @@ from tests.reference.verticals import compensated_bearings, inclinations, plane_
 BARREL = (0.0, -0.1, 0.0, 0.0, 0.0)
 CAMERA = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=BARREL)
 TABLE = build_vertical_table(CAMERA)
-EDGES = (
-    Edge(0.45, 60.0),
-    Edge(0.30, -40.0),
-    Edge(0.14, 70.0),
-    Edge(-0.02, -90.0),
-    Edge(-0.21, 50.0),
-    Edge(-0.40, -35.0),
-)
 
 
 def scene(camera: Camera, edges: Sequence[Edge] = EDGES, seed: int = 0) -> np.ndarray:
@@ -59,11 +60,9 @@ def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> 
     pitch, roll = np.radians(tilt_deg)
     found = detect_lines(scene(tilted(CAMERA, pitch, roll)), TABLE)
     np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=4e-4)
+    np.testing.assert_allclose(tilt_of(found), (pitch, roll), atol=np.radians(0.08))
     assert found.tilt is not None
     assert found.tilt.lines == len(EDGES)
-    assert (found.tilt.pitch_rad, found.tilt.roll_rad) == pytest.approx(
-        (pitch, roll), abs=np.radians(0.08)
-    )
     # Uncompensated bearings are off by more.
     if max(np.abs(tilt_deg)) > 3.0:
         raw = compensated_bearings(plane_normals(found.lines.ends, CAMERA.rotation), None)
@@ -89,9 +88,7 @@ def test_cameras_that_do_not_see_the_horizon_see_verticals(
     deviation = np.sqrt(np.diag(found.tilt.covariance))
     # Seven lines may lean, as carpentry does, by more than they do here.
     assert np.all(deviation < np.radians(0.15))
-    assert np.all(
-        np.abs([found.tilt.pitch_rad - pitch, found.tilt.roll_rad - roll]) < 4 * deviation
-    )
+    assert np.all(np.abs(tilt_of(found) - (pitch, roll)) < 4 * deviation)
 
 
 def test_rows_hold_ends_beta_and_sigma() -> None:
@@ -165,10 +162,7 @@ def test_mirrored_image_and_camera_give_mirrored_rows(seed: int) -> None:
     np.testing.assert_allclose(
         other.lines.ends[::-1], found.lines.ends * [-1.0, 1.0, -1.0, 1.0], atol=2e-4
     )
-    assert found.tilt is not None
-    assert other.tilt is not None
-    assert other.tilt.pitch_rad == pytest.approx(found.tilt.pitch_rad, abs=1e-4)
-    assert other.tilt.roll_rad == pytest.approx(-found.tilt.roll_rad, abs=1e-4)
+    np.testing.assert_allclose(tilt_of(other), tilt_of(found) * [1.0, -1.0], atol=1e-4)
 
 
 @given(pitch=st.floats(-30.0, 30.0), roll=st.floats(-25.0, 25.0), seed=st.integers(0, 1000))
@@ -202,8 +196,7 @@ def test_leaning_edges_are_no_verticals() -> None:
     image += np.where(columns > 165 + 0.12 * (rows - 80), -60.0, 0.0)
     found = detect_lines(np.clip(image, 0, 255).astype(np.uint8), table)
     np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=5e-4)
-    assert found.tilt is not None
-    assert abs(found.tilt.roll_rad) < np.radians(0.1)
+    assert abs(tilt_of(found)[1]) < np.radians(0.1)
 
 
 def test_close_edges_are_joined_to_one_row() -> None:

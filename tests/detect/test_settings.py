@@ -27,11 +27,7 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
         (LineSettings, {"regulariser": 0.0}, "regulariser is 0: expected"),
         (LineSettings, {"least_rows": 2}, "least_rows is 2: expected"),
         (LineSettings, {"refine_steps_px": ((0.0, 1.0),)}, "refine_steps_px is .*: expected"),
-        (
-            LineSettings,
-            {"blurred_widths": (1.0,)},
-            "blurred_widths is 1: expected a number",
-        ),
+        (LineSettings, {"blurred_widths": (1.0,)}, "blurred_widths is 1: expected a number"),
         (LineSettings, {"blurred_widths": (2.0, 11.0)}, "blurred_widths is 11: expected a number"),
         (MarkerSettings, {"thresholds": ()}, "thresholds"),
         (MarkerSettings, {"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),

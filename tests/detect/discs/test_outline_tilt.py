@@ -18,7 +18,7 @@ from detect.discs.outline_tilt import (
     mean_of_tilts,
     tilt_of_outlines,
 )
-from detect.seen import image_positions, level_matrix, level_seen
+from detect.seen import image_positions, level_matrix
 from redetect.landmarks import FrameTilt
 from tests.detect.line_scene import tilted
 from tests.detect.painted_floor import PaintedFloor
@@ -118,9 +118,3 @@ def test_errors_of_discs_and_of_floors_are_stated(published_camera: Camera) -> N
     least = math.sqrt(FLOOR_SIGMA_RAD**2 + DISC_SIGMA_RAD**2 / len(DISCS) * 0.6)
     assert math.sqrt(found.cpp) > least
     assert math.sqrt(found.crr) > least
-
-
-def test_levelling_and_its_inverse_agree(published_camera: Camera) -> None:
-    tilt = (-0.045, 0.012)
-    rows = published_camera.floor_from_pixel(image_positions(published_camera, DISCS, tilt))
-    np.testing.assert_allclose(level_seen(published_camera, rows, tilt), DISCS, atol=1e-9)

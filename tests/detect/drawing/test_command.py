@@ -13,21 +13,14 @@ from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
 from detect.drawing.inputs import SeenRows, read_head
-from detect.seen import Sight, image_positions, level_seen
+from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
 from detect.sources.poses import SomeFrames
-from redetect.landmarks import (
-    CircleLandmark,
-    Frame,
-    FrameTilt,
-    LineLandmark,
-    Step,
-    circle_landmarks,
-)
+from lut import ring
+from redetect.landmarks import CircleLandmark, Frame, LineLandmark, Step, circle_landmarks
 from tests.detect.commands import Captured, assert_refused
-from tests.detect.drawing.test_detections import changed
-from tests.pictures import read_grey
+from tests.pictures import changed, read_grey
 
 FloatArray = NDArray[np.float64]
 
@@ -57,17 +50,6 @@ def image() -> NDArray[np.uint8]:
 
 
 # -- where things are drawn -------------------------------------------------------------------
-
-
-def test_positions_corrected_for_the_tilt_are_drawn_where_they_were_seen(
-    published_camera: Camera,
-) -> None:
-    tilt = FrameTilt("e.0000", 0.031, -0.017, 1e-6, 0.0, 1e-6, 9)
-    seen = np.array([[0.4, -1.2], [-0.9, -2.5], [0.1, -3.9]])
-    level = level_seen(published_camera, seen, (tilt.pitch, tilt.roll))
-    assert np.abs(level - seen).max() > 0.05
-    drawn = image_positions(published_camera, level, (tilt.pitch, tilt.roll))
-    np.testing.assert_allclose(drawn, published_camera.project_floor(seen), atol=1e-9)
 
 
 def test_bars_cross_the_horizon_and_are_as_wide_as_their_sigma(published_camera: Camera) -> None:
@@ -123,7 +105,7 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
         ((-0.6, -1.5), (255, 60, 255)),
         ((0.7, -1.6), (60, 60, 255)),
     ):
-        edge = np.array([colour_at(p) for p in project(centre + 0.1 * _circle(32))])
+        edge = np.array([colour_at(p) for p in project(centre + ring(0.1, 32))])
         assert np.median(np.abs(edge - expected).sum(axis=1)) < 120, centre
     for bearing, expected in ((0.3, (255, 60, 255)), (-0.4, (60, 60, 255))):
         row = vertical(published_camera, bearing, 0.002)
@@ -140,14 +122,11 @@ def test_without_reference_nothing_is_missed_or_extra(
 ) -> None:
     rows = SeenRows(circles=Frame(STEP, discs((0.2, -1.3))))
     canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS).astype(int)
-    edge = np.rint(published_camera.project_floor((0.2, -1.3) + 0.1 * _circle(32))).astype(int)
+    edge = np.rint(published_camera.project_floor(np.array([0.2, -1.3]) + ring(0.1, 32))).astype(
+        int
+    )
     apart = np.abs(canvas[edge[:, 1], edge[:, 0]] - (0, 170, 255)).sum(axis=1)
     assert np.median(apart) < 120
-
-
-def _circle(points: int) -> FloatArray:
-    angle = 2.0 * np.pi * np.arange(points) / points
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 # -- which frames -----------------------------------------------------------------------------

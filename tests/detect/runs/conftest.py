@@ -36,7 +36,7 @@ def trial(
     return Trial(run_folder, tmp_path / "output", undisturbed, capsys)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def runs(
     run_folder: Path, undisturbed: dict[str, bytes], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[ForkedRuns]:
