@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from camera import Camera
-from lut import TableError, VoteShape, build_vote_table, cached_vote_table
+from lut import VoteShape, build_vote_table, cached_vote_table
 
 SHAPE = VoteShape()
 
@@ -38,11 +36,3 @@ def test_a_table_is_read_back_as_it_was_kept(published_camera: Camera, tmp_path:
     for name, ours, theirs in zip(built._fields, read, built, strict=True):
         np.testing.assert_array_equal(ours, theirs, err_msg=name)
         assert isinstance(ours, type(theirs)), name
-
-
-def test_a_camera_below_the_floor_is_refused(published_camera: Camera) -> None:
-    rows = np.array(published_camera.robot_from_camera)
-    rows[2, 3] = -1.0
-    below = replace(published_camera, robot_from_camera=tuple(map(tuple, rows.tolist())))
-    with pytest.raises(TableError, match="above the floor"):
-        build_vote_table(below, SHAPE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.comparison.compare import compare_frames
+from detect.comparison.compare import compare_frames as compare
 from detect.comparison.report import comparison_of
-from detect.comparison.result import DiscComparison
 from detect.errors import CompareError, DetectError
 from detect.options import Compare, CompareOptions
 from detect.sources.image_files import image_name
@@ -32,12 +30,6 @@ def disc(
 
 def frame(name: str, *discs: CircleLandmark) -> Frame:
     return Frame(Step(name, 0, 0, 0, 1e-6, 0, 1e-6, 0, 0, 1e-6), discs)
-
-
-def compare(
-    reference: Sequence[Frame], detected: Sequence[Frame], options: CompareOptions = STANDARD
-) -> DiscComparison:
-    return compare_frames(reference, detected, options)
 
 
 REFERENCE = [
@@ -68,7 +60,7 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
         frame("e.0000", *DETECTED[0].circles, disc(1.5, 1.5, 0.5)),
         frame("e.0001", *DETECTED[1].circles, disc(-0.6, 1.92, 0.9)),
     ]
-    found = compare_frames(REFERENCE, detected, STANDARD, unlisted=unlisted, lookalikes=lookalikes)
+    found = compare(REFERENCE, detected, STANDARD, unlisted=unlisted, lookalikes=lookalikes)
     assert (found.matched, found.missed, found.extra) == (4, 1, 2)
     assert (found.set_aside, found.on_lookalikes) == (1, 1)
     assert found.precision == pytest.approx(4 / 6)
@@ -76,14 +68,14 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
     assert "4 of 5 discs of the reference are found, 1 missed, in 2 frames." in text
     assert "1 are on things known to look like a disc, and 1 on nothing known." in text
     assert "set aside 1" in text
-    without = compare_frames(REFERENCE, detected, STANDARD)
+    without = compare(REFERENCE, detected, STANDARD)
     assert (without.extra, without.set_aside, without.on_lookalikes) == (3, 0, None)
 
 
 def test_a_reference_row_comes_before_an_unlisted_one() -> None:
     """An unlisted disc beside a listed one must not take its row."""
     unlisted = (frame("e.0000", disc(0.03, 1.04, 1.0)),)
-    found = compare_frames(REFERENCE, DETECTED, STANDARD, unlisted=unlisted)
+    found = compare(REFERENCE, DETECTED, STANDARD, unlisted=unlisted)
     assert (found.matched, found.set_aside) == (4, 0)
 
 
@@ -334,6 +326,6 @@ def test_rows_are_accounted_for_whatever_they_are(
 
 def test_the_shipped_file_agrees_with_itself(shared_data: Path) -> None:
     frames = list(read_frames(shared_data / "dlr" / "map.circles"))
-    found = compare_frames(frames, frames)
+    found = compare(frames, frames)
     assert (found.matched, found.missed, found.extra) == (14745, 0, 0)
     assert found.error_95_m == 0

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.cli import main
-from detect.comparison.compare import compare_line_frames
+from detect.comparison.compare import compare_line_frames as compare
 from detect.comparison.result import LineComparison
 from detect.options import CompareOptions
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, write_frames
@@ -38,12 +38,6 @@ def line(
 
 def frame(name: str, *rows: Landmark) -> Frame:
     return Frame(Step(name, 0, 0, 0, 1e-6, 0, 1e-6, 0, 0, 1e-6), rows)
-
-
-def compare(
-    reference: Sequence[Frame], detected: Sequence[Frame], options: CompareOptions = STANDARD
-) -> LineComparison:
-    return compare_line_frames(reference, detected, options)
 
 
 def compare_rows(
@@ -288,7 +282,7 @@ def test_rows_on_unlisted_lines_are_neither_right_nor_wrong(tmp_path: Path) -> N
     reference, unlisted = [frame("a", line(0.0))], [frame("a", line(5.0), line(20.0))]
     detected = [frame("a", line(0.1), line(5.1), line(-30.0))]
 
-    result = compare_line_frames(reference, detected, unlisted=unlisted)
+    result = compare(reference, detected, unlisted=unlisted)
 
     assert (result.found, result.extra, result.set_aside) == (1, 1, 1)
     assert result.precision == 0.5
