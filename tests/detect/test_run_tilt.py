@@ -41,8 +41,10 @@ def sequence(
     return true, measured, sigma**2
 
 
-def found_tilt(*of_frames: FrameTilts | FloatArray) -> RunTilt:
-    run = tilt_of_run(*of_frames)  # type: ignore[arg-type]
+def found_tilt(
+    verticals: FrameTilts, outlines: FrameTilts | None = None, common: FloatArray | None = None
+) -> RunTilt:
+    run = tilt_of_run(verticals, outlines, common)
     assert run is not None
     return run
 

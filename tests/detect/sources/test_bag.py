@@ -273,15 +273,6 @@ def test_images_may_be_written_to(tmp_path: Path, kind: BagKind) -> None:
     assert image.flags.c_contiguous
 
 
-def test_deep_images_by_the_bits_that_each_needs(tmp_path: Path) -> None:
-    ros = Ros()
-    first = ros.image(np.full((4, 4), 4000, "<u2"), "mono16", 1.0)
-    over = ros.image(np.full((4, 4), 5000, "<u2"), "mono16", 2.0)
-    path = ros.write(tmp_path / "d", [Said("/i", 1.0, first), Said("/i", 2.0, over)])
-    frames = open_source(path).frames
-    assert [int(read_image(frame, None)[0, 0]) for frame in frames] == [4000 >> 4, 5000 >> 6]
-
-
 def test_times_of_recording_where_the_header_has_none(tmp_path: Path) -> None:
     ros = Ros()
     said = [Said("/i", 7.5 + k, ros.image(GRAY, "mono8", 0.0)) for k in range(2)]
