@@ -61,7 +61,7 @@ def right(project_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
 
 @pytest.mark.parametrize("lean_deg", LEANS)
 def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
-    project_root: Path, tmp_path: Path, right: Rows,
+    project_root: Path, tmp_path: Path, capsys: Captured, right: Rows,
     lean_deg: tuple[float, float],
 ) -> None:  # fmt: skip
     run = project_root / "images" / "e"
@@ -72,7 +72,9 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     assert found_again(right, wrong) > 0.96
     assert found_again(wrong, right) > 0.96
     # `detect circles` searches alike, and writes rows as they are seen by the calibration.
+    assert "not levelled" not in capsys.readouterr().out
     assert main(["circles", *wrongly, "-o", str(tmp_path / "seen.circles")]) == 0
+    assert "positions are not levelled: pitch and roll" in capsys.readouterr().out
     seen = level_rows(tmp_path / "seen.circles")
     assert [len(rows) for rows in seen] == [len(rows) for rows in wrong]
     assert found_again(seen, wrong) < 0.8
@@ -88,16 +90,14 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     assert 0.3 < squared_mahalanobis(off, covariance).mean() / 2.0 < 1.4
 
 
-def test_what_is_said_of_positions_that_are_not_levelled(
+def test_frames_that_are_levelled_by_themselves_say_so(
     project_root: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     run = project_root / "images" / "e"
     camera = tmp_path / "wrong.cam"
     write_camera(wrong_by(read_camera(run / "e.cam"), (2.3, 0.0)), camera)
-    rest = ["--camera", str(camera), "--jobs", "1", "-o", str(tmp_path / "some")]
-    assert main(["circles", str(run), *rest]) == 0
-    assert "positions are not levelled: pitch and roll" in capsys.readouterr().out
-    assert main(["all", str(run), *rest[:-1], str(tmp_path / "all"), "--tilt", "frame"]) == 0
+    rest = ["--camera", str(camera), "--tilt", "frame", "-o", str(tmp_path / "all")]
+    assert main(["all", str(run), *rest]) == 0
     said = capsys.readouterr().out
     assert "not levelled" not in said
     assert "assumed level within 1." in said

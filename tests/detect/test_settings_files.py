@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from detect.cli import main, parsed
 from detect.errors import DetectError
@@ -19,22 +18,13 @@ from detect.settings_files import read_settings, settings_text
 from tests.detect.commands import Captured
 
 
-@settings(max_examples=25)
-@given(
-    st.sampled_from(list(PRESETS.values())),
-    st.sampled_from(list(LINE_PRESETS.values())),
-    st.floats(0.001, 10.0),
-)
-def test_come_back(circles: CircleSettings, lines: LineSettings, radius_m: float) -> None:
-    import tempfile
-    from dataclasses import replace
-
-    circles = replace(circles, radius_m=radius_m)
-    markers = MarkerSettings(ids=(1, 2))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "s.json"
-        path.write_text(settings_text(circles=circles, lines=lines, markers=markers))
-        read = read_settings(path)
+@pytest.mark.parametrize("circles", PRESETS.values())
+@pytest.mark.parametrize("lines", LINE_PRESETS.values())
+def test_come_back(tmp_path: Path, circles: CircleSettings, lines: LineSettings) -> None:
+    circles, markers = replace(circles, radius_m=0.1 / 3.0), MarkerSettings(ids=(1, 2))
+    path = tmp_path / "s.json"
+    path.write_text(settings_text(circles=circles, lines=lines, markers=markers))
+    read = read_settings(path)
     assert (read.circles, read.lines, read.markers) == (circles, lines, markers)
 
 
