@@ -18,7 +18,7 @@ from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.storage.bounded import MOST_PIXELS, claimed_size
-from tests.detect.runs.test_faults_images import SIDE, jpeg, png
+from tests.detect.runs.claimed_images import SIDE, jpeg, png
 
 
 @pytest.mark.parametrize("make", [jpeg, png])

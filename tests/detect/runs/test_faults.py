@@ -20,7 +20,7 @@ from redetect.landmarks import read_frames, read_steps
 from redetect.storage import demand_writable
 from tests.detect.commands import Captured
 from tests.detect.conftest import SMALL_RUN_DISCS
-from tests.detect.runs.test_faults_images import SIDE, jpeg, png
+from tests.detect.runs.claimed_images import SIDE, jpeg, png
 from tests.pictures import read_grey
 
 NOBODY = 65534

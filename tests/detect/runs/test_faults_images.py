@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import gc
-import struct
 import sys
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,52 +17,7 @@ from detect.sources.interface import RunFrame, bounded_content, decode_gray, rea
 from redetect.landmarks import Step
 from redetect.storage.bounded import MOST_PIXELS, claimed_size
 from tests.detect.commands import output_of
-
-TEXTURE = np.random.default_rng(3).integers(0, 256, (48, 96)).astype(np.uint8)
-SIDE = 60_000
-
-
-def jpeg(width: int, height: int) -> bytes:
-    """A JPEG whose header claims a size that its content does not have."""
-    content = bytearray(cv2.imencode(".jpg", TEXTURE)[1].tobytes())
-    frame = content.index(b"\xff\xc0")
-    content[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
-    return bytes(content)
-
-
-def png(width: int, height: int) -> bytes:
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        crc = struct.pack(">I", zlib.crc32(kind + data))
-        return struct.pack(">I", len(data)) + kind + data + crc
-
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
-        + chunk(b"IDAT", zlib.compress(bytes(1000)))
-        + chunk(b"IEND", b"")
-    )
-
-
-def pnm(width: int, height: int) -> bytes:
-    return f"P5\n# made by hand\n{width} {height}\n255\n".encode() + bytes(1000)
-
-
-def bmp(width: int, height: int) -> bytes:
-    content = bytearray(cv2.imencode(".bmp", TEXTURE)[1].tobytes())
-    content[18:26] = struct.pack("<ii", width, -height)
-    return bytes(content)
-
-
-def tiff(width: int, height: int, order: str = "<", tile: int = 0, big: bool = False) -> bytes:
-    mark = b"II" if order == "<" else b"MM"
-    sizes = [(256, width), (257, height), *([(322, tile), (323, tile)] if tile else [])]
-    if big:
-        head = mark + struct.pack(order + "HHHQ", 43, 8, 0, 16)
-        entries = [struct.pack(order + "HHQQ", tag, 16, 1, value) for tag, value in sizes]
-        return head + struct.pack(order + "Q", len(entries)) + b"".join(entries) + bytes(100)
-    head = mark + struct.pack(order + "HI", 42, 8)
-    entries = [struct.pack(order + "HHII", tag, 4, 1, value) for tag, value in sizes]
-    return head + struct.pack(order + "H", len(entries)) + b"".join(entries) + bytes(100)
+from tests.detect.runs.claimed_images import SIDE, TEXTURE, bmp, jpeg, png, pnm, tiff
 
 
 def frame_of(path: Path) -> RunFrame:
