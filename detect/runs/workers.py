@@ -38,6 +38,7 @@ from detect.terminal import (
     show_announcements,
 )
 from redetect.interrupts import interrupts_deferred, raise_if_interrupt_waits
+from redetect.storage.messages import excerpt
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -51,6 +52,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 #: Number of frames for which starting another process pays off.
 FRAMES_PER_PROCESS = 500
+#: Largest number of processes: more than cores and memory are good for.
+_MOST_JOBS = 1000
 #: Frames per chunk.
 _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
@@ -202,8 +205,8 @@ def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Wo
     Chunks of `large` tasks, which contain images, have one frame. With `shared`, a single process
     lets two or three others compile missing kernels at the same time.
     """
-    if jobs < 1:
-        raise WorkerError(f"jobs is {jobs}: expected 1 or more")
+    if not 1 <= jobs <= _MOST_JOBS:
+        raise WorkerError(f"jobs is {excerpt(jobs)}: expected 1 to {_MOST_JOBS}")
     chunk = 1 if large else _TOGETHER
     if jobs == 1:
         return Workers(lambda plan: _InProcess(plan, shared=shared), chunk, window=lambda: 1)

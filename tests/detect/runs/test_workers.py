@@ -107,9 +107,10 @@ def test_as_many_processes_as_are_worth_it() -> None:
     assert 1 <= default_jobs(10**6) <= (os.cpu_count() or 1)
 
 
-def test_no_workers_are_refused() -> None:
-    with pytest.raises(WorkerError, match="jobs is 0: expected 1 or more"):
-        local_workers(0)
+@pytest.mark.parametrize("jobs", [0, 10**12])
+def test_impossible_numbers_of_workers_are_refused(jobs: int) -> None:
+    with pytest.raises(WorkerError, match=f"jobs is {jobs}: expected 1 to 1000"):
+        local_workers(jobs)
 
 
 def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) -> None:
