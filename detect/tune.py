@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from itertools import chain, islice
 from typing import Any
 
@@ -41,7 +41,10 @@ _MOST_NAMED = 12
 def perform(options: Tune) -> int:
     """Execute the command; returns the exit code."""
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
-    varied = dict(map(_name_and_values, options.vary))
+    named = [_name_and_values(word) for word in options.vary]
+    varied = dict(named)
+    if len(varied) < len(named):
+        raise DetectError(f"--vary {' '.join(options.vary)}: expected each parameter once")
     grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
 
@@ -121,7 +124,7 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
             if not (last - first).is_finite() or step <= 0 or not 0 <= (last - first) / step <= 1e5:
                 raise ValueError
             words = [str(first + k * step) for k in range(int((last - first) / step) + 1)]
-        except (InvalidOperation, ValueError):
+        except (ArithmeticError, ValueError):  # not numbers, or a quotient out of range
             raise DetectError(expected) from None
     return tuple(dict.fromkeys(word_value(CircleSettings, name, word.strip()) for word in words))
 

@@ -93,6 +93,7 @@ def test_values_of_a_parameter(name: str, text: str, expected: tuple[object, ...
         ("threshold", "0.3:0.7:0", "FROM:TO:STEP"),
         ("threshold", "0:inf:1", "FROM:TO:STEP"),
         ("threshold", "a:b:c", "FROM:TO:STEP"),
+        ("threshold", "0:1e999999:1e-999999", "FROM:TO:STEP"),
         ("threshold", "much", "expected a number"),
         ("samples", "8:9:0.5", "expected a whole number"),
         ("refine", "maybe", "True or False"),
@@ -146,7 +147,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
         small_run, {**SMALL_RUN_DISCS, "s.0001": [], "s.0002": [(0.0, -1.4), (0.5, -1.4)]}
     )
     folder = tmp_path / "t"
-    arguments = ["tune", str(small_run), "--vary", "samples=8,16", "threshold=0.4,0.999"]
+    arguments = ["tune", str(small_run), "--vary", "samples=8,16", "--vary", "threshold=0.4,0.999"]
     assert main([*arguments, "-o", str(folder)]) == 0
     document = json.loads((folder / "table.json").read_text())
     rows = document["trials"]
@@ -187,6 +188,8 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     tune = ["tune", run, "-o", str(tmp_path / "t")]
     assert_refused(tune, small_run, "nothing is varied", capsys)
     assert_refused([*tune, "--vary", "threshold"], small_run, "expected NAME=VALUES", capsys)
+    twice = ["--vary", "threshold=0.4", "--vary", "samples=8", "threshold=0.5"]
+    assert_refused([*tune, *twice], small_run, "expected each parameter once", capsys)
     assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "map.circles", capsys)
     write_reference(small_run, {"other": [(0.0, -1.0)]})
     assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "none of the 3", capsys)
