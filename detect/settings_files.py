@@ -46,7 +46,7 @@ def read_settings(path: Path) -> SettingsFile:
             document = json.loads(stream.read(_LONGEST_BYTES))
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError:
+    except (ValueError, RecursionError):  # the latter if it is nested very deeply
         raise DetectError(f"{path}: not JSON: expected settings, as in a .log.json") from None
     given = document.get("settings") if isinstance(document, dict) else None
     if not isinstance(given, dict):

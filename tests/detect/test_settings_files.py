@@ -57,6 +57,7 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
     ("content", "words"),
     [
         ("nonsense", "not JSON"),
+        pytest.param("[" * 100_000, "not JSON", id="deep"),
         ("[]", 'no "settings"'),
         ('{"settings": 3}', 'no "settings"'),
         ('{"settings": {"circles": 3}}', "names and values"),
