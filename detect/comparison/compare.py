@@ -76,10 +76,11 @@ def compare_with_file(
     """Compare discs, or lines, with those of a reference file.
 
     Other parameters as in `compare_frames`; look-alikes, and by default unlisted rows, are those in
-    the reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read.
+    the reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read,
+    and CompareError if all rows of the reference are of the other kind.
     """
     names = names or (str(reference), "detected")
-    wanted = read_frames(reference)
+    wanted = read_kind(kind, reference)
 
     def rows(name: str, path: Path | None) -> list[Frame] | None:
         usual = reference.parent / f"{name}.{kind}"
@@ -92,6 +93,16 @@ def compare_with_file(
     return compare_frames(
         wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
+
+
+def read_kind(kind: Kind, path: Path) -> list[Frame]:
+    """The frames of a file; a CompareError if all its rows are of the other kind."""
+    frames = list(read_frames(path))
+    other = "circles" if kind == "lines" else "lines"
+    has, has_other = (any(getattr(frame, rows) for frame in frames) for rows in (kind, other))
+    if has_other and not has:
+        raise CompareError(f"{path}: its rows are {other}: expected {kind}")
+    return frames
 
 
 def compare_frames(

@@ -12,13 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from camera import Camera, camera_in, read_camera
-from detect.comparison.compare import compare_with_file
+from detect.comparison.compare import compare_with_file, read_kind
 from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, Kind, number
 from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.options import Compare
 from detect.seen import Sight
-from redetect.landmarks import read_frames
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
 from redetect.storage.messages import one_line
@@ -65,7 +64,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     return compare_with_file(
         kind,
         reference,
-        read_frames(detected),
+        read_kind(kind, detected),
         command.matching,
         sight=sight,
         unlisted=command.unlisted,
