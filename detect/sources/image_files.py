@@ -6,6 +6,7 @@ Only the names of the images are kept in memory.
 from __future__ import annotations
 
 import fnmatch
+import glob
 import os
 import re
 from collections.abc import Generator, Mapping
@@ -168,6 +169,14 @@ class ImageFiles(Source):
         self.has_times = bool(times) or times_file.is_file()
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
+        prefixes: dict[str, str] = {}
+        for name in self._names.names:
+            first = prefixes.setdefault(frame_prefix(Path(name).stem), name)
+            if first != name:
+                raise DetectError(
+                    f"{self.name}: {excerpt(first)} and {excerpt(name)} would be the same frame: "
+                    "expected different names, or a pattern such as '*.png'"
+                )
         for name in self._names.names:
             path = self._names.folder / name
             step, time_s = still(frame_prefix(path.stem)), self._times.get(path.stem)
@@ -184,14 +193,15 @@ class ImageFiles(Source):
 
 
 def _matching_images(pattern: Path) -> ImageNames:
-    """The images that a pattern matches, or one image."""
-    if WILDCARDS & set(str(pattern.parent)):
+    """The images that a pattern matches, or one image, whose name may look like a pattern."""
+    if WILDCARDS & set(str(pattern.parent)) and not pattern.parent.is_dir():
         raise DetectError(
             f"{pattern}: wildcards in a folder's name: expected them in the last part only"
         )
     if not pattern.parent.is_dir():
         raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
-    found = ImageNames(pattern.parent, pattern.name)
+    name = glob.escape(pattern.name) if pattern.is_file() else pattern.name
+    found = ImageNames(pattern.parent, name)
     if not found.names:
         kinds = " ".join(sorted(IMAGE_SUFFIXES))
         raise DetectError(f"{pattern}: no image matches: expected {kinds}")

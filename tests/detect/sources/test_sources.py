@@ -141,6 +141,23 @@ def test_patterns_and_single_images(small_run: Path, published_camera: Camera) -
     assert alone.image == small_run / "images" / "s.0002.png"
 
 
+def test_names_that_look_like_patterns(small_run: Path) -> None:
+    folder = (small_run / "images").rename(small_run / "drive[1]")
+    (folder / "s.0000.png").rename(folder / "s[1].png")
+    (folder / "s.0001.png").rename(folder / "s1.png")
+    (frame,) = open_source(folder / "s[1].png").frames
+    assert frame.image == folder / "s[1].png"
+    assert len(list(open_source(folder / "*.png").frames)) == 3
+
+
+def test_two_images_of_the_same_name(small_run: Path) -> None:
+    folder = small_run / "images"
+    (folder / "s.0001.png").rename(folder / "s.0000.tiff")
+    with pytest.raises(DetectError, match=r"'s\.0000\.png' and 's\.0000\.tiff' would be the same"):
+        list(open_source(folder).frames)
+    assert len(list(open_source(folder / "*.png").frames)) == 2
+
+
 @pytest.mark.parametrize(
     ("deep", "significant"), [(4095, 12), (1023, 10), (65535, 16), (200, 8), (0, 8)]
 )
