@@ -18,6 +18,7 @@ from detect.errors import DetectError, FrameError
 from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.seen import Sight
+from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect.reporting.page import Part, Section, image_part, page_of
@@ -200,7 +201,7 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
 
 def _frames(inputs: ReportInputs, worst: int) -> Section:
     """The worst frames, or some frames if there is no reference to rank them."""
-    named = {picture_name(prefix): prefix for prefix in inputs.names}
+    named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}
     for kind, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
@@ -210,7 +211,7 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
         table = worst_frames_table(result, worst)
         parts.append(Part("table", f"{table.caption}: {kind}", table.head, table.rows))
         for rank, match in enumerate(matches, 1):
-            prefix, place = named[picture_name(match.name)], f"number {rank} of {kind}"
+            prefix, place = named[match.name], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
     if parts:
         key = (

@@ -237,6 +237,14 @@ def test_unlisted_verticals_are_no_errors(project_root: Path, tmp_path: Path) ->
     assert re.search(r"precision of verticals\s+1\.000", words)
 
 
+def test_names_with_two_extensions(judged_run: Path, tmp_path: Path) -> None:
+    for name in ("map.circles", "detected.circles", "s.txt"):
+        path = judged_run / name
+        path.write_text(re.sub(r"(?m)^STEP (s\.000.)", r"STEP \1.png.png", path.read_text()))
+    page = reported(judged_run, tmp_path / "r.html")
+    assert "Frame s.0001.png (number 1 of discs)" in " ".join(" ".join(page.words).split())
+
+
 def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Path) -> None:
     assert main(["circles", str(small_run), "--threshold", "0.4"]) == 0
     page = reported(small_run, tmp_path / "r.html")
