@@ -170,13 +170,14 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
         pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning})
         for c in TABLES[table]
     ]
-    schema = pa.schema(fields, metadata={"table": table, "source": source})
     columns = list(zip(*rows)) or [()] * len(fields)
     try:
+        schema = pa.schema(fields, metadata={"table": table, "source": source})
         arrays = [pa.array(column, field.type) for column, field in zip(columns, fields)]
     except UnicodeEncodeError:
         raise DetectError(
-            f"{source}: the name of an image is not valid Unicode: Parquet cannot store it"
+            f"{source}: its name, or that of an image, is not valid Unicode: Parquet cannot "
+            "store it"
         ) from None
     pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), stream)
 
@@ -236,7 +237,6 @@ def _nanoseconds(image: Value, time_s: Value, source: str) -> int:
             f"{source}: no time for {image}: messages need one: give --times (a file of "
             "rows 'prefix seconds') or --rate-hz"
         )
-    time_ns = round(time_s * 1e9)
-    if not 0 <= time_ns < 2**31 * 10**9:
+    if not 0.0 <= time_s < 2.0**31:
         raise DetectError(f"{source}: {image} is from {time_s:g} s: expected 0 to 2^31 s")
-    return time_ns
+    return round(time_s * 1e9)
