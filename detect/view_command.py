@@ -65,6 +65,7 @@ def perform(options: View) -> int:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
+                    advance()
                     continue
                 picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
                 coloured = np.ascontiguousarray(picture[:, :, ::-1])

@@ -21,6 +21,7 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
+from detect.sources.video import quiet_opencv
 from detect.terminal import progress_bar, report_failures
 from lut import cached_vertical_table
 from redetect.array_types import ByteArray
@@ -74,6 +75,7 @@ def draw_run(
                 image = read_image(frame, None if sight is None else sight.camera)
             except FrameError as error:
                 failures.append(str(error))
+                advance()
                 continue
             prefix = frame.step.prefix
             name = picture_name(prefix)
@@ -112,9 +114,12 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
             even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             if size is None:
                 size = (even.shape[1], even.shape[0])
-                if not writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size):
+                with quiet_opencv():
+                    writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+                if not writer.isOpened():
                     raise DetectError(
-                        f"{path}: this OpenCV cannot write MP4 videos: expected -o and a folder"
+                        f"{path}: this OpenCV cannot write MP4 videos of {fps:g} frames per "
+                        "second: expected another --fps, or -o and a folder"
                     )
             if (even.shape[1], even.shape[0]) != size:
                 raise DetectError(f"{path}: pictures differ in size: expected one size for a video")

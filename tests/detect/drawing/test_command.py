@@ -212,6 +212,8 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
         main(["draw", run, "-o", out, "--every", "0"])
     assert "every is 0: expected a whole number" in " ".join(capsys.readouterr().err.split())
     video = tmp_path / "v.mp4"
+    fast = ["draw", run, "--video", str(video), "--fps", "1e9"]
+    assert_refused(fast, small_run, "expected another --fps", capsys)
     video.write_bytes(b"mine")
     assert_refused(["draw", run, "--video", str(video)], small_run, "--force", capsys)
     assert video.read_bytes() == b"mine"
