@@ -55,8 +55,9 @@ def _print(found: DiscExplanation) -> None:
     if found.place:
         console.print(found.place, highlight=False, markup=False)
     table = Table(box=box.SIMPLE_HEAD, padding=0)
-    for heading in ("", "u", "v", "ahead m", "left m", "votes", "contrast", "result"):
-        table.add_column(heading, justify="left" if heading.startswith("what") else "right")
+    for heading in ("", "u", "v", "ahead m", "left m", "votes", "contrast"):
+        table.add_column(heading, justify="right")
+    table.add_column("result")
     for number, row in enumerate(found.candidates, start=1):
         figures = f"{row.u:.0f} {row.v:.0f} {-row.y_m:.2f} {row.x_m:.2f} {row.votes:.1f}"
         contrast = f"{row.contrast:+.0f}" if row.contrast == row.contrast else "-"
