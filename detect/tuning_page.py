@@ -233,7 +233,7 @@ class _Handler(BaseHTTPRequestHandler):
             kind, content = work()
         except (OneLineError, OSError) as error:
             self._refuse(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             self._refuse(HTTPStatus.BAD_REQUEST, "not understood")
         else:
             self._answer(kind, content)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import math
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -145,7 +146,8 @@ def test_impossible_settings_are_refused_in_words(
 
 
 @pytest.mark.parametrize(
-    "content", [{}, [], {"frame": 99, "settings": {}}, {"frame": "x", "settings": {}}, 7]
+    "content",
+    [{}, [], {"frame": 99, "settings": {}}, {"frame": "x", "settings": {}}, 7, {"frame": math.inf}],
 )
 def test_nonsense_is_refused(server: TuningServer, content: Any) -> None:
     status, answer = post(server, "/detect", content)
