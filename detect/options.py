@@ -16,6 +16,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from redetect.storage.bounds import (
     ABOVE_0,
+    SHARE,
     MaybeFloat,
     MaybeInt,
     MaybePath,
@@ -27,6 +28,8 @@ from redetect.storage.bounds import (
     whole,
 )
 
+#: More than any run has.
+MOST_FRAMES = 10**9
 Preset = Literal["default", "published"]
 DetectorPreset = Literal["default", "published", "report"]
 
@@ -45,7 +48,7 @@ class SourceOptions:
     times: str = ""
     image_topic: str = ""  #: Image topic of a bag, if there are several.
     #: Stop after this many frames; 0 for all of them (with a live camera: until Ctrl-C).
-    frames: Annotated[int, whole(0)] = 0
+    frames: Annotated[int, whole(0, MOST_FRAMES)] = 0
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
@@ -240,11 +243,14 @@ class Compare:
     #: Calibration, by default the one in the run folder: discs are compared in the image, where
     #: they were seen. Without one, or with --gate-m, they are compared on the floor.
     camera: MaybePath = None
-    min_recall: MaybeFloat = None  #: Exit with 1 if the recall is lower.
-    min_precision: MaybeFloat = None  #: Exit with 1 if the precision is lower.
+    min_recall: Annotated[MaybeFloat, SHARE] = None  #: Exit with 1 if the recall is lower.
+    min_precision: Annotated[MaybeFloat, SHARE] = None  #: Exit with 1 if the precision is lower.
     json: MaybePath = None  #: Write the result as JSON; -: to standard output only.
     force: bool = False  #: Replace an existing JSON file.
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
+
+    def __post_init__(self) -> None:
+        demand_fields(self, CompareError)
 
 
 @dataclass(frozen=True)
@@ -264,7 +270,7 @@ class RowFiles:
 class SomeFramesFlags(RunFlags):
     """Options of commands that may skip frames."""
 
-    every: Annotated[int, whole(1)] = 1  #: Only every n-th frame.
+    every: Annotated[int, whole(1, MOST_FRAMES)] = 1  #: Only every n-th frame.
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)

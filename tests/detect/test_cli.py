@@ -324,6 +324,13 @@ def test_demands_decide_the_exit_code(
     assert "0.75" in shown.out or "75" in shown.out
 
 
+@pytest.mark.parametrize("least", ["nan", "75"])
+def test_demands_are_shares(compared_run: Path, capsys: Captured, least: str) -> None:
+    with pytest.raises(SystemExit):
+        main(["compare", str(compared_run), "--min-recall", least])
+    assert f"min_recall is {least}: expected 0 to 1" in " ".join(capsys.readouterr().err.split())
+
+
 def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:
     as_json = tmp_path / "result.json"
     assert main(["compare", str(compared_run), "--json", str(as_json)]) == 0
