@@ -293,9 +293,10 @@ def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
     assert (swapped.matched, swapped.missed, swapped.extra) == (4, 1, 1)
     strict = comparison_of(Compare(tmp_path, matching=CompareOptions(gate_m=0.001)))
     assert strict.matched == 2
-    for files in ({"reference": sides[1]}, {"reference": sides[0], "detected": sides[1]}):
+    write_frames(tmp_path / "no.lines", [])
+    for files in ((sides[1], tmp_path / "no.lines"), (tmp_path / "no.lines", sides[1])):
         with pytest.raises(CompareError, match=r"circles: its rows are circles: expected lines"):
-            comparison_of(Compare(tmp_path, lines=True, **{"detected": sides[0], **files}))
+            comparison_of(Compare(tmp_path, True, *files))
     (tmp_path / "detected.circles").unlink()
     with pytest.raises(DetectError, match=r"detected\.circles: no such landmark file"):
         comparison_of(Compare(tmp_path))
