@@ -18,7 +18,7 @@ from camera import Camera, read_camera
 from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
 from detect.drawing.inputs import SeenRows
-from detect.errors import FrameError
+from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
@@ -29,6 +29,7 @@ from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
+from redetect.storage.messages import excerpt
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
@@ -312,6 +313,8 @@ class RecordedFrame:
         line_settings: LineSettings | None = None,
     ) -> Detection:
         """Detect discs, verticals and tilt: see `detect`."""
+        if axes not in MEANING:
+            raise DetectError(f"axes is {excerpt(axes)}: expected one of {', '.join(MEANING)}")
         chosen = settings_of(settings, radius_m, polarity)
         plan = FramePlan(
             self.camera,

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,13 +23,16 @@ from redetect.landmarks.map_file import (
 from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
 from redetect.slam.commands.filters import localized_run_of, path_distance
 from redetect.slam.commands.map import mapped_run_of
+from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import FilterRun
 from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined
+from redetect.storage.bounds import demand_fields
 
 PathLike = str | os.PathLike[str]
+Command = TypeVar("Command", Map, Localize)
 
 
 class Poses(Table):
@@ -174,7 +177,7 @@ def map_landmarks(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     """
-    command = Map(run=Path(run), circles=circles, lines=lines, **_as_paths(options))
+    command = _checked(Map(run=Path(run), circles=circles, lines=lines, **_as_paths(options)))
     mapped = mapped_run_of(command, joined(read_runs(command)))
     return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
@@ -209,8 +212,8 @@ def localize(
         If a file is malformed.
     """
     in_file = Path("the map") if isinstance(landmarks, RunMap) else Path(landmarks)
-    command = Localize(
-        run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options)
+    command = _checked(
+        Localize(run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options))
     )
     if isinstance(landmarks, RunMap):
         places = landmarks.result.landmarks_jointly()
@@ -225,5 +228,15 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
     if paths.get("camera") is not None:
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
-        paths["more"] = tuple(map(Path, paths["more"]))
+        more = paths["more"]
+        some = [more] if isinstance(more, str | os.PathLike) else more
+        paths["more"] = tuple(map(Path, some))
     return paths
+
+
+def _checked(command: Command) -> Command:
+    """The command; a SlamError if its landmarks or words are none of those there are."""
+    if not command.circles and not command.lines:
+        raise SlamError("circles and lines are False: expected at least one of them")
+    demand_fields(command, SlamError)
+    return command

@@ -15,7 +15,7 @@ from functools import cache
 from math import inf
 from numbers import Integral
 from pathlib import Path
-from typing import Annotated, Any, Optional, get_type_hints
+from typing import Annotated, Any, Literal, Optional, get_args, get_origin, get_type_hints
 
 from redetect.storage.messages import excerpt
 
@@ -96,7 +96,9 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
 
 
 def demand_fields(settings: object, error: type[Exception]) -> None:
-    """Reject a dataclass of settings with a number out of the bounds that annotate its field."""
+    """Reject a dataclass of settings with a number out of the bounds that annotate its field, or
+    a word that is none of a field's.
+    """
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
 
@@ -104,7 +106,12 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
 @cache
 def _annotated(kind: type) -> dict[str, Bounds]:
     hints = get_type_hints(kind, include_extras=True)
-    return {
+    choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
+    words = {
+        name: Bounds(f"one of {', '.join(map(str, known))}", known.__contains__)
+        for name, known in choices.items()
+    }
+    return words | {
         name: bounds
         for name, hint in hints.items()
         for bounds in getattr(hint, "__metadata__", ())

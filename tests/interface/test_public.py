@@ -104,6 +104,11 @@ def test_radius_and_settings(demo_image: Path, demo_camera: rd.Camera) -> None:
     assert found.settings == rd.CircleSettings(polarity="dark", threshold=0.9, radius_m=0.06)
     with pytest.raises(rd.Error, match="radius_m is -1"):
         rd.detect(demo_image, demo_camera, radius_m=-1.0)
+    wrong: Any = "grey"
+    with pytest.raises(rd.Error, match="polarity is 'grey': expected one of any, light, dark"):
+        rd.detect(demo_image, demo_camera, polarity=wrong)
+    with pytest.raises(rd.Error, match="axes is 'grey': expected one of robotics, dataset"):
+        rd.detect(demo_image, demo_camera, axes=wrong)
 
 
 @pytest.mark.parametrize(
@@ -230,6 +235,12 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     from_file = rd.localize(demo, tmp_path / "map.csv", lines=True)
     np.testing.assert_allclose(in_memory.path.poses, from_file.path.poses, atol=1e-9)
     assert in_memory.distance(landmarks.path)["position_max_m"] < 0.05
+    with pytest.raises(rd.Error, match="circles and lines are False"):
+        rd.map(demo, circles=False)
+    with pytest.raises(rd.Error, match="association is 'all': expected one of known, nearest"):
+        rd.localize(demo, landmarks, association="all")
+    both = rd.map(demo, more=str(demo))
+    assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
     assert len(repr(landmarks)) < 200
     assert len(repr(in_memory)) < 200
 
