@@ -40,6 +40,8 @@ _MOST_NAMED = 12
 
 def perform(options: Tune) -> int:
     """Execute the command; returns the exit code."""
+    if options.serve and options.vary:
+        raise DetectError("--serve and --vary: expected one of them")
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     named = [_name_and_values(word) for word in options.vary]
     varied = dict(named)

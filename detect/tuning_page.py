@@ -21,7 +21,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from detect.discs.unfound import explain_discs
 from detect.drawing.frame import png_of
@@ -174,9 +174,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """The page, or the image of a frame."""
-        if not self._allowed(parse_qs(urlsplit(self.path).query).get("token", [""])[0]):
+        path, _, query = self.path.partition("?")
+        if not self._allowed(parse_qs(query).get("token", [""])[0]):
             return
-        path = urlsplit(self.path).path
         session = self.server.session
         if path == "/":
             page = files("detect").joinpath("tuning_page.html").read_text("utf-8")
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._allowed(self.headers.get("X-Token", "")):
             return
         length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > _LONGEST_BYTES:
+        if not length.isdecimal() or len(length) > 9 or int(length) > _LONGEST_BYTES:
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request is too long")
             return
         body = self.rfile.read(int(length))
@@ -260,7 +260,11 @@ class _Handler(BaseHTTPRequestHandler):
 
 def serve(session: TuningSession, port: int = 0) -> int:
     """Serve the page until an interrupt; returns the exit code."""
-    with TuningServer(session, port) as server:
+    try:
+        server = TuningServer(session, port)
+    except OSError as error:
+        raise DetectError(f"port {port}: {error.strerror}: expected another --port") from None
+    with server:
         print(f"{server.address}\nCtrl-C ends it.", flush=True)
         try:
             server.serve_forever()

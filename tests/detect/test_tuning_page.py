@@ -16,10 +16,11 @@ import pytest
 
 from camera import Camera, read_camera
 from detect.cli import main
+from detect.errors import DetectError
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings
 from detect.sources.opening import open_run
-from detect.tuning_page import TuningServer, TuningSession
+from detect.tuning_page import TuningServer, TuningSession, serve
 from redetect.landmarks import read_frames
 from tests.detect.commands import in_browser
 
@@ -153,6 +154,17 @@ def test_nonsense_is_refused(server: TuningServer, content: Any) -> None:
     status, answer = post(server, "/detect", content)
     assert status in (400, 422)
     assert answer["error"]
+
+
+def test_addresses_and_lengths_that_cannot_be(server: TuningServer) -> None:
+    assert ask(server, "GET", "http://[/", Host="127.0.0.1:1")[0] == 403
+    headers = {"X-Token": server.token, "Content-Length": "9" * 5000}
+    assert ask(server, "POST", "/detect", **headers)[0] == 413
+
+
+def test_a_port_in_use_is_named(server: TuningServer) -> None:
+    with pytest.raises(DetectError, match=f"port {server.server_port}: .*: expected another"):
+        serve(server.session, server.server_port)
 
 
 def test_settings_and_labels_are_saved(server: TuningServer, tmp_path: Path) -> None:

@@ -190,6 +190,8 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused([*tune, "--vary", "threshold"], small_run, "expected NAME=VALUES", capsys)
     twice = ["--vary", "threshold=0.4", "--vary", "samples=8", "threshold=0.5"]
     assert_refused([*tune, *twice], small_run, "expected each parameter once", capsys)
+    by_hand = [*tune, "--serve", "--vary", "samples=8"]
+    assert_refused(by_hand, small_run, "--serve and --vary: expected one of them", capsys)
     assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "map.circles", capsys)
     write_reference(small_run, {"other": [(0.0, -1.0)]})
     assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "none of the 3", capsys)
