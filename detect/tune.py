@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -34,6 +35,7 @@ from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_r
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
 
+_MOST_TRIALS = 100_000
 # Largest number of labelled points.
 _MOST_NAMED = 12
 
@@ -135,13 +137,16 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
     Each has the names and values in the order of `varied`; the last varies fastest. Raises
-    DetectError if nothing is varied, and as `parameter_values` does.
+    DetectError if nothing is varied, or there are too many, and as `parameter_values` does.
     """
     if not varied:
         raise DetectError(
             "nothing is varied: expected a parameter and values, as --vary evidence=-1:3:0.5"
         )
     values = {name: parameter_values(name, text) for name, text in varied.items()}
+    count = math.prod(map(len, values.values()))
+    if count > _MOST_TRIALS:
+        raise DetectError(f"{count} combinations of values: expected at most {_MOST_TRIALS}")
     return tuple(dict(zip(values, chosen)) for chosen in itertools.product(*values.values()))
 
 

@@ -112,6 +112,8 @@ def test_all_combinations_are_tried() -> None:
     ]
     with pytest.raises(DetectError, match="nothing is varied"):
         combinations({})
+    with pytest.raises(DetectError, match="1010101 combinations of values: expected at most"):
+        combinations({"evidence": "0:1:0.0001", "threshold": "0:1:0.01"})
 
 
 # -- tables and pictures ----------------------------------------------------------------------
