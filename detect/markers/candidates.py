@@ -107,6 +107,8 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
     if expected:
         while expected / scale > _LEVEL_RADIUS_PX:
             scale *= 2
+        if scale > min(image.shape):
+            return []  # the marker is much larger than the image
         levels = [(scale, max(4, math.ceil(expected / scale)))]
     else:
         levels = [(1, _LEVEL_RADIUS_PX)]
