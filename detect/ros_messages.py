@@ -92,7 +92,7 @@ def _pose(make: Make, table: TableName, row: Values) -> Any:
     mean, covariance = np.zeros(6), np.zeros((6, 6))  # Position, rotation vector
     if table == "lines":
         *_, alpha, _, _, sigma, _ = row
-        mean[5], covariance[5, 5] = alpha, sigma**2
+        mean[5], covariance[5, 5] = alpha, sigma * sigma  # may be infinite
     else:
         x, y, xx, xy, yy = *row[:2], *(row[3:6] if table == "circles" else row[2:5])
         part = slice(0, 2) if table == "circles" else slice(3, 5)

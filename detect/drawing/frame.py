@@ -255,12 +255,12 @@ def draw_text(
     size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:
-    """Draw ASCII text with the left end of its base line at u, v, unless these are not finite.
+    """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
 
     `shift` moves the text, by more in wide pictures.
     """
     place = np.asarray(at, dtype=np.float64)
-    if np.isfinite(place).all():
+    if np.all(np.abs(place) < _FARTHEST_PX):
         times = enlargement(canvas)
         u, v = (np.rint(place) + times * np.array(shift)).astype(int).tolist()
         cv2.putText(

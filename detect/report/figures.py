@@ -29,6 +29,8 @@ _MOST_DOTS = 4000
 
 #: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
 _SIGMAS, _CORNERS = 3.0, 32
+#: Matplotlib cannot scale axes to any number.
+_FARTHEST_M = 1e12
 
 
 def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
@@ -170,7 +172,8 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
 def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     """Map of the discs found and of the reference, along the path summed from the steps.
 
-    Forward at the start is up, left is left. None if there are no discs.
+    Forward at the start is up, left is left. None if there are no discs; a note if some are too far
+    away for a figure.
     """
     seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
     if not any(found.circles for found, _ in seen):
@@ -182,14 +185,17 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
         outlines.append(apply(pose, ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS)))
         if reference is not None:
             true.append(apply(pose, circle_arrays(reference.circles).xy))
+    outline, marks = np.concatenate(outlines), np.concatenate(true)
+    if not all(np.all(np.abs(part) < _FARTHEST_M) for part in (poses, outline, marks)):
+        return Part("note", f"No map of the floor: positions above {_FARTHEST_M:g} m.")
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
     with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
         path = ahead * poses[:, :2]
         axes.plot(*path.T, color=REFERENCE, lw=1.0, label="path by the odometry")
-        if len(marks := ahead * np.concatenate(true)):
-            axes.plot(*marks.T, "+", color=MARK, ms=6, mew=0.7, label="reference")
-        closed = np.concatenate(outlines)[:, [*range(_CORNERS), 0]]
+        if len(marks):
+            axes.plot(*(ahead * marks).T, "+", color=MARK, ms=6, mew=0.7, label="reference")
+        closed = outline[:, [*range(_CORNERS), 0]]
         gaps = np.pad(closed, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         axes.plot(*(ahead * gaps.reshape(-1, 2)).T, color=DATA, lw=0.7, label="found")
         axes.set_aspect("equal", adjustable="datalim")

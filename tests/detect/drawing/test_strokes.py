@@ -32,6 +32,7 @@ def test_strokes_and_words_grow_with_the_picture(columns: int, times: int) -> No
     draw_text(canvas, "0.98", (20, 100), WHITE)
     small = np.zeros((200, 320, 3), np.uint8)
     draw_text(small, "0.98", (20, 100), WHITE)
+    draw_text(small, "far outside", (1e300, -1e300), WHITE)
     for large, usual in zip(marked(canvas), marked(small)):
         assert large == pytest.approx(times * usual, rel=0.15)
 

@@ -242,6 +242,11 @@ def test_the_same_bytes_and_nothing_overwritten(tmp_path: Path, to: str, capsys:
     [
         (None, [], "no such landmark file"),
         ("# nothing\n", ["-o", "o.csv"], None),
+        (
+            "STEP a 0 0 0 0 0 0 0 0 0\nLANDMARK_L 0 0 0 1 0.1 0 0 1e300 3\n",
+            ["--to", "mcap", "--rate-hz", "1"],
+            None,
+        ),
         (FILES["circles"], ["--to", "mcap"], 'no time for "a.0000": messages need one'),
         (FILES["circles"], ["--rate-hz", "0"], "rate_hz is 0: expected above 0"),
         (FILES["circles"], ["--to", "mcap", "--rate-hz", "1e-309"], "b,1 is from inf s"),
