@@ -17,7 +17,7 @@ from detect.options import Compare, CompareOptions, SourceOptions
 from detect.seen import Sight
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
-from redetect.interface.detection import CameraLike, Detection, RecordedFrame
+from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
 
 PathLike = str | os.PathLike[str]
 
@@ -100,7 +100,7 @@ def compare(
     lines : bool
         Compare verticals instead of discs.
     camera : Camera, or path, optional
-        Calibration; by default the one in the run folder.
+        Calibration; by default the one in the run folder, or that of the detections.
     options : CompareOptions, optional
         How rows are matched, and which rows count.
 
@@ -134,11 +134,12 @@ def compare(
         raise DetectError(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
+    seen_by = found[0].camera if camera is None else camera_of(camera)
     return compare_with_file(
         kind,
         in_file,
         [one.frame for one in found],
         options,
-        sight=Sight(found[0].camera, found[0].settings.radius_m, read_head(in_file).level),
+        sight=Sight(seen_by, found[0].settings.radius_m, read_head(in_file).level),
         names=(str(in_file), "detections"),
     )

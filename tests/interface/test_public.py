@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,9 @@ def test_frames_of_a_run_and_their_comparison(demo: Path, tmp_path: Path) -> Non
     assert discs.recall == 1.0
     assert "discs of the reference are found, 0 missed, in 3 frames" in discs.sentences()[0]
     assert json.loads(discs.to_json())["matched"] == discs.matched
+    sharper = replace(run.camera, scale_x=2.0 * run.camera.scale_x)
+    figures = [c.figures() for c in (discs, rd.compare(demo, found, camera=sharper))]
+    assert figures[0]["image_median_px"] < figures[1]["image_median_px"]
     verticals = rd.compare(demo, found, lines=True)
     alone = shutil.copy(demo / "map.lines", tmp_path)  # with nothing beside it
     assert "verticals of the reference are found" in verticals._repr_html_()

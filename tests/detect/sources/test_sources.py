@@ -12,6 +12,7 @@ import pytest
 
 from camera import Camera
 from detect.cli import main
+from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import open_run, open_source
@@ -148,6 +149,11 @@ def test_names_that_look_like_patterns(small_run: Path) -> None:
     (frame,) = open_source(folder / "s[1].png").frames
     assert frame.image == folder / "s[1].png"
     assert len(list(open_source(folder / "*.png").frames)) == 3
+
+
+def test_more_frames_than_there_can_be() -> None:
+    with pytest.raises(DetectError, match="frames is 100000000000000000000: expected a whole"):
+        SourceOptions(frames=10**20)
 
 
 def test_two_images_of_the_same_name(small_run: Path) -> None:
