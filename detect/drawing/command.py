@@ -112,8 +112,9 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
             # The encoder needs even numbers of rows and columns.
             height, width = picture.shape[:2]
             even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+            even_size = (even.shape[1], even.shape[0])
             if size is None:
-                size = (even.shape[1], even.shape[0])
+                size = even_size
                 with quiet_opencv():
                     writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
                 if not writer.isOpened():
@@ -121,7 +122,7 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
                         f"{path}: this OpenCV cannot write MP4 videos of {fps:g} frames per "
                         "second: expected another --fps, or -o and a folder"
                     )
-            if (even.shape[1], even.shape[0]) != size:
+            if even_size != size:
                 raise DetectError(f"{path}: pictures differ in size: expected one size for a video")
             writer.write(even)
 
