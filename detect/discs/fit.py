@@ -190,19 +190,20 @@ class Levels(NamedTuple):
 
 
 @kernel()
-def eliminate(matrices: FloatArray, k: int) -> None:
-    """Eliminate unknown k from the rows after it of S normal equations (T, T, S), lower halves.
+def eliminate(matrices: FloatArray, unknowns: range) -> None:
+    """Eliminate unknowns from the rows after them of S normal equations (T, T, S), lower halves.
 
     This leaves the Schur complement. An unknown that no observation depends on changes nothing.
     """
     terms, _, count = matrices.shape
     per_pivot = np.empty(count)
-    for s in range(count):
-        per_pivot[s] = 1.0 / matrices[k, k, s] if matrices[k, k, s] > 0.0 else 0.0
-    for i in range(k + 1, terms):
-        for j in range(k + 1, i + 1):
-            for s in range(count):
-                matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
+    for k in unknowns:
+        for s in range(count):
+            per_pivot[s] = 1.0 / matrices[k, k, s] if matrices[k, k, s] > 0.0 else 0.0
+        for i in range(k + 1, terms):
+            for j in range(k + 1, i + 1):
+                for s in range(count):
+                    matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
 
 
 @kernel(inline="always")
@@ -254,10 +255,9 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         if moved < _ARRIVED and step > _EARLY:
             break
     reduced = normal.copy()
-    eliminate(reduced, _BLUR_1)
-    eliminate(reduced, _BLUR_2)
+    eliminate(reduced, range(_BLUR_1, _RADIUS))
     information = _radius_information(reduced) - 1.0 / settings.radius_sigma**2
-    eliminate(reduced, _RADIUS)
+    eliminate(reduced, range(_RADIUS, _X))
     noise = _inverse(reduced, 0)
     if by_parts:
         xx, xy, yy = _covariance_by_parts(products, levels, normal, noise)
@@ -368,12 +368,11 @@ def _eliminate_levels(
     if by_parts:
         for s in range(groups):
             grouped[_SLOPE, _SLOPE, s] += (noise / _RAMP_SIGMA) ** 2
-    for k in range(_OUTSIDE if by_parts else 0, _SLOPE):
-        eliminate(grouped, k)
+    eliminate(grouped, range(_OUTSIDE if by_parts else 0, _SLOPE))
     spread = grouped[_CONTRAST, _CONTRAST].copy()
-    eliminate(grouped, _SLOPE)
+    eliminate(grouped, range(_SLOPE, _CONTRAST))
     without = grouped[_GREY, _GREY].copy()
-    eliminate(grouped, _CONTRAST)
+    eliminate(grouped, range(_CONTRAST, _BLUR_1))
     for s in range(groups):
         levels.contrast[s] = levels.weight[s] = levels.explained[s] = 0.0
         if pixels[s] < _LEAST_PIXELS or spread[s] < _LEAST_SPREAD:
@@ -497,8 +496,7 @@ def _add_up(
 @kernel()
 def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
     """Solve normal equations (T, T, 1), which are overwritten, for the unknowns from `first` on."""
-    for k in range(first, _GREY):
-        eliminate(normal, k)
+    eliminate(normal, range(first, _GREY))
     for k in range(_Y, first - 1, -1):
         rest = normal[_GREY, k, 0]
         for i in range(k + 1, _GREY):
@@ -596,8 +594,7 @@ def _covariance_by_parts(
                 left_out[a, b, s] = normal[a, b, 0]
                 for k in range(_STRETCH):
                     left_out[a, b, s] -= products[a, b, (s + k) % SECTORS]
-    for k in range(_BLUR_1, _X):
-        eliminate(left_out, k)
+    eliminate(left_out, range(_BLUR_1, _X))
     centres = np.empty((SECTORS, 2))
     mean_x = mean_y = 0.0
     count = 0

@@ -16,6 +16,8 @@ from detect.discs.placing import size_of_disc
 from detect.discs.rim import DIRECTIONS, best_circle
 from detect.settings import CircleSettings
 from lut import VoteTable
+from redetect.array_types import FloatArray
+from redetect.compiled import kernel
 from tests.detect.discs.test_rim import PLACES
 from tests.detect.painted_floor import LIGHT, PaintedFloor
 
@@ -109,12 +111,16 @@ def test_movement_leaves_a_disc_in_its_place_and_its_covariance_right(
     assert 0.1 < normalised < 2.0
 
 
+@kernel()
+def _eliminate_first(products: FloatArray, count: int) -> None:
+    eliminate(products, range(count))  # a range cannot be passed from outside
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(1, 7))
 def test_elimination_leaves_what_the_eliminated_do_not_explain(seed: int, eliminated: int) -> None:
     several = np.random.default_rng(seed).normal(size=(3, 30, 8))
     products = np.stack([rows.T @ rows for rows in several], axis=-1)
-    for k in range(eliminated):
-        eliminate(products, k)
+    _eliminate_first(products, eliminated)
     for rows, rest in zip(several, np.moveaxis(products, -1, 0), strict=True):
         first, later = rows[:, :eliminated], rows[:, eliminated:]
         left = later - first @ np.linalg.lstsq(first, later, rcond=None)[0]
