@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,15 +52,20 @@ _STEPS = 8
 _LARGEST_CHI2 = 4.0
 
 
-def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> tuple[FloatArray, float]:
+class Background(NamedTuple):
+    """A scanner's static background, beam by beam."""
+
+    # (readings,): a reading below this is of a new object; infinite if the beam sees nothing
+    near_m: FloatArray
+    quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
+
+
+def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
     """Learn the background of the beams from scans (N, readings) of the empty area.
 
     Readings without a return are 0, or `max_range_m` and more. The nearest object of a beam is at a
     low quantile of its readings: beams along an edge jump between near and far. Nearer readings are
     treated as passing objects.
-
-    Returns the range (readings,) below which a reading is of a new object (m), infinite if the beam
-    sees nothing; and the quantum of which all readings are whole multiples (m), 0 without readings.
     """
     if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
         raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
@@ -83,7 +89,7 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> tuple
     near = np.where(seen, quantile(ordered, _PASSING), 0.0)
     near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
     quantum_m = 1e-3 * float(np.gcd.reduce(ranges_mm[hit]))
-    return np.where(seen, np.maximum(near, 0.0), np.inf), quantum_m
+    return Background(np.where(seen, np.maximum(near, 0.0), np.inf), quantum_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +117,9 @@ def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> Fix
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
     direction = np.zeros((len(scanners), width, 2))
-    for i, (scanner, (near_m, _)) in enumerate(zip(scanners, backgrounds)):
-        near[i, : scanner.readings] = 1e3 * np.minimum(near_m, scanner.max_range_m)
+    for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
+        reach_m = np.minimum(background.near_m, scanner.max_range_m)
+        near[i, : scanner.readings] = 1e3 * reach_m
         angle = scanner.pose[2] + scanner.angles_rad
         direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return FixedScanners(
@@ -120,7 +127,7 @@ def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> Fix
         direction,
         np.stack([scanner.pose[:2] for scanner in scanners]),
         # Rounding adds an error that is uniform over a quantum.
-        np.sqrt([s.sigma_m**2 + q**2 / 12.0 for s, (_, q) in zip(scanners, backgrounds)]),
+        np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
         block_diag(*(scanner.covariance for scanner in scanners)),
     )
 
