@@ -63,7 +63,7 @@ from detect.discs.patch import (
     gather,
 )
 from detect.discs.rim import median
-from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
+from redetect.array_types import Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 #: Terms of the normal equations: light common to all pixels, light of each sector, the disc, and
@@ -397,35 +397,33 @@ def _eliminate_levels(
 @kernel(inline="always")
 def _weigh(levels: Levels, early: bool, noise: float) -> int:
     """Weight the sectors; returns how many count."""
-    contrast, variance, off_px = levels.contrast, levels.variance, levels.off_px
-    chosen, some = np.zeros(SECTORS, np.bool_), np.empty(SECTORS)
-    total = 0.0
+    variance, off_px, weight = levels.variance, levels.off_px, levels.weight
+    some, total = np.empty(SECTORS), 0.0
     for s in range(SECTORS):
-        total += contrast[s]
-        levels.weight[s] = 0.0
+        total += levels.contrast[s]
     sign = 1.0 if total > 0.0 else -1.0
     for s in range(SECTORS):
-        chosen[s] = sign * contrast[s] > 0.0
-        some[s] = sign * contrast[s]
-    least = _LEAST_CONTRAST * _median_of(some, chosen)
+        some[s] = sign * levels.contrast[s]
+        weight[s] = 1.0 if some[s] > 0.0 else 0.0
+    least = _LEAST_CONTRAST * _median_of(some, weight)
     for s in range(SECTORS):
-        chosen[s] = chosen[s] and sign * contrast[s] >= least
-    usual = max(_median_of(variance, chosen), noise * noise)
-    middle = _median_of(off_px, chosen)
+        weight[s] = weight[s] if some[s] >= least else 0.0
+    usual = max(_median_of(variance, weight), noise * noise)
+    middle = _median_of(off_px, weight)
     for s in range(SECTORS):
         some[s] = abs(off_px[s] - middle)
-    spread = max(1.4826 * _median_of(some, chosen), _LEAST_OFF_PX)
+    spread = max(1.4826 * _median_of(some, weight), _LEAST_OFF_PX)
     count = 0
     for s in range(SECTORS):
-        if chosen[s]:
+        if weight[s] > 0.0:
             far = off_px[s] / spread
             if early:
-                weight = 1.0 / (1.0 + (far / _FAR_EARLY) ** 2)
+                weight[s] = 1.0 / (1.0 + (far / _FAR_EARLY) ** 2)
             else:
-                weight = max(1.0 - (far / _FAR_OFF) ** 2, 0.0) ** 2
-            weight *= usual / max(variance[s], usual)
-            count += weight > _COUNTS
-            levels.weight[s] = weight / usual
+                weight[s] = max(1.0 - (far / _FAR_OFF) ** 2, 0.0) ** 2
+            weight[s] *= usual / max(variance[s], usual)
+            count += weight[s] > _COUNTS
+            weight[s] /= usual
     return count
 
 
@@ -435,7 +433,7 @@ def _trust(
     levels: Levels, noise: float,
 ) -> None:  # fmt: skip
     """Weight the pixels of the sectors that count by their residuals."""
-    usual = max(_median_of(levels.variance, levels.weight > 0.0), noise * noise)
+    usual = max(_median_of(levels.variance, levels.weight), noise * noise)
     per_limit = F32(1.0 / (_FAR_PIXEL**2 * usual))
     for s in range(SECTORS):
         if not levels.weight[s] > 0.0:
@@ -455,11 +453,11 @@ def _trust(
 
 
 @kernel()
-def _median_of(values: FloatArray, chosen: BoolArray) -> float:
-    """Median of the chosen values, 0 if there are none."""
+def _median_of(values: FloatArray, weight: FloatArray) -> float:
+    """Median of the values with a weight, 0 if there are none."""
     some, count = np.empty(len(values)), 0
     for k in range(len(values)):
-        if chosen[k]:
+        if weight[k] > 0.0:
             some[count] = values[k]
             count += 1
     return median(some[:count]) if count > 0 else 0.0

@@ -230,7 +230,11 @@ def glance(
 @kernel()
 def pairs_of_steps(grey: FloatArray) -> FloatArray:
     """Profiles as the network sees them: means of pairs of steps."""
-    return 0.5 * (grey[:, ::2] + grey[:, 1::2])
+    pairs = np.empty((len(grey), grey.shape[1] // 2))
+    for k in range(len(grey)):
+        for m in range(grey.shape[1] // 2):
+            pairs[k, m] = 0.5 * (grey[k, 2 * m] + grey[k, 2 * m + 1])
+    return pairs
 
 
 @kernel()
@@ -253,10 +257,14 @@ def _contrast(grey: FloatArray, sign: float, least_step: float) -> float:
 def _quality(grey: FloatArray) -> tuple[float, float]:
     """Between-class over total variance of the grey values inside and outside; mean outside."""
     inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
-    seen = np.isfinite(inside) & np.isfinite(outside)
-    inside, outside = inside[seen], outside[seen]
-    if len(inside) == 0:
+    count = 0
+    for k in range(DIRECTIONS):
+        if math.isfinite(inside[k]) and math.isfinite(outside[k]):
+            inside[count], outside[count] = inside[k], outside[k]
+            count += 1
+    if count == 0:
         return 0.0, 0.0
+    inside, outside = inside[:count], outside[:count]
     floor_grey = np.mean(outside)
     between = 0.25 * (np.mean(inside) - floor_grey) ** 2
     total = between + 0.5 * (np.var(inside) + np.var(outside))

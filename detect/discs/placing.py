@@ -99,7 +99,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
             for k, fit in enumerate(whole):
                 if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
                     nominal = Size(scene.radius, RADIUS_SIGMA * scene.radius)
-                    radii[k] = _radius_seen(fit, nominal)
+                    radii[k, 0], radii[k, 1] = _radius_seen(fit, nominal)
             parts, known = whole.copy(), radii.copy()
         elif stage == _LAST:
             known = radii  # those of partly hidden discs included
@@ -114,7 +114,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
                 whole[k] = fit
             elif stage == _PARTS:
                 parts[k] = fit
-                radii[k] = _radius_seen(fit, size)
+                radii[k, 0], radii[k, 1] = _radius_seen(fit, size)
             else:
                 last[k] = fit
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))

@@ -133,7 +133,9 @@ def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate,
     pitch, roll = _vote_for_tilt(lines, numbers)
     prior = math.radians(numbers.tilt_prior_deg)
     pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
-    count = int(np.count_nonzero(agrees))
+    count = 0
+    for agreeing in agrees:
+        count += int(agreeing)
     largest = max(abs(pitch), abs(roll))
     if count < numbers.least_lines or largest > math.radians(numbers.largest_tilt_deg):
         count = 0
