@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
-from detect.discs.quality import quality_of_centres as quality_of_centres
 from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError, FrameError
 from detect.grey_values import blank_margins, estimate_noise, steep_gradient
@@ -51,6 +49,8 @@ _NOISE_ROWS = 16
 #: Lowest gradient of an edge that votes, and the same in images full of edges, grey levels per
 #: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
+
+_numbers = lru_cache(maxsize=4)(camera_numbers)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def _by_rims(
     discs, log_odds = judgement.where(best), log_odds[best]
     scene = scene_of(image, camera, table, settings, noise)
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
-    seen_at = np.rint(project_floor_points(_kernel_camera(camera).numbers, floor_xy))
+    seen_at = np.rint(project_floor_points(_numbers(camera), floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
     in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
     order = np.flatnonzero(in_sight)
@@ -151,7 +151,9 @@ def _by_rims(
     return CircleDetections(
         pixels=seen_at[order].astype(np.int64),
         floor_xy=floor_xy,
-        covariance=refined_covariance(camera, floor_xy, fitted[order], settings),
+        covariance=refined_covariance(
+            camera, floor_xy, fitted[order], settings.systematic_px, settings.tilt_sigma_rad
+        ),
         quality=discs.quality[order],
         evidence=log_odds[order],
     )
@@ -179,9 +181,8 @@ def judged(
     `networks` defaults to the trained ones.
     """
     weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
-    step, numbers = max(weakest, _LEAST_STEP), _kernel_camera(camera).numbers
-    networks = networks or trained_networks()
-    return judge(image, candidates, settings.radius_m, step, numbers, networks)
+    step, networks = max(weakest, _LEAST_STEP), networks or trained_networks()
+    return judge(image, candidates, settings.radius_m, step, _numbers(camera), networks)
 
 
 def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
@@ -210,8 +211,8 @@ def scene_of(
     """The input of the fits in an image; parameters as for `detect_circles`."""
     # Optics blur equally in all directions. Where pixels are not square, as in single fields of
     # interlaced frames, the same blur spans fewer pixels along v.
-    ratio, numbers = camera.scale_y / camera.scale_x, _kernel_camera(camera).numbers
-    return Scene(image, table.floor_xy, settings.radius_m, least_noise(noise), ratio, numbers)
+    ratio, noise = camera.scale_y / camera.scale_x, least_noise(noise)
+    return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 
 def _by_quality(
@@ -271,38 +272,23 @@ def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, F
     (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
     the position (`Camera.floor_jacobian_published`).
     """
-    return pixel_positions(_kernel_camera(camera).published, floor_positions(camera), pixels)
-
-
-class _KernelCamera(NamedTuple):
-    """A camera in the form that kernels take."""
-
-    numbers: FloatArray
-    published: FloatArray  # `published_camera_numbers`
-    centre: FloatArray
-
-
-@lru_cache(maxsize=4)
-def _kernel_camera(camera: Camera) -> _KernelCamera:
-    centre = np.array(camera.centre, np.float64)
-    return _KernelCamera(camera_numbers(camera), published_camera_numbers(camera), centre)
+    return pixel_positions(published_camera_numbers(camera), floor_positions(camera), pixels)
 
 
 def refined_covariance(
-    camera: Camera, floor_xy: FloatArray, fitted: FloatArray, settings: CircleSettings
+    camera: Camera, floor_xy: FloatArray, fitted: FloatArray, sigma_px: float, tilt_sigma_rad: float
 ) -> FloatArray:
     """(N, 2, 2) covariances of refined positions (N, 2), square metres.
 
-    The covariances of the fits, plus `systematic_px` and `tilt_sigma_deg` of the settings.
+    The covariances of the fits, plus those due to standard deviations of pixels and of the tilt.
     """
-    kernel = _kernel_camera(camera)
     return np.asarray(
         refined_covariances(
-            kernel.numbers,
-            kernel.centre,
+            _numbers(camera),
+            np.array(camera.centre, np.float64),
             np.ascontiguousarray(floor_xy, np.float64),
             np.ascontiguousarray(fitted, np.float64),
-            settings.systematic_px**2,
-            settings.tilt_sigma_rad**2,
+            sigma_px**2,
+            tilt_sigma_rad**2,
         )
     )

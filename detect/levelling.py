@@ -30,7 +30,6 @@ from camera.model import inverse_2x2
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
 from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
-from detect.settings import CircleSettings
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, read_frames
 
@@ -109,7 +108,7 @@ def common_covariance(
     nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)
     if covariance is None:
-        return refined_covariance(camera, floor_xy, nothing, _wrong_by(unstated_px))
+        return refined_covariance(camera, floor_xy, nothing, unstated_px, tilt_sigma_rad=0.0)
     if len(floor_xy) == 0 or not covariance.any():
         return nothing
     jacobian = floor_by_parameters(camera, floor_xy)
@@ -120,11 +119,6 @@ def common_covariance(
         by_tilt = np.where(np.reshape(by_verticals, (-1, 1, 1)), by_tilt, 0.0)
         jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)
     return np.asarray(jacobian @ covariance @ jacobian.swapaxes(1, 2))
-
-
-@lru_cache(maxsize=4)
-def _wrong_by(pixels: float) -> CircleSettings:
-    return CircleSettings(systematic_px=pixels, tilt_sigma_deg=0.0)
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:

@@ -185,17 +185,3 @@ def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))
     return find_centres(grey, image.size, table.pixels, table.samples, table.groups, limits)
-
-
-def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, Float32Array]:
-    """(H, W) Otsu's quality of the outlines around every centre of a table, and their contrast.
-
-    The quality is the between-class variance of the grey values over the total variance, 0 where
-    the table has no centre; the contrast is the mean grey value of the inner outline minus that of
-    the outer. Raises FrameError if the image does not belong to the table.
-    """
-    centres = centres_of(image, table, Limits(quality=0.0))
-    u, v = centres.pixels.T
-    quality, contrast = np.zeros(image.shape), np.zeros(image.shape, np.float32)
-    quality[v, u], contrast[v, u] = centres.quality, centres.contrast
-    return quality, contrast

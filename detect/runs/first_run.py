@@ -1,7 +1,7 @@
 """Runs later stages of the detection on empty input, so that their kernels are compiled.
 
-A process compiles kernels in the order of a frame's path. Other processes call these functions at
-the same time, and store in the disk cache what the first one would have to compile later.
+A process compiles kernels in the order of a frame's path. Another process calls this function at
+the same time, and stores in the disk cache what the first one would have to compile later.
 """
 
 from __future__ import annotations
@@ -21,20 +21,15 @@ from detect.sources.interface import read_image
 from lut import cached_vote_table
 
 
-def place_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Locate zero discs in the first frame."""
+def place_and_level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
+    """Locate zero discs in the first frame, and estimate tilts from their outlines and of a run."""
     camera, settings = plan.camera, plan.circles
-    if camera and settings and settings.refine:
-        image = read_image(tasks[0].frame, camera, plan.working_folder)
-        table = cached_vote_table(camera, vote_shape(settings))
-        scene = scene_of(image, camera, table, settings, noise=0.0)
-        place_discs(scene, NO_CANDIDATES, working_space()[0])
-
-
-def level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Estimate the tilt of the first frame from the outlines of zero discs, and that of a run."""
-    camera, settings = plan.camera, plan.circles
-    if camera and settings and settings.refine and plan.levelling == "run":
-        image = read_image(tasks[0].frame, camera, plan.working_folder)
+    if not (camera and settings and settings.refine):
+        return
+    image = read_image(tasks[0].frame, camera, plan.working_folder)
+    table = cached_vote_table(camera, vote_shape(settings))
+    scene = scene_of(image, camera, table, settings, noise=0.0)
+    place_discs(scene, NO_CANDIDATES, working_space()[0])
+    if plan.levelling == "run":
         tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
         smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)

@@ -126,32 +126,6 @@ def strip_of(table: VerticalTable) -> Strip:
     )
 
 
-def line_response(image: GreyImage, table: VerticalTable, settings: LineSettings) -> Float32Array:
-    """(H, W) responses in an image (H, W) along the verticals of its camera's table.
-
-    The response at (v, c) is that in row v of the vertical that crosses the horizon at column c: in
-    [-1, 1], positive if the image is brighter on the right; 0 where it is not defined.
-    """
-    column = np.ascontiguousarray(table.column.T)
-    return _respond_everywhere(np.ascontiguousarray(image), column, line_filter(settings)).T
-
-
-@kernel()
-def _respond_everywhere(image: GreyImage, column: Float32Array, window: LineFilter) -> Float32Array:
-    width, height = column.shape
-    stripe = empty_stripe(window)
-    response = np.zeros((width, height), np.float32)
-    for c in range(width):
-        for top in range(0, height, STRIPE_ROWS):
-            for i in range(len(stripe.path)):
-                v = top - window.half_length + i
-                stripe.path[i] = column[c, v] if 0 <= v < height else np.nan
-            respond(image, top, stripe)
-            for v in range(top, min(top + STRIPE_ROWS, height)):
-                response[c, v] = stripe.response[v - top, stripe.middle]
-    return response
-
-
 @kernel()
 def empty_stripe(window: LineFilter) -> Stripe:
     """Buffers for the stripes of a filter."""

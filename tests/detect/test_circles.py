@@ -19,13 +19,13 @@ from detect.circles import (
     disc_shape,
     disc_table,
     published_positions,
-    quality_of_centres,
 )
 from detect.errors import DetectError, FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscTable, VoteTable, cached_disc_table, ring
 from tests.detect.line_scene import mirrored
 from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
+from tools.detector_maps import quality_of_centres
 from tools.evaluation.accuracy import Scene, measure_accuracy
 
 FloatArray = NDArray[np.float64]

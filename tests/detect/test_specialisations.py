@@ -20,7 +20,6 @@ from camera import Camera, parse_camera
 from detect.circles import CircleDetections, refined_covariance
 from detect.discs.positions import refined_covariances
 from detect.levelling import levelled
-from detect.settings import CircleSettings
 from lut import DiscShape, cached_disc_table, cached_vertical_table
 from redetect.landmarks import FrameTilt
 from tools.benchmark.material import scaled_camera
@@ -65,6 +64,6 @@ def test_cameras_that_are_read_and_handed_over_are_of_one_kind() -> None:
     compiled = []
     for camera in (read, handed_over):
         levelled(discs, camera, tilt)
-        refined_covariance(camera, FLOOR_XY, COVARIANCE, CircleSettings())
+        refined_covariance(camera, FLOOR_XY, COVARIANCE, 0.002, 0.005)
         compiled.append([set(kernel.signatures) for kernel in kernels])
     assert compiled[0] == compiled[1]

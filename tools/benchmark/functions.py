@@ -10,7 +10,6 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
-from detect.discs.quality import quality_of_centres
 from detect.grey_values import estimate_noise
 from detect.levelling import levelled
 from detect.line_settings import DEFAULT as LINES_DEFAULT
@@ -18,9 +17,9 @@ from detect.lines import detect_lines
 from detect.options import All, Circles, Lines
 from detect.runs.frame import tilt_of_lines
 from detect.settings import PUBLISHED, REPORT, CircleSettings
-from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from tools.benchmark.material import Picture
+from tools.detector_maps import line_response, quality_of_centres
 
 #: The function with which all others are compared.
 DECODING = "decoding"

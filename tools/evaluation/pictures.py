@@ -14,7 +14,6 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import detect_circles, disc_shape, disc_table
-from detect.discs.quality import quality_of_centres
 from detect.drawing.frame import track_pixels
 from detect.line_settings import LineSettings
 from detect.lines import detect_lines
@@ -24,7 +23,6 @@ from detect.seen import circle_on_floor, summed_steps
 from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
-from detect.verticals.response import line_response
 from lut import cached_disc_table, cached_vertical_table
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import read_building
@@ -33,6 +31,7 @@ from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply
+from tools.detector_maps import line_response, quality_of_centres
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.maps import read_truth
 from tools.evaluation.tables import picture

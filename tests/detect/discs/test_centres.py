@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from camera import Camera, parse_camera
 from detect.circles import detect_circles, disc_shape
-from detect.discs.quality import Limits, centres_of, least_part_quality, quality_of_centres
+from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table, ring
 from tests.camera.strategies import cameras
 from tests.reference.centres import PlainOutlines, plain_best_centres, plain_outlines, plain_quality
 from tools.benchmark.material import scaled_camera
+from tools.detector_maps import quality_of_centres
 from tools.published_camera import PUBLISHED_CAM
 
 GreyImage = NDArray[np.uint8]

@@ -13,7 +13,6 @@ from detect.circles import refined_covariance
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
 from detect.seen import image_positions
-from detect.settings import CircleSettings
 from lut import VoteTable
 from tests.detect.discs.single_fits import fit_discs
 from tests.detect.painted_floor import PaintedFloor
@@ -108,7 +107,6 @@ def test_refined_covariance_is_the_sum(
     level.
     """
     camera = replace(published_camera, tangential=tangential)
-    settings = CircleSettings(systematic_px=0.02, tilt_sigma_deg=0.4)
     places = np.array(PLACES)
     fitted = np.random.default_rng(1).normal(0.0, 1e-3, (len(places), 2, 2))
     fitted = fitted @ fitted.swapaxes(-1, -2)
@@ -121,7 +119,7 @@ def test_refined_covariance_is_the_sum(
     tilt = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=-1) / (2.0 * step)
     expected = fitted + 0.02**2 * jacobian @ jacobian.swapaxes(-1, -2)
     expected += np.radians(0.4) ** 2 * tilt @ tilt.swapaxes(-1, -2)
-    found = refined_covariance(camera, places, fitted, settings)
+    found = refined_covariance(camera, places, fitted, 0.02, np.radians(0.4))
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

@@ -13,13 +13,13 @@ from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.sources.interface import decode_gray
 from detect.verticals.refinement import Crossings, newton_step, step_filters
-from detect.verticals.response import line_response
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable, build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import judge_tracks, line_tracks, start_response
 from tests.reference import verticals as reference
+from tools.detector_maps import line_response
 
 DEMO = Path(__file__).parents[3] / "images" / "e"
 CAMERA = pinhole(200, 130, 150.0, pitch_deg=12.0, roll_deg=2.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))

@@ -11,7 +11,6 @@ from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.verticals import starts
-from detect.verticals.response import line_response
 from detect.verticals.starts import LineStarts, start_band
 from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
@@ -23,6 +22,7 @@ from tests.detect.verticals.stages import (
     start_response,
     tracks_again,
 )
+from tools.detector_maps import line_response
 
 CAMERA = pinhole(96, 64, 110.0)
 TABLE = build_vertical_table(CAMERA)
