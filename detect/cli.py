@@ -83,7 +83,6 @@ PROGRAM = Program(
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-
     given = sys.argv[1:] if arguments is None else arguments
     code = exit_code_of(lambda: PROGRAM.run(given, parsed, carry_out))
     if code == EXIT_INTERRUPTED and arguments is None:
@@ -103,7 +102,7 @@ def carry_out(command: object) -> int:
 
 def parsed(arguments: Sequence[str]) -> Any:
     """Parse a command line; exits after `--help` and on errors."""
-    arguments = _with_all_varied(_with_radius_found(arguments))
+    arguments = _with_radius_found(arguments)
     deciding = ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in ("--preset", "--settings"):  # they set the other flags' defaults
         deciding.add_argument(flag, nargs="?", default="", const="")
@@ -134,11 +133,3 @@ def _with_radius_found(arguments: Sequence[str]) -> list[str]:
     parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
     given, rest = parser.parse_known_args(arguments)
     return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)
-
-
-def _with_all_varied(arguments: Sequence[str]) -> list[str]:
-    """The command line with the values of all `--vary` after one: tyro ignores all but the last."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--vary", nargs="*", action="extend", default=[])
-    given, rest = parser.parse_known_args(arguments)
-    return [*rest, "--vary", *given.vary] if given.vary else list(arguments)

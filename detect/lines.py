@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import pairwise
 
 import numpy as np
 
@@ -49,16 +48,9 @@ class LineDetections:
     lines: Lines  # the leftmost is the first, here and elsewhere
     tracks: LineTracks
     judged: Judgement  # lines through all tracks, and their fates
-    sharpness: float  # median sharpness of the edges (`detect.verticals.blur.median_sharpness`)
 
     def __len__(self) -> int:
         return len(self.lines.alpha_rad)
-
-    @cached_property
-    def members(self) -> tuple[tuple[int, ...], ...]:
-        """The tracks of each line, the strongest first, which determines the line's ends."""
-        own = self.lines.members.tolist()
-        return tuple(tuple(own[a:b]) for a, b in pairwise(self.lines.bounds.tolist()))
 
     @property
     def tilt(self) -> TiltEstimate | None:
@@ -136,7 +128,7 @@ def detect_lines(
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
         judged = judged._replace(tilt=error)
     lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
-    return LineDetections(lines, tracks, judged, sharpness)
+    return LineDetections(lines, tracks, judged)
 
 
 def carry_ids(

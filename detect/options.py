@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 
 from detect.errors import CompareError, DetectError
 from detect.line_settings import LineSettings
@@ -386,7 +386,7 @@ class Tune(SomeFramesFlags):
 
     #: Parameters of `detect circles` and their values: NAME=FROM:TO:STEP, both ends included, or
     #: NAME=VALUES with commas between them.
-    vary: tuple[str, ...] = ()
+    vary: UseAppendAction[tuple[tuple[str, ...], ...]] = ()
     serve: bool = False  #: Serve a page for tuning the settings of discs, until Ctrl-C.
     port: Annotated[int, whole(0, 65535)] = 0  #: Port of the page; 0: any free port.
     settings: MaybePath = None  #: JSON file with the values that are not varied.

@@ -45,10 +45,10 @@ def perform(options: Tune) -> int:
     if options.serve and options.vary:
         raise DetectError("--serve and --vary: expected one of them")
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
-    named = [_name_and_values(word) for word in options.vary]
-    varied = dict(named)
-    if len(varied) < len(named):
-        raise DetectError(f"--vary {' '.join(options.vary)}: expected each parameter once")
+    words = list(chain.from_iterable(options.vary))
+    varied = dict(map(_name_and_values, words))
+    if len(varied) < len(words):
+        raise DetectError(f"--vary {' '.join(words)}: expected each parameter once")
     grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
 

@@ -206,12 +206,12 @@ def test_close_edges_are_joined_to_one_row() -> None:
     apart = detect_lines(render(camera, bar, grey=80.0), table, replace(DEFAULT, join_px=1.0))
     joined = detect_lines(render(camera, bar, grey=80.0), table)
     assert (len(apart), len(joined)) == (2, 1)
-    assert len(joined.members[0]) == 2
-    assert sorted(joined.fate[t] for t in joined.members[0]) == [ACCEPTED, JOINED]
-    share = joined.judged.evidence[list(joined.members[0])]
-    share = share / share.sum()
-    order = np.argsort(-joined.judged.evidence[list(joined.members[0])])
-    sides = apart.lines.alpha_rad[np.argsort(-apart.judged.evidence[[m[0] for m in apart.members]])]
+    assert joined.lines.bounds.tolist() == [0, 2]
+    assert sorted(joined.fate[t] for t in joined.lines.members) == [ACCEPTED, JOINED]
+    evidence = joined.judged.evidence[joined.lines.members]
+    share, order = evidence / evidence.sum(), np.argsort(-evidence)
+    assert apart.lines.bounds.tolist() == [0, 1, 2]
+    sides = apart.lines.alpha_rad[np.argsort(-apart.judged.evidence[apart.lines.members])]
     mean = share[order] @ sides
     assert joined.lines.alpha_rad[0] == pytest.approx(mean, abs=1e-6)
     spread = share[order] @ (apart.lines.sigma_rad**2 + (sides - mean) ** 2)
@@ -263,7 +263,7 @@ def test_the_rows_that_the_report_prints(shared_data: Path) -> None:
         assert abs(row.alpha - own.alpha) <= 0.5 * row.sigma
         assert own.sigma == pytest.approx(row.sigma, rel=0.15)
         # No single printed line has more than 0.003.
-        assert (row.sigma > 0.005) == (len(found.members[nearest]) > 1)
+        assert (row.sigma > 0.005) == (np.diff(found.lines.bounds)[nearest] > 1)
 
 
 def _end_rows(line: LineLandmark, camera: Camera) -> np.ndarray:
@@ -337,7 +337,7 @@ def test_drawn_tracks_name_their_fates() -> None:
     found = detect_lines(image, TABLE)
     picture = draw_tracks(image, TABLE, found)
     assert picture.shape[0] > 160
-    track = found.members[0][0]
+    track = found.lines.members[0]
     pixels = np.rint(track_pixels(found.tracks, TABLE, track)).astype(int)
     assert np.all(picture[pixels[:, 1], pixels[:, 0]] == [60, 220, 60])
 

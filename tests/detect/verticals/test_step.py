@@ -24,7 +24,7 @@ def only_line(
     """Detection, its error and its predicted standard deviation due to noise, in pixels."""
     found = detect_lines(image, table, SETTINGS)
     assert len(found) == 1
-    pixel = found.judged.fits.pixel_rad[found.members[0][0]]
+    pixel = found.judged.fits.pixel_rad[found.lines.members[0]]
     noise_px = np.sqrt((found.lines.sigma_rad[0] / pixel) ** 2 - SETTINGS.sigma_px**2)
     return found, (found.lines.alpha_rad[0] - bearing_rad) / pixel, noise_px
 
@@ -91,7 +91,7 @@ def test_scatter_under_noise_is_the_predicted_one(
         found, error, sigma = only_line(image, table, bearing)
         errors.append(error)
         predicted.append(sigma)
-        track = found.members[0][0]
+        track = found.lines.members[0]
         leans.append(
             found.judged.fits.line[track, 1] / np.sqrt(found.judged.fits.covariance[track, 1, 1])
         )
@@ -105,7 +105,7 @@ def test_uncertainty_of_a_row_has_a_floor_of_sigma_px() -> None:
     camera = pinhole(120, 90)
     table = build_vertical_table(camera)
     found, _, noise_px = only_line(render(camera, [Edge(0.01, 150.0)]), table, 0.01)
-    track = found.members[0][0]
+    track = found.lines.members[0]
     pixel, covariance = found.judged.fits.pixel_rad[track], found.judged.fits.covariance[track]
     assert found.lines.sigma_rad[0] >= DEFAULT.sigma_px * pixel
     # The known lean of verticals makes a bearing more certain than the track's own.
