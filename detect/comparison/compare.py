@@ -71,7 +71,7 @@ def compare_with_file(
     *,
     sight: Sight | None = None,
     unlisted: Path | None = None,
-    names: tuple[str, str] | None = None,
+    names: tuple[str, str],
 ) -> Comparison:
     """Compare discs, or lines, with those of a reference file.
 
@@ -79,7 +79,6 @@ def compare_with_file(
     the reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read,
     and CompareError if all rows of the reference are of the other kind.
     """
-    names = names or (str(reference), "detected")
     wanted = read_kind(kind, reference)
 
     def rows(name: str, path: Path | None) -> list[Frame] | None:

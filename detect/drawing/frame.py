@@ -32,7 +32,7 @@ from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
-from redetect.landmarks import CircleLandmark, LineLandmark, MarkerLandmark, circle_arrays
+from redetect.landmarks import LineLandmark, MarkerLandmark, circle_arrays, wrap_angle
 from redetect.plane import ellipses
 
 _POINTS = 33
@@ -131,6 +131,7 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 def _draw_discs(
     canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool
 ) -> None:
+    """Missed reference discs; detected ones with their two outlines and a label above."""
     view = match.view
     assert view is not None
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
@@ -140,8 +141,18 @@ def _draw_discs(
     drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
     drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.matched, apart)]
-    for row, text, colour in drawn:
-        _outline_disc(canvas, view, row, settings, f"{row.quality:.2f}{text}", colour)
+    for row, text, edge_colour in drawn:
+        centre_xy = np.array([row.px, row.py])
+        for radius_m, colour in (
+            (settings.inner_radius_m, _OUTLINE_COLOUR),
+            (settings.radius_m, edge_colour),
+            (settings.outer_radius_m, _OUTLINE_COLOUR),
+        ):
+            outline = view.detected_px(circle_on_floor(centre_xy, radius_m))
+            draw_curve(canvas, outline, colour, closed=True)
+        top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
+        label = f"{row.quality:.2f}{text}"
+        draw_text(canvas, label, top, _TEXT_COLOUR, shift=(-14, -3))
 
 
 def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
@@ -150,7 +161,7 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
     for wanted, row in zip(match.wanted, match.matched):
-        error = (row.alpha - wanted.alpha + np.pi) % (2.0 * np.pi) - np.pi
+        error = float(wrap_angle(row.alpha - wanted.alpha))
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))
     rows = [row for row, _, _ in drawn]
@@ -179,27 +190,6 @@ def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark]) -> None:
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
     fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
     return f"{len(match.detected)} {what}{fate}"
-
-
-def _outline_disc(
-    canvas: ByteArray,
-    view: Sight,
-    row: CircleLandmark,
-    settings: CircleSettings,
-    text: str,
-    edge_colour: Colour,
-) -> None:
-    """Draw a detected disc's edge and its two outlines, with a label above."""
-    centre_xy = np.array([row.px, row.py])
-    for radius, colour in (
-        (settings.inner_radius_m, _OUTLINE_COLOUR),
-        (settings.radius_m, edge_colour),
-        (settings.outer_radius_m, _OUTLINE_COLOUR),
-    ):
-        edge = view.detected_px(circle_on_floor(centre_xy, radius))
-        draw_curve(canvas, edge, colour, closed=True)
-    top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
-    draw_text(canvas, text, top, _TEXT_COLOUR, shift=(-14, -3))
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:

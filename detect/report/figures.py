@@ -160,8 +160,7 @@ def _dots(axes: Axes, at: FloatArray, values: FloatArray, colour: str) -> None:
 
 
 def _finish(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+    axes.set(xlabel=x, ylabel=y)
     axes.grid(alpha=0.25, lw=0.6)
 
 

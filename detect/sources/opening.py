@@ -40,7 +40,7 @@ def open_run(
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read, or there are several calibrations.
     """
-    run = _open(name, camera_path, options or SourceOptions(), posed=True)
+    run = open_source(name, camera_path, options, posed=True)
     if isinstance(run, Run):
         return run
     raise DetectError(
@@ -50,23 +50,17 @@ def open_run(
 
 
 def open_source(
-    name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
+    name: Path,
+    camera_path: Path | None = None,
+    options: SourceOptions | None = None,
+    *,
+    posed: bool = False,
 ) -> ImageRun:
-    """Open a source with or without a calibration; without one the result is not a `Run`."""
-    return _open(name, camera_path, options or SourceOptions(), posed=False)
+    """Open a source with or without a calibration; without one the result is not a `Run`.
 
-
-def demand_recording(name: Path) -> None:
-    """Raise DetectError for a live camera, since existing rows do not belong to its images."""
-    if _LIVE.fullmatch(str(name)):
-        raise DetectError(
-            f"{name}: its images are not those of the rows any more: expected a recording: a "
-            "folder or pattern of images, a video or a bag"
-        )
-
-
-def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed: bool) -> ImageRun:
-    """Open any source, with its calibration if there is one (if `posed`, one with a pose)."""
+    Parameters and errors as for `open_run`. If `posed`, a calibration without a pose is ignored.
+    """
+    options = options or SourceOptions()
     source = _source(name, options)
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames: Frames
@@ -81,6 +75,15 @@ def _open(name: Path, camera_path: Path | None, options: SourceOptions, *, posed
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     return run if camera is None else run.calibrated(camera)
+
+
+def demand_recording(name: Path) -> None:
+    """Raise DetectError for a live camera, since existing rows do not belong to its images."""
+    if _LIVE.fullmatch(str(name)):
+        raise DetectError(
+            f"{name}: its images are not those of the rows any more: expected a recording: a "
+            "folder or pattern of images, a video or a bag"
+        )
 
 
 def _own_odometry(folder: Path) -> Path | None:
