@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import atexit
 import os
-import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +44,7 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
 from detect.terminal import show_announcements
-from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but, exit_code_of
+from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but
 from redetect.storage.messages import is_quiet
 
 #: Flags that only `--help-all` shows.
@@ -63,7 +62,50 @@ EXPERT: dict[type, frozenset[str]] = {
     CompareOptions: all_but(CompareOptions, "only_identified"),
 }  # fmt: skip
 
-PROGRAM = Program(
+
+def _with_radius_found(arguments: Sequence[str]) -> list[str]:
+    """The command line with `--find-radius` instead of a radius of `auto`."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
+    given, rest = parser.parse_known_args(arguments)
+    return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)
+
+
+class DetectProgram(Program):
+    """The program: presets and settings files decide the defaults of flags."""
+
+    def carry_out(self, command: Any) -> int:
+        """Carry out a command; returns the exit code."""
+        if not is_quiet():
+            show_announcements()
+        return super().carry_out(command)
+
+    def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
+        """Parse a command line; exits after `--help` and on errors."""
+        arguments = _with_radius_found(arguments)
+        deciding = ArgumentParser(add_help=False, allow_abbrev=False)
+        for flag in ("--preset", "--settings"):
+            deciding.add_argument(flag, nargs="?", default="", const="")
+        given = deciding.parse_known_args(arguments)[0]
+        preset, file = given.preset, given.settings
+        values = SettingsFile(
+            CIRCLE_PRESETS.get(preset, CircleSettings()), LINE_PRESETS.get(preset, LineSettings())
+        )
+        if file and not {"-h", "--help", "--help-all"} & set(arguments):
+            if preset:
+                raise DetectError("--preset and --settings: expected one of them")
+            values = read_settings(Path(file))
+        known = (
+            Circles(run=MISSING, parameters=values.circles),
+            Lines(run=MISSING, parameters=values.lines),
+            Markers(run=MISSING, parameters=values.markers),
+            All(run=MISSING, circles=values.circles, lines=values.lines),
+            Explain(image=MISSING, parameters=values.circles),
+        )
+        return super().parsed(arguments, (*known, *defaults))
+
+
+PROGRAM = DetectProgram(
     "detect",
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
@@ -79,57 +121,15 @@ PROGRAM = Program(
     },
     EXPERT,
 )
+parsed = PROGRAM.parsed
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
-    code = exit_code_of(lambda: PROGRAM.run(given, parsed, carry_out))
+    code = PROGRAM.main(arguments)
     if code == EXIT_INTERRUPTED and arguments is None:
         # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
         # it was caught.
         atexit._run_exitfuncs()
         os._exit(code)
     return code
-
-
-def carry_out(command: object) -> int:
-    """Carry out a command; returns the exit code."""
-    if not is_quiet():
-        show_announcements()
-    return PROGRAM.carry_out(command)
-
-
-def parsed(arguments: Sequence[str]) -> Any:
-    """Parse a command line; exits after `--help` and on errors."""
-    arguments = _with_radius_found(arguments)
-    deciding = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--preset", "--settings"):  # they set the other flags' defaults
-        deciding.add_argument(flag, nargs="?", default="", const="")
-    given = deciding.parse_known_args(arguments)[0]
-    preset, file = given.preset, given.settings
-    values = SettingsFile(
-        CIRCLE_PRESETS.get(preset, CircleSettings()), LINE_PRESETS.get(preset, LineSettings())
-    )
-    if file and not {"-h", "--help", "--help-all"} & set(arguments):
-        if preset:
-            raise DetectError("--preset and --settings: expected one of them")
-        values = read_settings(Path(file))
-    return PROGRAM.parsed(
-        arguments,
-        (
-            Circles(run=MISSING, parameters=values.circles),
-            Lines(run=MISSING, parameters=values.lines),
-            Markers(run=MISSING, parameters=values.markers),
-            All(run=MISSING, circles=values.circles, lines=values.lines),
-            Explain(image=MISSING, parameters=values.circles),
-        ),
-    )
-
-
-def _with_radius_found(arguments: Sequence[str]) -> list[str]:
-    """The command line with `--find-radius` instead of a radius of `auto`."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
-    given, rest = parser.parse_known_args(arguments)
-    return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)

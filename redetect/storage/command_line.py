@@ -140,27 +140,21 @@ class Program:
         return {kind.__name__.lower(): kind for kind in self.performed_by}
 
     def main(self, arguments: list[str] | None = None) -> int:
-        """Run the command line; returns the exit code."""
+        """Run the command line, quietly if requested; returns the exit code."""
         given = sys.argv[1:] if arguments is None else arguments
-        return exit_code_of(lambda: self.run(given, self.parsed, self.carry_out))
+        return exit_code_of(lambda: self._run(given))
 
-    def run(
-        self,
-        arguments: Sequence[str],
-        parse: Callable[[Sequence[str]], Any],
-        carry_out: Callable[[Any], int],
-    ) -> int:
-        """Parse and execute a command line, quietly if requested; returns the exit code."""
+    def _run(self, arguments: Sequence[str]) -> int:
         # Matrices are small or sparse here: BLAS threads would cost more time than they save.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         words = [word for word in arguments if word not in _QUIET]
-        command = parse(words)
+        command = self.parsed(words)
         if getattr(command, "json", None) == _STANDARD_OUTPUT:
-            return _with_json_alone(command, carry_out)
+            return _with_json_alone(command, self.carry_out)
         if len(words) == len(arguments):
-            return carry_out(command)
+            return self.carry_out(command)
         with _quietly():
-            return carry_out(command)
+            return self.carry_out(command)
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help`, `--version` and on errors.

@@ -44,7 +44,7 @@ def test_what_an_interrupt_turned_into(
             raise other("with an exception set") from None
         return 0
 
-    monkeypatch.setattr(cli, "carry_out", disguise)
+    monkeypatch.setattr(cli.DetectProgram, "carry_out", staticmethod(disguise))
     before = signal.getsignal(signal.SIGINT)
     assert main(["compare", str(tmp_path)]) == 130
     assert capsys.readouterr().err == "interrupted\n"
@@ -67,7 +67,7 @@ def test_a_swallowed_interrupt_comes_back_after_the_frame(
                 advance()
         return 0
 
-    monkeypatch.setattr(cli, "carry_out", swallow)
+    monkeypatch.setattr(cli.DetectProgram, "carry_out", staticmethod(swallow))
     assert main(["compare", str(tmp_path)]) == 130
     assert frames == [0, 1, 2]
     assert main(["compare", str(tmp_path)]) == 130  # the note of one run is none of the next
@@ -153,7 +153,7 @@ def test_nowhere_to_keep_kernels(
         return 0
 
     monkeypatch.setattr(FunctionCache._impl_class, "_locator_classes", [])
-    monkeypatch.setattr(cli, "carry_out", compile_one)
+    monkeypatch.setattr(cli.DetectProgram, "carry_out", staticmethod(compile_one))
     assert main(["compare", str(tmp_path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "NUMBA_CACHE_DIR" in line
@@ -165,7 +165,7 @@ def test_an_error_of_the_program_is_no_interrupt(
     def slip(_: object) -> int:
         raise SystemError("a slip")
 
-    monkeypatch.setattr(cli, "carry_out", slip)
+    monkeypatch.setattr(cli.DetectProgram, "carry_out", staticmethod(slip))
     with pytest.raises(SystemError, match="a slip"):
         main(["compare", str(tmp_path)])
 

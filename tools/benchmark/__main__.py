@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from detect import __version__
-from detect.cli import carry_out
+from detect.cli import PROGRAM
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from redetect.array_types import ByteArray
@@ -158,7 +158,7 @@ class Benchmark(Study):
 
 def perform(command: f.Command) -> None:
     """Execute a command like ``detect``, but silently."""
-    run_quietly("detect", lambda: carry_out(command))
+    run_quietly("detect", lambda: PROGRAM.carry_out(command))
 
 
 def _on_each(function: f.Function, pictures: Sequence[Picture]) -> Callable[[int], object]:
