@@ -18,7 +18,7 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
-from detect.discs.candidates import alone_published, local_maxima, suppress_neighbours
+from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, least_noise, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
@@ -182,8 +182,8 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
 def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
     """Indices of the candidates that are discs, without those too close to a better one."""
     taken = np.flatnonzero(log_odds >= settings.evidence)
-    places = judgement.floor_xy[taken]
-    return taken[suppress_neighbours(places, log_odds[taken], settings.separation_m)]
+    best_first = np.argsort(-log_odds[taken], kind="stable")
+    return taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
 
 
 def scene_of(

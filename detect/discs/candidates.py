@@ -39,17 +39,6 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
     return maxima
 
 
-def suppress_neighbours(floor_xy: FloatArray, score: FloatArray, separation: float) -> BoolArray:
-    """(N,) mask of floor positions (N, 2) to keep so that no two are closer than `separation` (m).
-
-    Those with the highest scores are kept; of equal scores the first.
-    """
-    order = np.argsort(-score, kind="stable")
-    kept = np.zeros(len(score), np.bool_)
-    kept[apart(np.ascontiguousarray(floor_xy, np.float64), order, separation)] = True
-    return kept
-
-
 @kernel()
 def apart(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
     """Indices, in this order, of positions at least `separation` away from all kept before."""

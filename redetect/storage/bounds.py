@@ -65,19 +65,16 @@ def whole(least: int, most: int | None = None) -> Bounds:
 FINITE = Bounds("a finite number", lambda x: -inf < x < inf)
 ABOVE_0 = Bounds("above 0", lambda x: 0.0 < x < inf)
 NOT_NEGATIVE = Bounds("0 or more", lambda x: 0.0 <= x < inf)
-#: Infinity means "no limit".
-LIMIT = Bounds("above 0", lambda x: x > 0.0)
-LIMIT_OR_0 = Bounds("0 or more", lambda x: x >= 0.0)
 SHARE = from_to(0.0, 1.0)
-SHARE_ABOVE_0 = Bounds("above 0, at most 1", lambda x: 0.0 < x <= 1.0)
 PROBABILITY = inside(0.0, 1.0)
 
 #: Types of fields for `demand_fields`.
 Positive = Annotated[float, ABOVE_0]
 NotNegative = Annotated[float, NOT_NEGATIVE]
-Limit = Annotated[float, LIMIT]
-LimitOr0 = Annotated[float, LIMIT_OR_0]
-ShareAbove0 = Annotated[float, SHARE_ABOVE_0]
+#: Infinity means "no limit".
+Limit = Annotated[float, Bounds("above 0", lambda x: x > 0.0)]
+LimitOr0 = Annotated[float, Bounds("0 or more", lambda x: x >= 0.0)]
+ShareAbove0 = Annotated[float, Bounds("above 0, at most 1", lambda x: 0.0 < x <= 1.0)]
 Share = Annotated[float, SHARE]
 
 
