@@ -17,6 +17,7 @@ import io
 import logging
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -99,14 +100,12 @@ def _read(path: Path, kind: type[Table]) -> Table | None:
     if content is None:
         return None
     digest, payload = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-    try:
+    with suppress(Exception):  # a damaged or forged archive can raise anything
         if _digest(path, payload) == digest:
             with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
                 found: dict[str, Any] = {name: arrays[name] for name in arrays.files}
             # Numbers were stored as arrays without dimensions.
             return kind(**{name: a if a.ndim else a.item() for name, a in found.items()})
-    except Exception:
-        pass  # a damaged or forged archive can raise anything
     _log.info("%s: is damaged: computing it again", path)
     return None
 
@@ -140,12 +139,10 @@ def _keep(path: Path, table: DiscTable | VerticalTable | VoteTable) -> None:
     # NumPy before 2.1 would store `allow_pickle` as an array; all arrays are numeric.
     np.savez(buffer, **{name: getattr(table, name) for name in names})
     payload = buffer.getvalue()
-    try:
+    with suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with write_whole(path, overwrite=True) as stream:
             stream.write(_digest(path, payload))
             stream.write(payload)
         # By default, some users' files are writable by their group.
         path.chmod(0o600)
-    except OSError:
-        pass

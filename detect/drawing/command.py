@@ -16,14 +16,13 @@ from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.drawing.inputs import RunRows, open_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
-from detect.runs.frame import detect_batch
+from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
 from detect.sources.video import quiet_opencv
 from detect.terminal import progress_bar, report_failures
-from lut import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.storage import demand_place, write_bytes
 
@@ -83,7 +82,7 @@ def draw_run(
             if plan is not None:
                 (found,) = detect_batch([FrameTask(frame)], plan)
                 if found.lines is not None and plan.camera is not None:
-                    picture = draw_tracks(image, cached_vertical_table(plan.camera), found.lines)
+                    picture = draw_tracks(image, vertical_table_of(plan.camera), found.lines)
                 if found.markers is not None:
                     picture = draw_candidates(picture, found.markers)
             if folder is not None:

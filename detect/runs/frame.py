@@ -112,10 +112,14 @@ def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Sea
     return leaning, disc_table(leaning, circles)
 
 
+#: The table of a camera's verticals, the same object at every call: more is prepared for it.
+vertical_table_of = lru_cache(maxsize=16)(cached_vertical_table)
+
+
 def prepare(plan: FramePlan) -> None:
     """Make the tables that a plan needs, or load them from the cache."""
     if plan.camera and plan.lines:
-        cached_vertical_table(plan.camera)
+        vertical_table_of(plan.camera)
     if plan.camera and plan.circles:
         search_of(plan.camera, plan.circles, plan.lean)
 
@@ -128,7 +132,7 @@ def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetec
     not affect the others. The images of all tasks are in memory at once.
     """
     batch = [FrameDetections() for _ in tasks]
-    verticals = cached_vertical_table(plan.camera) if plan.camera and plan.lines else None
+    verticals = vertical_table_of(plan.camera) if plan.camera and plan.lines else None
     paths = [_path(task, found, plan, verticals) for task, found in zip(tasks, batch)]
     with interrupts_deferred():  # an interrupt while Numba unpacks tuples would crash the process
         for _ in zip_longest(*paths):  # advances each path to its next `yield` in turn

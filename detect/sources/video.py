@@ -41,8 +41,8 @@ class VideoFile(Source):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with _opened(self.path) as capture:
             per_second = capture.get(cv2.CAP_PROP_FPS)
-            number, last_s = 0, -math.inf
-            while True:
+            last_s = -math.inf
+            for number in itertools.count():
                 there, pixels = capture.read()
                 if not there:
                     break
@@ -52,7 +52,7 @@ class VideoFile(Source):
                 prefix = numbered_prefix(self.path.stem, number)
                 gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
                 yield RunFrame(still(prefix), None, gray, time_s)
-                number, last_s = number + 1, time_s
+                last_s = time_s
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import lut.cache
+from detect.line_settings import LineSettings
 from detect.runs import frame as rows_module
 from detect.runs.frame import FrameDetections, detect_batch, rows_of_frames
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, KnownOfFrame
 from detect.runs.stream import Journal, task_digest
-from detect.settings import PUBLISHED
+from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_run
 from redetect.landmarks import FrameTilt
@@ -63,6 +66,23 @@ def test_no_more_images_are_in_memory_than_agreed(
     monkeypatch.setattr(rows_module, "PIXELS_AT_ONCE", 5 * plan.camera.width * plan.camera.height)
     rows_of_frames(tasks, plan)
     assert sizes == [5, 5, 2]
+
+
+def test_tables_are_loaded_once(
+    tasks_and_plan: tuple[list[FrameTask], FramePlan], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tasks, plan = tasks_and_plan
+    plan = replace(plan, lines=LineSettings(), circles=CircleSettings())
+    first = detect_batch(tasks[:1], plan)
+
+    def loaded_again(*_: Any, **__: Any) -> bytes:
+        raise AssertionError
+
+    monkeypatch.setattr(lut.cache, "read_bounded", loaded_again)
+    again = detect_batch(tasks[:1], plan)
+    assert again[0].lines is not None
+    assert first[0].lines is not None
+    assert again[0].lines.landmarks() == first[0].lines.landmarks()
 
 
 def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
