@@ -75,14 +75,14 @@ def perform(command: Export) -> int:
         demand_place(path, overwrite=command.force)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
+            written = f"{len(tables[table])} rows"
             if to == "mcap":
-                print(f"{path}: {write_mcap(stream, tables, str(file))} messages")
-                continue
-            if to == "csv":
+                written = f"{write_mcap(stream, tables, str(file))} messages"
+            elif to == "csv":
                 write_csv(stream, table, tables[table])
             else:
                 write_parquet(stream, table, tables[table], file.name)
-        print(f"{path}: {len(tables[table])} rows")
+        print(f"{path}: {written}")
     return 0
 
 

@@ -31,7 +31,7 @@ from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_param
 from detect.circles import CircleDetections, refined_covariance
 from detect.seen import level_seen
 from redetect.array_types import BoolArray, FloatArray
-from redetect.landmarks import FrameTilt, read_frames
+from redetect.landmarks import FrameTilt, circle_arrays, read_frames
 
 #: Step of central differences of levelled positions, metres and radians.
 _STEP = 1e-6
@@ -135,13 +135,13 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
 
 def sentence_of(circles: Path, camera: Camera) -> str:
     """A sentence on the calibration's share of the variances in a file's rows."""
-    shares = []
+    shares: list[float] = []
     for frame in read_frames(circles):
-        rows = frame.circles
-        xy = np.array([(row.px, row.py) for row in rows]).reshape(-1, 2)
+        rows = circle_arrays(frame.circles)
         by_verticals = frame.levelled_by is not None and any(frame.levelled_by)
-        common = common_covariance(camera, xy, 0.0, by_verticals=by_verticals)
-        shares += [float(np.trace(part)) / (row.cxx + row.cyy) for part, row in zip(common, rows)]
+        common = common_covariance(camera, rows.xy, 0.0, by_verticals=by_verticals)
+        traces = [np.trace(c, axis1=1, axis2=2) for c in (common, rows.covariance)]
+        shares += (traces[0] / traces[1]).tolist()
     share = 100.0 * float(np.median(shares)) if shares else 0.0
     return (
         f"{share:.0f} % of the discs' variance (median) are due to the calibration, according to "

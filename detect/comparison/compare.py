@@ -148,13 +148,14 @@ def compare_frames(
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.linalg.norm(pairs.offset, axis=1)
+    farthest_m = np.linalg.norm(second.xy, axis=1).max(initial=0.0)
     return DiscComparison(
         **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
         normalised_error=normalised_error(pairs.offset, second.covariance),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
         bins=tuple(_distance_bin(low, high, sides, pairs) for low, high in pairwise(_EDGES_M)),
-        extra_beyond=_beyond(extra.xy, second.xy),
+        extra_beyond=int((np.linalg.norm(extra.xy, axis=1) > farthest_m).sum()),
         in_image=in_image,
         image_median_px=quantile(image_px),
         image_95_px=quantile(image_px, 0.95),
@@ -171,12 +172,6 @@ def _image_cost(matches: Iterable[FrameMatch]) -> float:
         len(m.missed) + np.fmin((apart_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
     ]
     return float(np.sum(costs))
-
-
-def _beyond(xy: FloatArray, known_xy: FloatArray) -> int:
-    """Number of positions that are farther away than all known ones."""
-    farthest = np.linalg.norm(known_xy, axis=1).max(initial=0.0)
-    return int((np.linalg.norm(xy, axis=1) > farthest).sum())
 
 
 def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatArray:

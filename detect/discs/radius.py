@@ -61,12 +61,11 @@ def find_radius(
     for k in range(0, count + 1, 2):
         try_radius(k)
     coarse = best_radius()
-    if discs[coarse] >= LEAST_DISCS:
-        for k in {max(coarse - 1, 0), min(coarse + 1, count)} - {coarse}:
-            try_radius(k)
-    best = best_radius()
-    if discs[best] < LEAST_DISCS:
+    if discs[coarse] < LEAST_DISCS:
         return None
+    for k in {max(coarse - 1, 0), min(coarse + 1, count)} - {coarse}:
+        try_radius(k)
+    best = best_radius()
     shift = 0.0
     if 0 < best < count:
         before, here, after = evidence[best - 1 : best + 2]

@@ -68,13 +68,12 @@ class StepFilters(NamedTuple):
     same: BoolArray  # (K,) whether a step has the filter of the one before it
 
 
-def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilters:
-    """Filters of the settings' (first) steps and of the two contrasts."""
-    some = settings.refine_steps_px[:steps]
-    sigmas = [sigma for sigma, _ in some]
+def step_filters(settings: LineSettings) -> StepFilters:
+    """Filters of the settings' steps and of the two contrasts."""
+    sigmas = [sigma for sigma, _ in settings.refine_steps_px]
     half = [_half(sigma) for sigma in sigmas]
     widest = 2 * max(half, default=0)
-    weights = np.zeros((len(some), 2, SUBPIXELS, widest))
+    weights = np.zeros((len(sigmas), 2, SUBPIXELS, widest))
     for own, sigma, h in zip(weights, sigmas, half):
         own[..., : 2 * h] = gaussian_steps(sigma, h)[1:]
     # Both contrasts use the same pixels, some with weight 0.
@@ -86,8 +85,8 @@ def step_filters(settings: LineSettings, steps: int | None = None) -> StepFilter
         half=np.array(half, np.int64),
         weights=weights.astype(np.float32),
         heights=np.stack(heights).astype(np.float32),
-        farthest=np.array([distance for _, distance in some], np.float64),
-        same=np.array([k > 0 and sigmas[k] == sigmas[k - 1] for k in range(len(some))], np.bool_),
+        farthest=np.array([distance for _, distance in settings.refine_steps_px], np.float64),
+        same=np.array([k > 0 and sigmas[k] == sigmas[k - 1] for k in range(len(sigmas))], np.bool_),
     )
 
 

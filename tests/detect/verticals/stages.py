@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -63,7 +65,7 @@ def judge_tracks(
 ) -> Judgement:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect)
-    filters = step_filters(settings, steps)
+    filters = step_filters(replace(settings, refine_steps_px=settings.refine_steps_px[:steps]))
     judged = fit_and_judge(image, strip_of(table), tracks, filters, numbers, before)
     if judged.tilt is None:
         return judged
