@@ -24,7 +24,6 @@ import numpy as np
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
-from detect.positive_definite import invert_positive
 from detect.verticals.tilt import level_matrix
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
@@ -45,25 +44,70 @@ _STEP_RAD = 1e-4
 _ITERATIONS = 7
 #: Degrees of freedom of Student's t distribution of the discs' tilts.
 _FREEDOM = 4.0
+#: A pivot below this share of its diagonal entry counts as zero.
+_LEAST_PIVOT = 1e-13
+
+
+def tilt_of_outlines(
+    image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
+) -> FrameTilt | None:
+    """Estimate the tilt from the outlines of the discs in an image; None if no rim is visible.
+
+    `floor_xy` (N, 2) are the positions of the discs, not levelled; the camera is higher than
+    calibrated by `raised_m`. The tilt's prefix is empty.
+    """
+    height_ratio = 1.0 + raised_m / float(camera.centre[2])
+    tilts, covariances = _tilts_of_discs(
+        image, camera_numbers(camera), np.array(camera.centre), floor_xy, radius_m, height_ratio
+    )
+    if not len(tilts):
+        return None
+    mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
+    (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
+    pitch, roll = mean.tolist()
+    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))
 
 
 @kernel()
-def _derivative_of_levelling(
-    rotation: FloatArray, centre: FloatArray, x: float, y: float
-) -> tuple[float, float, float, float]:
-    """d(levelled x, y) / d(x, y) of a point on the calibrated floor, row by row."""
-    dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
-    down = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
-    along = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
-    aside = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
-    height = rotation[2, 0] * centre[0] + rotation[2, 1] * centre[1] + rotation[2, 2] * centre[2]
-    scale = -height / down
-    return (
-        scale * (rotation[0, 0] - along / down * rotation[2, 0]),
-        scale * (rotation[0, 1] - along / down * rotation[2, 1]),
-        scale * (rotation[1, 0] - aside / down * rotation[2, 0]),
-        scale * (rotation[1, 1] - aside / down * rotation[2, 1]),
-    )
+def _tilts_of_discs(
+    image: GreyImage,
+    numbers: FloatArray,
+    centre: FloatArray,
+    floor_xy: FloatArray,
+    radius: float,
+    height_ratio: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Tilts of the discs for which the estimate succeeds, and their covariances."""
+    tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
+    used = 0
+    point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
+    for k in range(len(floor_xy)):
+        x, y = floor_xy[k, 0], floor_xy[k, 1]
+        seen = profiles(image, numbers, x, y, radius)
+        if not seen.pixels_per_radius.min() >= LEAST_AXIS_PX:
+            continue
+        contrast = _contrast(seen.grey)
+        if not abs(contrast) >= LEAST_CONTRAST:
+            continue
+        distance, _ = rim_points(seen, contrast)
+        count = 0
+        for m in range(DIRECTIONS):
+            count += not math.isnan(distance[m])
+            point_xy[m, 0] = radius * distance[m] * COS[m]
+            point_xy[m, 1] = radius * distance[m] * SIN[m]
+            px_per_m[m] = seen.pixels_per_radius[m] / radius
+        if count < LEAST_DIRECTIONS:
+            continue
+        # If the camera is higher than calibrated, discs are larger than they seem.
+        found, pitch, roll, cpp, cpr, crr = fit_outline(
+            point_xy, px_per_m, centre, x, y, radius / height_ratio
+        )
+        if found:
+            tilts[used, 0], tilts[used, 1] = pitch, roll
+            covariances[used, 0, 0], covariances[used, 1, 1] = cpp, crr
+            covariances[used, 0, 1] = covariances[used, 1, 0] = cpr
+            used += 1
+    return tilts[:used], covariances[:used]
 
 
 @kernel()
@@ -162,6 +206,25 @@ def fit_outline(
 
 
 @kernel()
+def _derivative_of_levelling(
+    rotation: FloatArray, centre: FloatArray, x: float, y: float
+) -> tuple[float, float, float, float]:
+    """d(levelled x, y) / d(x, y) of a point on the calibrated floor, row by row."""
+    dx, dy, dz = x - centre[0], y - centre[1], -centre[2]
+    down = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz
+    along = rotation[0, 0] * dx + rotation[0, 1] * dy + rotation[0, 2] * dz
+    aside = rotation[1, 0] * dx + rotation[1, 1] * dy + rotation[1, 2] * dz
+    height = rotation[2, 0] * centre[0] + rotation[2, 1] * centre[1] + rotation[2, 2] * centre[2]
+    scale = -height / down
+    return (
+        scale * (rotation[0, 0] - along / down * rotation[2, 0]),
+        scale * (rotation[0, 1] - along / down * rotation[2, 1]),
+        scale * (rotation[1, 0] - aside / down * rotation[2, 0]),
+        scale * (rotation[1, 1] - aside / down * rotation[2, 1]),
+    )
+
+
+@kernel()
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts under Student's t distribution, and its covariance."""
     count = len(tilt)
@@ -187,62 +250,35 @@ def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray,
 
 
 @kernel()
-def _tilts_of_discs(
-    image: GreyImage,
-    numbers: FloatArray,
-    centre: FloatArray,
-    floor_xy: FloatArray,
-    radius: float,
-    height_ratio: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Tilts of the discs for which the estimate succeeds, and their covariances."""
-    tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
-    used = 0
-    point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
-    for k in range(len(floor_xy)):
-        x, y = floor_xy[k, 0], floor_xy[k, 1]
-        seen = profiles(image, numbers, x, y, radius)
-        if not seen.pixels_per_radius.min() >= LEAST_AXIS_PX:
-            continue
-        contrast = _contrast(seen.grey)
-        if not abs(contrast) >= LEAST_CONTRAST:
-            continue
-        distance, _ = rim_points(seen, contrast)
-        count = 0
-        for m in range(DIRECTIONS):
-            count += not math.isnan(distance[m])
-            point_xy[m, 0] = radius * distance[m] * COS[m]
-            point_xy[m, 1] = radius * distance[m] * SIN[m]
-            px_per_m[m] = seen.pixels_per_radius[m] / radius
-        if count < LEAST_DIRECTIONS:
-            continue
-        # If the camera is higher than calibrated, discs are larger than they seem.
-        found, pitch, roll, cpp, cpr, crr = fit_outline(
-            point_xy, px_per_m, centre, x, y, radius / height_ratio
-        )
-        if found:
-            tilts[used, 0], tilts[used, 1] = pitch, roll
-            covariances[used, 0, 0], covariances[used, 1, 1] = cpp, crr
-            covariances[used, 0, 1] = covariances[used, 1, 0] = cpr
-            used += 1
-    return tilts[:used], covariances[:used]
+def invert_positive(matrix: FloatArray, inverse: FloatArray) -> bool:
+    """Inverse of a positive definite matrix, by Cholesky's factor; False if it is not one.
 
-
-def tilt_of_outlines(
-    image: GreyImage, camera: Camera, floor_xy: FloatArray, radius_m: float, raised_m: float = 0.0
-) -> FrameTilt | None:
-    """Estimate the tilt from the outlines of the discs in an image; None if no rim is visible.
-
-    `floor_xy` (N, 2) are the positions of the discs, not levelled; the camera is higher than
-    calibrated by `raised_m`. The tilt's prefix is empty.
+    With NumPy's function, Numba looks up LAPACK at the first call, which is not safe to interrupt.
     """
-    height_ratio = 1.0 + raised_m / float(camera.centre[2])
-    tilts, covariances = _tilts_of_discs(
-        image, camera_numbers(camera), np.array(camera.centre), floor_xy, radius_m, height_ratio
-    )
-    if not len(tilts):
-        return None
-    mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
-    (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
-    pitch, roll = mean.tolist()
-    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))
+    n = matrix.shape[0]
+    lower = np.empty_like(matrix)
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i > j:
+                lower[i, j] = total / lower[j, j]
+            elif total > _LEAST_PIVOT * abs(matrix[i, i]):
+                lower[i, i] = math.sqrt(total)
+            else:
+                return False
+    for column in range(n):
+        for i in range(n):
+            total = 1.0 if i == column else 0.0
+            for k in range(i):
+                total -= lower[i, k] * inverse[k, column]
+            inverse[i, column] = total / lower[i, i]
+        for i in range(n - 1, -1, -1):
+            total = inverse[i, column]
+            for k in range(i + 1, n):
+                total -= lower[k, i] * inverse[k, column]
+            inverse[i, column] = total / lower[i, i]
+            if not math.isfinite(inverse[i, column]):
+                return False
+    return True

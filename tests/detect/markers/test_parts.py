@@ -29,7 +29,6 @@ from detect.markers.geometry import (
     square_homography,
 )
 from detect.markers.pattern_fit import robust_sigma
-from detect.positive_definite import invert_positive, solve_positive
 from detect.settings import MarkerSettings
 
 FloatArray = NDArray[np.float64]
@@ -132,21 +131,6 @@ def test_corners_by_homography_agree_with_finite_differences() -> None:
         np.testing.assert_allclose(
             analytic[:, k], (moved[0] - moved[1]) / (2.0 * step), rtol=1e-5, atol=1e-5
         )
-
-
-def test_small_systems_are_solved_or_refused() -> None:
-    rng = np.random.default_rng(2)
-    root = rng.normal(size=(9, 6))
-    matrix, right = root.T @ root, rng.normal(size=6)
-    solution, inverse = np.empty(6), np.empty((6, 6))
-    assert solve_positive(matrix, right, solution)
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-9)
-    assert invert_positive(matrix, inverse)
-    np.testing.assert_allclose(inverse @ matrix, np.eye(6), atol=1e-9)
-    matrix[:, 5] = matrix[:, 0]
-    matrix[5, :] = matrix[0, :]
-    assert not solve_positive(matrix, right, solution)
-    assert not invert_positive(-np.eye(6), inverse)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 60), (60, 1), (2, 2)])
