@@ -11,6 +11,7 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from decimal import Decimal
 from itertools import chain, islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,15 +66,7 @@ def perform(options: Tune) -> int:
     names = "table.json", "curve.png"
     demand_free([output / name for name in names], overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
-    if not path.is_file():
-        raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
-    reference = FramesByImage(path)
-    chosen = [each for each in frames if each.image is not None or each.content is not None]
-    wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
-    pairs = [(frame, rows) for frame, rows in wanted if rows is not None]
-    if not pairs:
-        raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
-
+    pairs = _with_reference(frames, path)
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     with progress_bar("trials", count) as advance:
@@ -104,6 +97,19 @@ def perform(options: Tune) -> int:
             )
     failures = sorted({failure for _, failed in trials for failure in failed})
     return report_failures(len(failures), failures)
+
+
+def _with_reference(frames: Iterable[RunFrame], path: Path) -> list[tuple[RunFrame, Frame]]:
+    """The frames that have an image and reference rows, with these."""
+    if not path.is_file():
+        raise LandmarkFileError(path, None, "no such reference rows: give some with --reference")
+    reference = FramesByImage(path)
+    chosen = [each for each in frames if each.image is not None or each.content is not None]
+    wanted = [(frame, reference.get(frame.step.prefix)) for frame in chosen]
+    pairs = [(frame, rows) for frame, rows in wanted if rows is not None]
+    if not pairs:
+        raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
+    return pairs
 
 
 def _name_and_values(word: str) -> tuple[str, str]:

@@ -93,7 +93,7 @@ class TuningSession:
                 "y": float(xy[1]),
                 "covariance": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
                 "quality": float(quality),
-                "evidence": _finite(evidence),
+                "evidence": float(evidence) if math.isfinite(evidence) else None,
                 "outline": self._outline(xy, settings.radius_m),
                 "ellipse": ellipses(xy, c, _SIGMAS, _OUTLINE).tolist(),
             }
@@ -143,10 +143,6 @@ def _label(values: Mapping[str, Any]) -> CircleLandmark:
         raise DetectError(
             "a label: expected a position, its covariance and an identifier"
         ) from None
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 class TuningServer(ThreadingHTTPServer):

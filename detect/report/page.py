@@ -19,7 +19,7 @@ from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.seen import Sight
 from detect.sources.image_files import image_name
-from detect.sources.interface import ImageRun, Run, read_image
+from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
@@ -80,14 +80,13 @@ def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
     return ReportInputs(run, files, names, rows, sight, discs, lines)
 
 
-def frame_picture(inputs: ReportInputs, prefix: str, words: str) -> Part:
+def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
     """The picture of a frame with its rows, or a note on why there is none."""
-    frame = next(frame for frame in inputs.run.frames if frame.step.prefix == prefix)
     try:
         image = read_image(frame, None if inputs.sight is None else inputs.sight.camera)
     except FrameError as error:
         return Part("note", f"{words}: {error}")
-    rows, settings = inputs.files.of(prefix), inputs.files.circle_settings
+    rows, settings = inputs.files.of(frame.step.prefix), inputs.files.circle_settings
     picture = draw_rows(image, inputs.sight, rows, settings)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
@@ -230,8 +229,12 @@ def _frames(inputs: ReportInputs, worst: int) -> Section:
         for k in np.unique(np.linspace(0, len(inputs.names) - 1, count).astype(int)):
             shown[inputs.names[k]] = "no reference rows"
     title = "Worst frames" if parts else "Some frames"
+    frames: dict[str, RunFrame] = {}
+    for frame in inputs.run.frames:  # once, since a video is decoded each time
+        if frame.step.prefix in shown:
+            frames.setdefault(frame.step.prefix, frame)
     parts += [
-        frame_picture(inputs, prefix, f"Frame {picture_name(prefix)} ({why})")
+        frame_picture(inputs, frames[prefix], f"Frame {picture_name(prefix)} ({why})")
         for prefix, why in shown.items()
     ]
     return Section("frames", title, parts)

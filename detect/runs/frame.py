@@ -112,7 +112,7 @@ def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Sea
     return leaning, disc_table(leaning, circles)
 
 
-#: The table of a camera's verticals, the same object at every call: more is prepared for it.
+#: The table of a camera's verticals, one object per process: `detect.lines` prepares more for it.
 vertical_table_of = lru_cache(maxsize=16)(cached_vertical_table)
 
 

@@ -150,23 +150,21 @@ class ImageFiles(Source):
     """
 
     ships_images = False
-    times_own = False
 
     def __init__(self, name: Path, times: str = "") -> None:
-        self.name = str(name)
-        if name.is_dir():
-            self._names, self._home = images_of_folder(name), name
-        else:
+        self.name, self._is_pattern = str(name), not name.is_dir()
+        if self._is_pattern:
             self._names, self._home = _matching_images(name), name.parent
             if name.parent.resolve().name == "images":
                 self._home = name.parent.parent
-        self._is_pattern = not name.is_dir()
+        else:
+            self._names, self._home = images_of_folder(name), name
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names.names)
         times_file = Path(times) if times else self._home / f"{self._home.resolve().name}.times"
-        self._times = read_times(times_file) if times or times_file.is_file() else {}
         self.has_times = bool(times) or times_file.is_file()
+        self._times = read_times(times_file) if self.has_times else {}
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         prefixes: dict[str, str] = {}

@@ -75,8 +75,7 @@ class Source(Frames):
     name: str  # in messages
     output_base: Path  # path of results without their extensions
     beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
-    times_own = True  # images have their own times; for other sources, a file can be given
-    has_times = True
+    has_times = True  # whether the times of the images are known
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside the source, or contained in it; None if there is none.

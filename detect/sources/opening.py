@@ -116,7 +116,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
     """The frames of a source along the given odometry, and the odometry's file."""
     named = options.odometry
     poses: PoseStream | None
-    if options.times and source.times_own:
+    if options.times and not isinstance(source, ImageFiles):
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
     if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
         poses = source.poses(named)
