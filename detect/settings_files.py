@@ -21,7 +21,7 @@ from redetect.storage.bounds import MaybeFloat
 from redetect.storage.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
-Kind = TypeVar("Kind", CircleSettings, LineSettings, MarkerSettings)
+Settings = TypeVar("Settings", CircleSettings, LineSettings, MarkerSettings)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def read_settings(path: Path) -> SettingsFile:
         raise DetectError(f"{path}: {error}") from None
 
 
-def checked_settings(name: str, values: Any, kind: type[Kind]) -> Kind:
+def checked_settings(name: str, values: Any, kind: type[Settings]) -> Settings:
     """Settings from JSON values; a DetectError if one is unknown or invalid."""
     if not isinstance(values, Mapping):
         raise DetectError(f"settings of {name}: expected names and values")

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import SeenRows, open_rows
 from detect.errors import DetectError, FrameError, imported_for
 from detect.options import View
+from detect.row_files import SeenRows, open_rows
 from detect.seen import circle_on_floor, summed_steps
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run

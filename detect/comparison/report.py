@@ -14,9 +14,9 @@ from rich.text import Text
 from camera import Camera, camera_in, read_camera
 from detect.comparison.compare import compare_with_file, read_kind
 from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, Kind, number
-from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.options import Compare
+from detect.row_files import read_head
 from detect.seen import Sight
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR

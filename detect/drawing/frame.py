@@ -21,11 +21,11 @@ from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
 from detect.discs.unfound import Candidate, Stage
-from detect.drawing.inputs import SeenRows
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
+from detect.row_files import SeenRows
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES

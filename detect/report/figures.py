@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
 from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
-from detect.drawing.inputs import SeenRows
+from detect.row_files import SeenRows
 from detect.seen import summed_steps
 from redetect.array_types import FloatArray
 from redetect.landmarks import circle_arrays, is_positive_definite

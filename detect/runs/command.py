@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from detect.drawing.inputs import KINDS, RunRows, read_head
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
+from detect.row_files import KINDS, RunRows, read_head
 from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run, make_folder

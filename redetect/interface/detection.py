@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
-from detect.drawing.inputs import SeenRows
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
+from detect.row_files import SeenRows
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import Sight, image_positions

@@ -11,9 +11,9 @@ from camera import Camera
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
-from detect.drawing.inputs import read_head
 from detect.errors import DetectError
 from detect.options import Compare, CompareOptions, SourceOptions
+from detect.row_files import read_head
 from detect.seen import Sight
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 
 from camera import Camera, read_camera
 from detect.drawing.frame import draw_rows, draw_tracks, track_pixels
-from detect.drawing.inputs import SeenRows
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines
+from detect.row_files import SeenRows
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import decode_gray

@@ -19,7 +19,7 @@ from redetect.storage.command_line import exit_code_of
 #: Files may be twice as long as the longest seed, and at least this long.
 _SHORT_BYTES = 2048
 _INSTRUMENTED = (
-    "camera", "detect.drawing.inputs", "detect.runs.stream", "detect.sources", "redetect",
+    "camera", "detect.row_files", "detect.runs.stream", "detect.sources", "redetect",
     "tools.fuzz", "csv",
 )  # fmt: skip
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
-from detect.drawing.inputs import read_head
 from detect.errors import DetectError, FrameError
+from detect.row_files import read_head
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import draw_rows, line_curves, sigma_bars
-from detect.drawing.inputs import SeenRows, read_head
+from detect.row_files import SeenRows, read_head
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.drawing.frame import draw_rows
-from detect.drawing.inputs import SeenRows
+from detect.row_files import SeenRows
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from lut import ring

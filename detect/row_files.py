@@ -25,9 +25,6 @@ KINDS = ("circles", "lines", "markers", "tilt")
 _LONGEST_BYTES = 1 << 16
 
 
-# -- heads ------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class FileHead:
     """The known parts of the head of a file of rows.
@@ -75,9 +72,6 @@ def read_head(path: Path) -> FileHead:
     )
     level = any(LEVELLED in text or LEVEL in text for text in comments)
     return FileHead(tuple(comments), settings, level, str(path))
-
-
-# -- rows -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
