@@ -65,11 +65,10 @@ def perform(options: View) -> int:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
-                    advance()
-                    continue
-                picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
-                coloured = np.ascontiguousarray(picture[:, :, ::-1])
-                recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
+                else:
+                    picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
+                    coloured = np.ascontiguousarray(picture[:, :, ::-1])
+                    recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()
         recording.flush()
         recording.disconnect()

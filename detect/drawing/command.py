@@ -18,12 +18,12 @@ from detect.options import Draw
 from detect.row_files import RunRows, open_rows, picture_name
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
-from detect.sources.interface import ImageRun, Run, read_image
+from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
 from detect.sources.video import quiet_opencv
 from detect.terminal import progress_bar, report_failures
-from redetect.array_types import ByteArray
+from redetect.array_types import ByteArray, GreyImage
 from redetect.storage import demand_place, write_bytes
 
 Video = Callable[[ByteArray], None]
@@ -74,24 +74,29 @@ def draw_run(
                 image = read_image(frame, None if sight is None else sight.camera)
             except FrameError as error:
                 failures.append(str(error))
-                advance()
-                continue
-            prefix = frame.step.prefix
-            name = picture_name(prefix)
-            picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
-            if plan is not None:
-                (found,) = detect_batch([FrameTask(frame)], plan)
-                if found.lines is not None and plan.camera is not None:
-                    picture = draw_tracks(image, vertical_table_of(plan.camera), found.lines)
-                if found.markers is not None:
-                    picture = draw_candidates(picture, found.markers)
-            if folder is not None:
-                write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
-            if video is not None:
-                video(picture)
-            drawn += 1
+            else:
+                prefix = frame.step.prefix
+                name = picture_name(prefix)
+                picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
+                if plan is not None:
+                    picture = _with_rejected(picture, image, frame, plan)
+                if folder is not None:
+                    write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
+                if video is not None:
+                    video(picture)
+                drawn += 1
             advance()
     return drawn, failures
+
+
+def _with_rejected(
+    picture: ByteArray, image: GreyImage, frame: RunFrame, plan: FramePlan
+) -> ByteArray:
+    """All tracks instead of the verticals, rejected ones included; rejected markers as well."""
+    (found,) = detect_batch([FrameTask(frame)], plan)
+    if found.lines is not None and plan.camera is not None:
+        picture = draw_tracks(image, vertical_table_of(plan.camera), found.lines)
+    return picture if found.markers is None else draw_candidates(picture, found.markers)
 
 
 @contextmanager
