@@ -50,6 +50,7 @@ _NOISE_ROWS = 16
 #: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
+#: A camera in the form that kernels take.
 _numbers = lru_cache(maxsize=4)(camera_numbers)
 
 

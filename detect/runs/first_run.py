@@ -22,7 +22,7 @@ from lut import cached_vote_table
 
 
 def place_and_level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Locate zero discs in the first frame, and estimate tilts from their outlines and of a run."""
+    """Locate zero discs in the first frame; estimate the tilt from their outlines, and of a run."""
     camera, settings = plan.camera, plan.circles
     if not (camera and settings and settings.refine):
         return

@@ -263,9 +263,8 @@ class RunFiles:
         self._base, self._log_path = job.beside(""), job.beside(".log.json")
         self._paths = [*(output.path for output in self._outputs), self._log_path]
         self._made_by = made_by(self._outputs, job.plan)
-        self._overwrite, self._keep = job.overwrite, True
-        self._frames = 0
-        self._resumes = self._done = False
+        self._overwrite = job.overwrite
+        self._frames, self._resumes = 0, False
         self._journal: Journal
 
     # -- beginning ------------------------------------------------------------------------
@@ -361,8 +360,9 @@ class RunFiles:
         return chain(beyond, tasks)
 
     def add(self, frames: Sequence[tuple[FrameTask, FrameRows]]) -> None:
-        """Write the next frames to the journal."""
-        self._keep = not self._job.strict or all(rows.error is None for _, rows in frames)
+        """Write the next frames to the journal; if one has failed, a strict run keeps nothing."""
+        if self._job.strict and any(rows.error is not None for _, rows in frames):
+            self._journal.file.remove()
         for _, rows in frames:
             self._demand_strictly(rows)
         self._journal.write_frames(frames)
@@ -405,7 +405,7 @@ class RunFiles:
             for part in parts:
                 part.sync()
             self._place(parts)
-        self._done = True
+        self._journal.file.remove()
 
     def _place(self, parts: Sequence[PartFile]) -> None:
         with folder_locked(self._log_path.parent):
@@ -424,9 +424,7 @@ class RunFiles:
     def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
         journal = self._journal.file
         if (
-            self._done
-            or not self._keep
-            or isinstance(error, OutputExistsError)  # another process was first
+            isinstance(error, OutputExistsError)  # another process was first
             or not (self._frames or self._resumes)
             or journal.stream.closed
             or not journal.is_in_place()
