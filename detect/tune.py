@@ -24,7 +24,7 @@ from detect.errors import DetectError
 from detect.options import CompareOptions, Tune
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
-from detect.runs.workers import Crew, Workers, default_jobs, detect_chunks, local_workers
+from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
@@ -173,8 +173,8 @@ def tune_run(
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame, _ in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
-    with closing(Crew(workers)) as crew:
-        done = chain.from_iterable(detect_chunks(work, plans[0], crew))
+    with closing(WorkerPool(workers)) as pool:
+        done = chain.from_iterable(pool.detect_chunks(work, plans[0]))
         for _ in plans:
             found: list[Frame] = []
             failures: list[str] = []

@@ -43,7 +43,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
-from detect.runs.workers import Crew, Workers, detect_chunks, local_workers
+from detect.runs.workers import WorkerPool, Workers, local_workers
 from detect.sources.interface import ImageRun, RunFrame
 from detect.sources.poses import SomeFrames
 from redetect.storage import OutputExistsError
@@ -191,9 +191,9 @@ def detect_run(
             on_progress()
 
     with ExitStack() as stack:
-        crew = stack.enter_context(closing(Crew(workers)))
+        pool = stack.enter_context(closing(WorkerPool(workers)))
         plan = replace(job.plan, json="json" in job.places)
-        plan = _with_lean(job.run, plan, crew)
+        plan = _with_lean(job.run, plan, pool)
         if plan.circles != job.plan.circles and plan.circles:
             summary.unlevelled_deg = plan.circles.tilt_sigma_deg
         job, summary.lean = replace(job, plan=plan), plan.lean
@@ -201,11 +201,11 @@ def detect_run(
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
         tasks = files.take_over(every, count)
-        for frames in detect_chunks(tasks, plan, crew):
+        for frames in pool.detect_chunks(tasks, plan):
             files.add(frames)
             for _, rows in frames:
                 count(rows)
-        crew.close()
+        pool.close()
         summary.images_without_step = job.run.frames.left_out
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
@@ -216,7 +216,7 @@ def detect_run(
     return summary
 
 
-def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
+def _with_lean(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePlan:
     """The plan with the camera's lean, estimated from some frames of a run."""
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
@@ -229,7 +229,7 @@ def _with_lean(run: ImageRun, plan: FramePlan, crew: Crew) -> FramePlan:
     tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _LEAN_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
-        return [rows for chunk in detect_chunks(tasks, plan, crew) for _, rows in chunk]
+        return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
     rows = rows_by(level)

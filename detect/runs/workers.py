@@ -76,57 +76,16 @@ class Workers:
     died: tuple[type[BaseException], ...] = ()  # raised if a worker dies, as `BrokenExecutor` is
 
 
-def detect_chunks(
-    tasks: Iterable[FrameTask], plan: FramePlan, crew: Crew
-) -> Iterator[list[tuple[FrameTask, FrameRows]]]:
-    """Frames with their rows, in the order of the tasks, chunk by chunk.
-
-    Raises WorkerError if workers die with every frame, disappear, or do not have this program, and
-    `lut.TableError` if no table can be made for the camera.
-    """
-    source = iter(tasks)
-    chunks = iter(lambda: tuple(islice(source, crew.chunk)), ())
-    # A chunk without a future is suspect: it is processed while nothing else is pending.
-    under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
-    crew.plan = plan
-    while True:
-        if all(future is not None for _, future in under_way):
-            more = max(0, crew.window() - len(under_way))
-            under_way.extend((chunk, crew.submit(chunk)) for chunk in islice(chunks, more))
-        if not under_way:
-            return
-        chunk, future = under_way.popleft()
-        if future is None:
-            yield [(task, crew.rows_alone(task)) for task in chunk]
-            continue
-        try:
-            rows = crew.rows(future)
-        except crew.died as error:
-            crew.dismiss(error)
-            under_way.appendleft((chunk, None))
-            under_way = deque((c, None if crew.lost(f) else f) for c, f in under_way)
-            continue
-        yield list(zip(chunk, rows))
-
-
-def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
-    """Process a chunk in a worker; its input and output are small."""
-    from detect.runs.frame import rows_of_frames  # loads the compiler, which only workers need
-
-    return rows_of_frames(chunk, plan)
-
-
-class Crew:
+class WorkerPool:
     """The workers of a run, started when they are needed, and replaced when one of them has died.
 
     `close` ends them.
     """
 
-    plan: FramePlan  # how they process frames
+    _plan: FramePlan  # how they process frames
 
     def __init__(self, workers: Workers) -> None:
-        self.died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
-        self.chunk, self.window = workers.chunk, workers.window
+        self._died: tuple[type[BaseException], ...] = (BrokenExecutor, *workers.died)
         self._workers, self._started = workers, ExitStack()
         self._executor: Executor | None = None
         self._deadly = 0
@@ -136,17 +95,49 @@ class Crew:
         self._executor = None
         self._started.close()
 
-    def submit(self, chunk: Chunk) -> Future[list[FrameRows]]:
+    def detect_chunks(
+        self, tasks: Iterable[FrameTask], plan: FramePlan
+    ) -> Iterator[list[tuple[FrameTask, FrameRows]]]:
+        """Frames with their rows, in the order of the tasks, chunk by chunk.
+
+        Raises WorkerError if workers die with every frame, disappear, or do not have this program,
+        and `lut.TableError` if no table can be made for the camera.
+        """
+        source = iter(tasks)
+        chunks = iter(lambda: tuple(islice(source, self._workers.chunk)), ())
+        # A chunk without a future is suspect: it is processed while nothing else is pending.
+        under_way: deque[tuple[Chunk, Future[list[FrameRows]] | None]] = deque()
+        self._plan = plan
+        while True:
+            if all(future is not None for _, future in under_way):
+                more = max(0, self._workers.window() - len(under_way))
+                under_way.extend((chunk, self._submit(chunk)) for chunk in islice(chunks, more))
+            if not under_way:
+                return
+            chunk, future = under_way.popleft()
+            if future is None:
+                yield [(task, self._rows_alone(task)) for task in chunk]
+                continue
+            try:
+                rows = self._rows(future)
+            except self._died as error:
+                self._dismiss(error)
+                under_way.appendleft((chunk, None))
+                under_way = deque((c, None if self._lost(f) else f) for c, f in under_way)
+                continue
+            yield list(zip(chunk, rows))
+
+    def _submit(self, chunk: Chunk) -> Future[list[FrameRows]]:
         try:
             if self._executor is None:
-                self._executor = self._started.enter_context(self._workers.start(self.plan))
-            return self._executor.submit(work_on_chunk, self.plan, chunk)
-        except self.died as error:  # they died before they received anything
+                self._executor = self._started.enter_context(self._workers.start(self._plan))
+            return self._executor.submit(work_on_chunk, self._plan, chunk)
+        except self._died as error:  # they died before they received anything
             failed: Future[list[FrameRows]] = Future()
             failed.set_exception(error)
             return failed
 
-    def rows(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
+    def _rows(self, future: Future[list[FrameRows]]) -> list[FrameRows]:
         """The rows of a chunk; waits for them."""
         try:
             rows = future.result()
@@ -159,14 +150,14 @@ class Crew:
         self._deadly = 0
         return rows
 
-    def rows_alone(self, task: FrameTask) -> FrameRows:
+    def _rows_alone(self, task: FrameTask) -> FrameRows:
         """The rows of a frame during which a worker may have died."""
         for _ in range(2):
             try:
-                (rows,) = self.rows(self.submit((task,)))
+                (rows,) = self._rows(self._submit((task,)))
                 return rows
-            except self.died as error:
-                self.dismiss(error)
+            except self._died as error:
+                self._dismiss(error)
         reason = f"{task.name}: every worker died on this frame"
         self._deadly += 1
         if self._deadly == _DEADLY_FRAMES:
@@ -175,18 +166,25 @@ class Crew:
             )
         return rows_of_failure(task, f"{reason}: out of memory?")
 
-    def dismiss(self, error: BaseException) -> None:
+    def _dismiss(self, error: BaseException) -> None:
         """End the remaining workers if their pool is broken; the next chunk gets new ones."""
         if isinstance(error, BrokenExecutor):
             self.close()
 
-    def lost(self, future: Future[list[FrameRows]] | None) -> bool:
+    def _lost(self, future: Future[list[FrameRows]] | None) -> bool:
         """Whether a chunk was lost with its worker."""
         if future is None or future.cancelled():
             return True
         if not future.done():
             return self._executor is None
-        return isinstance(future.exception(), self.died)
+        return isinstance(future.exception(), self._died)
+
+
+def work_on_chunk(plan: FramePlan, chunk: Chunk) -> list[FrameRows]:
+    """Process a chunk in a worker; its input and output are small."""
+    from detect.runs.frame import rows_of_frames  # loads the compiler, which only workers need
+
+    return rows_of_frames(chunk, plan)
 
 
 def default_jobs(frames: int) -> int:

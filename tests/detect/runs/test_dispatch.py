@@ -16,7 +16,7 @@ import pytest
 from camera import Camera
 from detect.errors import WorkerError
 from detect.runs.plan import FramePlan, FrameRows, FrameTask
-from detect.runs.workers import Chunk, Crew, Workers, detect_chunks
+from detect.runs.workers import Chunk, WorkerPool, Workers
 from detect.sources.interface import RunFrame
 from redetect.landmarks import Step
 
@@ -44,8 +44,8 @@ def detect_frames(
     tasks: Iterable[FrameTask], plan: FramePlan, workers: Workers
 ) -> Generator[FrameRows, None, None]:
     """The frames of all chunks, one by one; each comes with its own task."""
-    with closing(Crew(workers)) as crew:
-        for task, rows in chain.from_iterable(detect_chunks(tasks, plan, crew)):
+    with closing(WorkerPool(workers)) as pool:
+        for task, rows in chain.from_iterable(pool.detect_chunks(tasks, plan)):
             assert task.frame.step.prefix in rows.rows["circles"]
             yield rows
 
