@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,9 +16,13 @@ from camera import camera_in
 from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
-from detect.options import CompareOptions
+from detect.options import CompareOptions, RowFiles
 from detect.report.figures import binned, rates_over, whitened
+from detect.report.page import gather, report_page
 from detect.seen import Sight
+from detect.sources.interface import RunFrame
+from detect.sources.opening import open_source
+from detect.sources.poses import SomeFrames
 from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
 from tests.detect.commands import Captured, assert_refused, in_browser
 
@@ -259,6 +264,21 @@ def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Pat
     assert "No reference rows" in words
     assert "Frame s.0002 (no reference rows)" in words
     assert "threshold 0.4" in words
+
+
+def test_a_source_is_read_twice_however_many_frames_are_shown(judged_run: Path) -> None:
+    """A video is decoded each time."""
+    passes = []
+
+    class Counted(SomeFrames):
+        def __iter__(self) -> Generator[RunFrame, None, None]:
+            passes.append(1)
+            return super().__iter__()
+
+    run = open_source(judged_run)
+    inputs = gather(replace(run, frames=Counted(run.frames)), RowFiles())
+    assert report_page(inputs, 3).count(b"data:image/jpeg") == 2
+    assert len(passes) == 2
 
 
 def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path) -> None:
