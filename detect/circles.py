@@ -78,10 +78,29 @@ class CircleDetections:
 def detect_circles(
     image: GreyImage, camera: Camera, table: VoteTable | DiscTable, settings: CircleSettings
 ) -> CircleDetections:
-    """Find the discs in one image (H, W) uint8, with a table from `disc_table`.
+    """Find the discs in one image.
 
-    Raises FrameError if the image does not have the camera's size, and DetectError if the table
-    belongs to the other detector.
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey image of the camera's size.
+    camera : Camera
+        The calibrated camera.
+    table : VoteTable or DiscTable
+        From `disc_table`.
+    settings : CircleSettings
+        What to look for.
+
+    Returns
+    -------
+    CircleDetections
+
+    Raises
+    ------
+    FrameError
+        If the image does not have the camera's size.
+    DetectError
+        If the table belongs to the other detector.
     """
     if isinstance(table, DiscTable) == settings.refine:
         owner = "the published detector" if settings.refine else "the default detector"

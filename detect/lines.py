@@ -84,9 +84,26 @@ def _prepared(
 def detect_lines(
     image: GreyImage, table: VerticalTable, settings: LineSettings = DEFAULT
 ) -> LineDetections:
-    """Find the building's verticals in one image (H, W) uint8, with the table of its camera.
+    """Find the building's verticals in an image.
 
-    Raises FrameError if the image does not have the table's size or 8 bit grey values.
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Grey values.
+    table : VerticalTable
+        The table of the image's camera.
+    settings : LineSettings
+        `detect.line_settings.PUBLISHED` are those of the report.
+
+    Returns
+    -------
+    LineDetections
+        Lines, leftmost first, and their tracks and fits.
+
+    Raises
+    ------
+    FrameError
+        If the image does not have the table's size or 8 bit grey values.
     """
     if image.shape != table.column.shape or image.dtype != np.uint8:
         raise FrameError(

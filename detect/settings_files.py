@@ -36,7 +36,10 @@ class SettingsFile:
 def read_settings(path: Path) -> SettingsFile:
     """Read settings from a JSON file: a log of detections, or the output of `settings_text`.
 
-    Raises DetectError if it cannot be read, has no settings, or an unknown or invalid one.
+    Raises
+    ------
+    DetectError
+        If it cannot be read, has no settings, or an unknown or invalid one.
     """
     try:
         with path.open("rb") as stream:

@@ -116,10 +116,23 @@ def compare_frames(
 ) -> DiscComparison:
     """Compare the discs of two sets of frames.
 
-    `sight` maps rows into the images; without it, they are compared on the floor. `unlisted` discs
-    may be detected but need not be: rows matching them are neither right nor wrong. Rows that match
-    known `lookalikes` of discs are extra, and counted separately. `names` are those of the two sets
-    in messages. Raises CompareError if an image has two frames.
+    Parameters
+    ----------
+    reference, detected : iterable of Frame
+    options : CompareOptions, optional
+    sight : Sight, optional
+        Maps rows into the images; without it, they are compared on the floor.
+    unlisted : iterable of Frame, optional
+        Discs that may be detected but need not be: rows matching them are neither right nor wrong.
+    lookalikes : iterable of Frame, optional
+        Known look-alikes of discs: rows that match them are extra, and counted separately.
+    names : (str, str)
+        Names of the two sets in messages.
+
+    Raises
+    ------
+    CompareError
+        If an image has two frames.
     """
     options = options or CompareOptions()
     in_image = sight is not None and options.gate_m is None

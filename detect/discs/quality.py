@@ -161,9 +161,19 @@ def find_centres(
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
-    """Find the centres of a table within some limits in an image (H, W) uint8.
+    """Find the centres of a table within some limits.
 
-    Raises FrameError if the image does not belong to the table.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    table : DiscTable
+        The camera's.
+    limits : Limits
+
+    Raises
+    ------
+    FrameError
+        If the image does not belong to the table.
     """
     expected = table.floor_xy.shape[:2]
     if image.shape != expected or image.dtype != np.uint8:

@@ -150,13 +150,26 @@ class _Marker(NamedTuple):
 
 
 def detect_markers(
-    image: GreyImage, settings: MarkerSettings, camera: Camera | None = None
+    image: GreyImage,
+    settings: MarkerSettings,
+    camera: Camera | None = None,
 ) -> MarkerDetections:
-    """Find the square markers in one image (H, W) uint8 (RAWSEEDS deliverable D2.1 part 2).
+    """Find the square markers in one grey image (RAWSEEDS deliverable D2.1 part 2).
 
-    Without a camera, whose distortion bends the markers' edges, these are assumed to be straight in
-    the image. Raises DetectError if there is no such dictionary, or it lacks an expected ID, and
-    FrameError if the image's size differs from the camera's.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    settings : MarkerSettings
+    camera : Camera, optional
+        The calibration, whose distortion bends the markers' edges; without one they are assumed to
+        be straight in the image.
+
+    Raises
+    ------
+    DetectError
+        If there is no such dictionary, or it lacks an expected ID.
+    FrameError
+        If the image's size differs from the camera's.
     """
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)
