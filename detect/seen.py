@@ -5,6 +5,7 @@ Plain NumPy, so that comparing files does not load the compiler.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from camera.model_checks import checked_pose
 from camera.rotations import rotation_of
+from detect.settings import USUAL_TILT_DEG
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
 from redetect.plane import chain_steps
@@ -22,6 +24,9 @@ Tilt = tuple[float, float]
 
 #: Lower bound of the gate in the image, for small discs (px).
 LEAST_GATE_PX = 3.0
+#: Unknown tilt by which rows that are not levelled may be off from level ones: three usual
+#: standard deviations.
+_UNKNOWN_TILT_RAD = 3.0 * math.radians(USUAL_TILT_DEG)
 _POINTS = 64
 
 
@@ -125,9 +130,15 @@ class Sight:
         return np.where(np.isfinite(xy), xy, reference_xy)
 
     def gates(self, reference_xy: FloatArray) -> FloatArray:
-        """(N, 2) half widths and heights of imaged discs, at least `LEAST_GATE_PX`, pixels."""
+        """(N, 2) half widths and heights of imaged discs, at least `LEAST_GATE_PX`, pixels.
+
+        Wider where the tilt between the reference and the detected rows is unknown.
+        """
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
         high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
-        return np.asarray(np.maximum(0.5 * (high - low), LEAST_GATE_PX))
+        gates = np.maximum(0.5 * (high - low), LEAST_GATE_PX)
+        if self.reference_level and self.detected_by is None:
+            gates += _UNKNOWN_TILT_RAD * np.array([self.camera.scale_x, self.camera.scale_y])
+        return np.asarray(gates)

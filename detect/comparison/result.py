@@ -239,10 +239,13 @@ class DiscComparison(Comparison):
             None if value is None else 1000.0 * value
             for value in (self.error_median_m, self.error_95_m)
         )
-        return (
+        errors = (
             f"Positions on the floor err by {number(median, 1)} mm (median), "
             f"95 % of them by less than {number(most, 1)} mm."
         )
+        if self.reference_level and not self.detected_levelled:
+            errors += " They are not corrected for the robot's tilt, which `detect all` does."
+        return errors
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,26 @@ def test_level_truth_is_seen_through_the_tilt_of_what_was_detected(
     assert unsaid.error_95_m == pytest.approx(0.0, abs=1e-9)
     raw, level = leaning_run(published_camera)
     assert not compare(published_camera, raw, level).reference_level
+
+
+def test_rows_that_are_not_levelled_match_level_truth(published_camera: Camera) -> None:
+    camera = replace(
+        published_camera, width=2304, height=1728, scale_x=1394.0, scale_y=1394.0,
+        offset_x=1152.0, offset_y=864.0,
+    )  # fmt: skip
+    rng, truth, seen = np.random.default_rng(3), [], []
+    for k in range(20):
+        xy = places(rng)
+        by = tuple(np.radians(rng.uniform(-0.7, 0.7, 2)))
+        truth.append(frame(k, xy))
+        seen.append(frame(k, camera.floor_from_pixel(image_positions(camera, xy, by))))
+
+    found = compare_frames(truth, seen, sight=Sight(camera, reference_level=True))
+
+    assert (found.recall, found.extra) == (1.0, 0)
+    assert "not corrected for the robot's tilt" in found.sentences()[2]
+    on_one_tilt = compare_frames(truth, truth, sight=Sight(camera))
+    assert "tilt" not in on_one_tilt.sentences()[2]
 
 
 def test_a_far_disc_is_the_same_within_three_pixels(published_camera: Camera) -> None:
