@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from decimal import Decimal
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,12 @@ from detect import __version__
 from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.errors import DetectError
-from detect.options import CompareOptions, Tune
+from detect.options import Tune
 from detect.report.figures import DATA, MARK
+from detect.row_files import read_head
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
+from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
@@ -32,7 +35,13 @@ from detect.sources.opening import demand_recording, open_run
 from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
-from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
+from redetect.landmarks import (
+    Frame,
+    LandmarkFileError,
+    frames_of_rows,
+    parse_rows,
+    read_frames,
+)
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
 
@@ -67,10 +76,19 @@ def perform(options: Tune) -> int:
     demand_free([output / name for name in names], overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
     pairs = _with_reference(frames, path)
+    uncounted = path.parent / "unlisted.circles"
+    compare = partial(
+        compare_frames,
+        [rows for _, rows in pairs],
+        options=options.matching,
+        sight=Sight(run.camera, base.radius_m, read_head(path).level),
+        unlisted=list(read_frames(uncounted)) if uncounted.is_file() else None,
+    )
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)
     with progress_bar("trials", count) as advance:
-        trials = list(tune_run(run, pairs, settings, options.matching, workers, advance))
+        chosen = [frame for frame, _ in pairs]
+        trials = list(tune_run(run, chosen, settings, compare, workers, advance))
     records = marked([{**c, **figures_of(found)} for c, (found, _) in zip(grid, trials)])
     head = {
         "version": __version__,
@@ -158,20 +176,20 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
 
 def tune_run(
     run: Run,
-    frames: Sequence[tuple[RunFrame, Frame]],
+    frames: Sequence[RunFrame],
     settings: Sequence[CircleSettings],
-    options: CompareOptions,
+    compare: Callable[[list[Frame]], DiscComparison],
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[DiscComparison, list[str]]]:
     """Detect discs in frames of a run with each setting, and compare them.
 
-    `frames` come with their reference rows; `on_progress` is called after every frame of every
-    setting. Yields the comparison of each setting, and why frames could not be processed: these
-    count as frames without detections.
+    `compare` compares their rows with the reference; `on_progress` is called after every frame of
+    every setting. Yields the comparison of each setting, and why frames could not be processed:
+    these count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
-    tasks = [FrameTask(frame) for frame, _ in frames]
+    tasks = [FrameTask(frame) for frame in frames]
     work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(WorkerPool(workers)) as pool:
         done = chain.from_iterable(pool.detect_chunks(work, plans[0]))
@@ -184,7 +202,7 @@ def tune_run(
                 )
                 failures += [] if each.error is None else [each.error]
                 on_progress()
-            yield compare_frames([rows for _, rows in frames], found, options), failures
+            yield compare(found), failures
 
 
 def figures_of(result: DiscComparison) -> dict[str, Any]:

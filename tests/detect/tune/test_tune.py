@@ -13,11 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from detect.cli import main
-from detect.comparison.compare import compare_frames
 from detect.errors import DetectError
 from detect.settings import CircleSettings
 from detect.tune import combinations, curve_picture, knee, marked, parameter_values, pareto_front
-from redetect.landmarks import read_frames
 from tests.detect.commands import Captured, assert_refused
 from tests.detect.conftest import SMALL_RUN_DISCS
 
@@ -135,20 +133,23 @@ def test_records_mark_front_and_knee() -> None:
 # -- the command ------------------------------------------------------------------------------
 
 
-def write_reference(run: Path, discs: dict[str, list[tuple[float, float]]]) -> None:
+def write_reference(
+    run: Path, discs: dict[str, list[tuple[float, float]]], name: str = "map"
+) -> None:
     rows = []
     for prefix, places in discs.items():
         rows.append(f"STEP {prefix} 0 0 0 0 0 0 0 0 0")
         rows += [f"LANDMARK_C {x} {y} 0.9 1e-4 0 1e-4 1" for x, y in places]
-    (run / "map.circles").write_text("\n".join(rows) + "\n")
+    (run / f"{name}.circles").write_text("\n".join(rows) + "\n")
 
 
 def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path: Path) -> None:
-    # Of the three discs one is not in the reference, and one of the reference is not in the image.
+    # Of the three discs one need not be found, and one of the reference is not in the image.
     write_reference(
         small_run, {**SMALL_RUN_DISCS, "s.0001": [], "s.0002": [(0.0, -1.4), (0.5, -1.4)]}
     )
-    folder = tmp_path / "t"
+    write_reference(small_run, {"s.0001": SMALL_RUN_DISCS["s.0001"]}, "unlisted")
+    folder, compared = tmp_path / "t", tmp_path / "c.json"
     arguments = ["tune", str(small_run), "--vary", "samples=8,16", "--vary", "threshold=0.4,0.999"]
     assert main([*arguments, "-o", str(folder)]) == 0
     document = json.loads((folder / "table.json").read_text())
@@ -156,18 +157,14 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     assert [(r["threshold"], r["samples"]) for r in rows] == [
         (0.4, 8), (0.999, 8), (0.4, 16), (0.999, 16),
     ]  # fmt: skip
-    assert (rows[2]["recall"], rows[2]["precision"]) == (0.5, round(2 / 3, 6))
+    assert (rows[2]["recall"], rows[2]["precision"]) == (0.5, 1.0)
     for row in rows:
         flags = ["--threshold", str(row["threshold"]), "--samples", str(row["samples"])]
         assert main(["circles", str(small_run), *flags, "--force"]) == 0
-        reference, found = (
-            read_frames(small_run / f"{name}.circles") for name in ("map", "detected")
-        )
-        expected = compare_frames(reference, found)
-        counts = (expected.reference, expected.detected, expected.matched)
-        assert tuple(row[n] for n in ("reference", "detected", "matched")) == counts
-        assert row["recall"] == pytest.approx(expected.recall, rel=1e-5)
-        assert row["precision"] == pytest.approx(expected.precision, rel=1e-5)
+        assert main(["compare", str(small_run), "--json", str(compared), "--force"]) == 0
+        expected = json.loads(compared.read_text())
+        for name in ("reference", "detected", "matched", "recall", "precision"):
+            assert row[name] == pytest.approx(expected[name], rel=1e-5)
     assert document["varied"] == {"samples": "8,16", "threshold": "0.4,0.999"}
     assert document["settings"]["radius_m"] == 0.1
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
