@@ -21,12 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from detect.settings import LEAST_FRAMES as LEAST_FRAMES
 from redetect.array_types import BoolArray, FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
-#: Least number of measured frames; with fewer, errors cannot be separated from the tilt.
-LEAST_FRAMES = 20
 #: Priors of the estimated parameters, and the standard deviations of their logarithms: the spread
 #: of the true tilt about its constant, for an even floor (rad); the duration of a deviation, for a
 #: robot on springs (frames); the factors on the stated deviations of verticals and of outlines,
@@ -87,6 +86,11 @@ class RunTilt:
     variance: FloatArray
     #: Relative standard deviation of the camera's height, if the calibration has no covariance.
     height_sigma: float = 0.0
+
+    @property
+    def usual_rad(self) -> float:
+        """Root mean square of pitch and roll: the standard deviation of an unknown tilt."""
+        return math.sqrt(np.mean(self.tilt**2 + self.variance))
 
     def sentence(self) -> str:
         """A sentence on the constant lean."""

@@ -25,6 +25,8 @@ from redetect.storage.bounds import (
 
 #: Standard deviation of the pitch and the roll of a robot on an even floor, degrees.
 USUAL_TILT_DEG = 0.3
+#: Least number of frames with a tilt: the errors of fewer cannot be separated from the run's tilt.
+LEAST_FRAMES = 20
 
 #: Tilt for which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
@@ -80,8 +82,8 @@ class CircleSettings:
     #: refined positions. Calibrations commonly have residuals of 0.1-0.3 px.
     calibration_px: NotNegative = 0.15
     #: Standard deviation of the robot's pitch and roll, degrees: added to the covariance of refined
-    #: positions if the frame's tilt is unknown. By default 0.3, combined with the camera's lean
-    #: where a run shows one.
+    #: positions if the frame's tilt is unknown. By default what some images of the run show, or 0.3
+    #: where they show none.
     tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
 
     def __post_init__(self) -> None:

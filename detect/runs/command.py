@@ -202,8 +202,8 @@ def _print_results(job: Job, summary: RunSummary) -> None:
         print(lean_sentence(summary.lean))
     if summary.unlevelled_deg is not None and "tilt" not in places and not job.known.tilts:
         print(
-            "the camera leans, and positions are not levelled: pitch and roll are assumed unknown "
-            f"within {summary.unlevelled_deg:g} degrees (detect all levels them)"
+            "positions are not levelled: pitch and roll are assumed unknown within "
+            f"{summary.unlevelled_deg:g} degrees, as some frames show (detect all levels them)"
         )
     camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:

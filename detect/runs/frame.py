@@ -349,16 +349,15 @@ def lean_of_frame(tilt: FrameTilt) -> Lean | None:
     return (pitch, roll) if pitch or roll else None
 
 
-def lean_of_run(camera: Camera, frames: Iterable[FrameRows]) -> Lean | None:
-    """The lean for the search for discs in a run, from the rows of some frames.
-
-    None if few of them have a tilt, or if it is so small that it makes no difference.
-    """
+def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> RunTilt | None:
+    """The tilt of a run, from the rows of some frames; None if few of them have a tilt."""
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
-    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera))
-    if found is None:
-        return None
-    lean_deg = np.degrees(found.lean).round(1)  # so that runs of a camera share a cached table
+    return tilt_of_run(verticals, outlines, common_tilt_variance(camera))
+
+
+def searched_lean(tilt: RunTilt) -> Lean | None:
+    """The lean for the search for discs; None if it is so small that it makes no difference."""
+    lean_deg = np.degrees(tilt.lean).round(1)  # so that runs of a camera share a cached table
     if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:
         return None
     pitch, roll = np.radians(lean_deg).tolist()

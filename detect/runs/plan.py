@@ -219,7 +219,7 @@ class RunSummary:
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0  # missing in the odometry
     lean: Lean | None = None  # of the camera in the search for discs
-    unlevelled_deg: float | None = None  # sigma of pitch and roll, enlarged by the camera's lean
+    unlevelled_deg: float | None = None  # sigma of pitch and roll, as some frames show
     tilt: RunTilt | None = None  # used for levelling, if that was by the run
 
     def add(self, rows: FrameRows) -> None:

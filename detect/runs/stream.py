@@ -44,6 +44,7 @@ from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import WorkerPool, Workers, local_workers
+from detect.settings import LEAST_FRAMES
 from detect.sources.interface import ImageRun, RunFrame
 from detect.sources.poses import SomeFrames
 from redetect.storage import OutputExistsError
@@ -55,8 +56,8 @@ _JOURNAL_VERSION = 7
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
 _COMPLETE = "complete"
-#: Number of frames from which the camera's lean is estimated, and their largest spacing.
-_LEAN_FRAMES, _LEAN_STEP = 32, 20
+#: Largest number of frames from which a run's tilt is estimated first, and their largest spacing.
+_FIRST_FRAMES, _FIRST_STEP = 32, 20
 
 _log = logging.getLogger("redetect")
 
@@ -193,7 +194,7 @@ def detect_run(
     with ExitStack() as stack:
         pool = stack.enter_context(closing(WorkerPool(workers)))
         plan = replace(job.plan, json="json" in job.places)
-        plan = _with_lean(job.run, plan, pool)
+        plan = _with_first_look(job.run, plan, pool)
         if plan.circles != job.plan.circles and plan.circles:
             summary.unlevelled_deg = plan.circles.tilt_sigma_deg
         job, summary.lean = replace(job, plan=plan), plan.lean
@@ -216,31 +217,39 @@ def detect_run(
     return summary
 
 
-def _with_lean(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePlan:
-    """The plan with the camera's lean, estimated from some frames of a run."""
+def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePlan:
+    """The plan with what some frames of a run show of its tilt.
+
+    That is the camera's lean and, if positions are not levelled by the run, the usual tilt.
+    """
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    if expected < _LEAN_FRAMES:
+    if expected < LEAST_FRAMES:
         return plan
-    from detect.runs.frame import evidence_of, lean_of_run, pays  # loads the compiler
+    from detect.runs.frame import (  # loads the compiler
+        evidence_of,
+        pays,
+        searched_lean,
+        tilt_of_some,
+    )
 
-    step = min(expected // _LEAN_FRAMES, _LEAN_STEP)
-    tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _LEAN_FRAMES, step)]
+    step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
+    tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
     rows = rows_by(level)
-    lean = lean_of_run(camera, rows)
-    if lean is None:
+    tilt = tilt_of_some(camera, rows)
+    if tilt is None:
         return plan
     if circles.tilt_sigma_deg is None and plan.levelling != "run":
-        sigma_rad = math.hypot(circles.tilt_sigma_rad, math.hypot(*lean) / math.sqrt(2.0))
-        circles = replace(circles, tilt_sigma_deg=round(math.degrees(sigma_rad), 1))
+        circles = replace(circles, tilt_sigma_deg=round(math.degrees(tilt.usual_rad), 2))
         plan = replace(plan, circles=circles)
-    if not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
+    lean = searched_lean(tilt)
+    if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
         return plan
     return replace(plan, lean=lean)
 

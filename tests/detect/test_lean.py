@@ -78,7 +78,7 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     seen = level_rows(tmp_path / "seen.circles")
     assert [len(rows) for rows in seen] == [len(rows) for rows in wrong]
     assert found_again(seen, wrong) < 0.8
-    # They say how wrong they may be: by the lean of the first frames, and by 0.3 degrees as usual.
+    # They say how wrong they may be: by the lean and the tilt of the first frames.
     settings = read_settings(tmp_path / "seen.circles.log.json").circles
     assert settings.tilt_sigma_deg is not None
     assert settings.tilt_sigma_deg == pytest.approx(

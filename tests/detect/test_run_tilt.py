@@ -72,6 +72,17 @@ def test_is_nearer_than_the_frames_and_than_the_constant(seed: int) -> None:
     assert error < 0.9 * np.sqrt(np.mean((run.lean - true) ** 2))
 
 
+@pytest.mark.parametrize("spread", [0.1, 0.5])
+@pytest.mark.parametrize("lean", [np.zeros(2), LEAN])
+def test_usual_tilt_is_that_of_the_frames(spread: float, lean: FloatArray) -> None:
+    true, measured, variance = sequence(4, spread)
+    true, measured = true + lean - LEAN, measured + lean - LEAN
+    run = found_tilt(FrameTilts(measured, variance))
+    # The lens may add to the lean what it does to all verticals.
+    least = math.sqrt(np.mean(true**2))
+    assert 0.95 * least < run.usual_rad < 1.2 * math.hypot(least, COMMON_RAD)
+
+
 def test_verticals_that_lean_together_are_not_believed() -> None:
     """Trunks in view for twenty frames, by three degrees, and not sure of it."""
     true, measured, variance = sequence(4, strays=0.0, jumps=0.0)

@@ -21,7 +21,14 @@ from detect.discs.hough import _MOST_DOUBTFUL
 from detect.discs.judgement import GLANCED, GLANCED_AT
 from detect.discs.rim import DIRECTIONS
 from detect.line_settings import LineSettings
-from detect.settings import PUBLISHED, REPORT, USUAL_TILT_DEG, CircleSettings, MarkerSettings
+from detect.settings import (
+    LEAST_FRAMES,
+    PUBLISHED,
+    REPORT,
+    USUAL_TILT_DEG,
+    CircleSettings,
+    MarkerSettings,
+)
 from redetect.cli import PROGRAMS
 from tests.docs.blocks import documents
 
@@ -49,7 +56,7 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
     ("docs/discs.md", r"the rim is traced in # directions", [DIRECTIONS]),
     ("docs/discs.md", r"at # directions times # pixels", [GLANCED, len(GLANCED_AT)]),
     ("docs/discs.md", r"the best # centres of either polarity", [_MOST_DOUBTFUL]),
-    ("docs/discs.md", r"and a tilt of #°", [USUAL_TILT_DEG]),
+    ("docs/discs.md", r"or #° for fewer images than #", [USUAL_TILT_DEG, LEAST_FRAMES]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),
     ("docs/markers.md", r"takes #, #, #, # and #", list(MARKERS.thresholds)),
     ("docs/camera.md", r"leave it open by more than #", [_ASPECT_SIGMA]),
