@@ -77,9 +77,12 @@ def compare_with_file(
 
     Other parameters as in `compare_frames`; look-alikes, and by default unlisted rows, are those in
     the reference's folder. Raises `redetect.landmarks.LandmarkFileError` if a file cannot be read,
-    and CompareError if all rows of the reference are of the other kind.
+    and CompareError if all rows of the reference are of the other kind, or no image is in both.
     """
-    wanted = read_kind(kind, reference)
+    wanted, detected = read_kind(kind, reference), list(detected)
+    images = map(frames_by_image, (wanted, detected), names)
+    if not set.intersection(*map(set, images)):
+        raise CompareError(f"no image is in both {names[0]} and {names[1]}: expected one run")
 
     def rows(name: str, path: Path | None) -> list[Frame] | None:
         usual = reference.parent / f"{name}.{kind}"

@@ -150,11 +150,13 @@ class Comparison(ABC):
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
     def sentences(self) -> tuple[str, ...]:
-        """Four sentences: found and missed rows, extra rows, errors, covariances."""
+        """Sentences on found and missed rows, extra rows, errors and covariances."""
         found = (
             f"{self.found} of {self.reference} {self.what} of the reference are found, "
-            f"{self.missed} missed, in {len(self.frames)} frames."
+            f"{self.missed} missed, in {len(self.frames)} frame{'s' * (len(self.frames) != 1)}."
         )
+        if not self.reference:
+            found = f"The reference has no {self.what} to find."
         extra = f"{self.matched} of {self.detected} detected rows are {self.what} of the reference;"
         alike = self.on_lookalikes
         if alike is None:
@@ -164,6 +166,10 @@ class Comparison(ABC):
                 f" {alike} are on things known to look like a disc, and "
                 f"{self.extra - alike or 'none'} on nothing known."
             )
+        if not self.detected:
+            extra = f"No {self.what}{' that count' * bool(self.set_aside)} are detected."
+        if not self.matched:
+            return found, extra, "There are no errors: no rows match."
         return found, extra, self._errors(), _agreement(self.normalised_error)
 
     def _beyond(self) -> str:

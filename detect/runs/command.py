@@ -249,8 +249,9 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "according to the calibration, the distortion is not invertible in all of the image: "
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
-    hardly_any = summary.frames >= _FEWEST_FRAMES and 3 * found["discs"] < summary.frames
-    none = not found["discs"] and summary.frames > summary.failed
+    seen = summary.frames - summary.failed
+    hardly_any = seen >= _FEWEST_FRAMES and 3 * found["discs"] < seen
+    none = not found["discs"] and seen > 0
     if plan.circles is not None and plan.circles.refine and (hardly_any or none):
         yield from _hints_on_discs(job, plan.circles, summary)
 

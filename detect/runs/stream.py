@@ -207,7 +207,9 @@ def detect_run(
             for _, rows in frames:
                 count(rows)
         pool.close()
-        summary.images_without_step = job.run.frames.left_out
+        summary.images_without_step = left_out = job.run.frames.left_out
+        if left_out and not summary.frames:
+            raise DetectError(f"{left_out} {job.run.frames.why_left_out}, and none remain")
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
             from detect.runs.frame import level_run  # loads the compiler

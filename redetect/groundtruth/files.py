@@ -19,11 +19,10 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_content
-from redetect.storage.bounds import FINITE, Bounds
+from redetect.storage.bounds import FINITE, LARGEST_NUMBER, Bounds
 from redetect.storage.messages import excerpt, one_line
 
 _LARGEST_FILE_BYTES = 1 << 26
-_LARGEST_NUMBER = 1e100
 _ROUNDING = 1e-6
 _DIGITS = re.compile(r"[-+0-9.eE]*")
 #: A number in a file; unlike `float`, this excludes 1_000, nan and infinity.
@@ -163,7 +162,7 @@ def is_number(value: Any) -> TypeGuard[float]:
     """Whether a value from JSON is a usable number."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return False
-    return abs(value) <= _LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
+    return abs(value) <= LARGEST_NUMBER  # NaN fails this; a whole number may fit no double
 
 
 def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
@@ -270,15 +269,18 @@ def known_name(path: str | os.PathLike[str], line: int, name: str, known: Collec
     return name
 
 
-def parse_numbers(path: str | os.PathLike[str], line: int, words: list[str]) -> list[float]:
-    """The words of a row as finite numbers."""
+def parse_numbers(
+    path: str | os.PathLike[str], line: int, words: list[str], below: float = LARGEST_NUMBER
+) -> list[float]:
+    """The words of a row as finite numbers, within a bound."""
     try:
         # One expression for all words: rows of scans have hundreds. It keeps out 1_0, nan and inf.
         if _DIGITS.fullmatch("".join(words)):
             values = [float(word) for word in words]
-            if all(map(math.isfinite, values)):
+            if max(map(abs, values), default=0.0) < below:
                 return values
     except ValueError:
         pass
-    wrong = next(w for w in words if not (re.fullmatch(NUMBER, w) and math.isfinite(float(w))))
-    raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected a finite number")
+    fit = (re.fullmatch(NUMBER, w) and abs(float(w)) < below for w in words)
+    wrong = next(word for word, fits in zip(words, fit) if not fits)
+    raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected {FINITE.expected}")

@@ -333,9 +333,11 @@ def settings_of(
 ) -> CircleSettings:
     """Settings with the radius and polarity that are given separately."""
     settings = settings or CircleSettings()
+    # Kernels are compiled for Python's numbers, not for those of NumPy.
+    number = radius_m.item() if isinstance(radius_m, np.generic) else radius_m
     return replace(
         settings,
-        radius_m=settings.radius_m if radius_m is None else radius_m,
+        radius_m=settings.radius_m if number is None else number,
         polarity=polarity or settings.polarity,
     )
 
@@ -499,6 +501,8 @@ def explain(
     """
     frame, camera = frame_of_image(image), camera_of(camera)
     chosen = settings_of(settings, radius_m, polarity)
+    if at is not None and (np.shape(at) != (2,) or not np.isreal(at).all()):
+        raise DetectError(f"at is {excerpt(at)}: expected a pixel (u, v)")
     pixels = read_image(frame, camera)
     found = explain_discs(pixels, camera, chosen, at)
     return Explanation(**vars(found), image=pixels, camera=camera, settings=chosen, at=at)

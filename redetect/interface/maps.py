@@ -30,6 +30,7 @@ from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined
 from redetect.storage.bounds import demand_fields
+from redetect.storage.messages import excerpt
 
 PathLike = str | os.PathLike[str]
 Command = TypeVar("Command", Map, Localize)
@@ -225,6 +226,12 @@ def localize(
 
 def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
     paths = dict(options)
+    if without_effect := paths.keys() & {"output", "force", "interactive", "reference"}:
+        raise SlamError(f"{', '.join(sorted(without_effect))}: of the command only")
+    for name in paths.keys() & {"start", "start_sigma"}:
+        paths[name] = tuple(np.ravel(paths[name]).tolist())
+        if len(paths[name]) != 3:
+            raise SlamError(f"{name} is {excerpt(options[name])}: expected three numbers")
     if paths.get("camera") is not None:
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:

@@ -116,7 +116,7 @@ def compare(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     detect.errors.CompareError
-        If an image has two frames, or a required covariance is not positive definite.
+        If an image has two frames, or no image is in both.
     """
     options = options or CompareOptions()
     in_file = None if reference is None else Path(reference)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_bounded, read_plain_array
+from redetect.storage.bounds import FINITE, LARGEST_NUMBER
 
 FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
@@ -249,7 +249,7 @@ def _read(
 ) -> Iterator[tuple[int, list[str]]]:
     """Rows of a file with their line numbers, after a head with either set of columns."""
     try:
-        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8", "surrogateescape")
+        text = read_bounded(path, _LARGEST_FILE_BYTES).decode("utf-8-sig", "surrogateescape")
     except OSError as error:
         reason = error.strerror or error
         raise LandmarkFileError(path, None, f"cannot be read: {reason}: expected {what}") from None
@@ -258,7 +258,10 @@ def _read(
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
-        words = next(csv.reader([line]))
+        try:
+            words = next(csv.reader([line]))
+        except csv.Error as error:
+            raise LandmarkFileError(path, number, str(error)) from None
         if not head:
             if tuple(words) not in (columns, fewer):
                 raise LandmarkFileError(path, number, f"expected the columns {','.join(columns)}")
@@ -280,13 +283,12 @@ def _finite(path: FilePath, line: int, names: Sequence[str], words: Sequence[str
 
 def _number(path: FilePath, line: int, name: str, word: str, kind: type[N]) -> N:
     """A finite float, or an integer of 64 bits."""
-    limit, expected = (2**63, "whole") if kind is int else (math.inf, "finite")
+    whole = (2**63, "a whole number")
+    limit, expected = whole if kind is int else (LARGEST_NUMBER, FINITE.expected)
     try:
         value = kind(word)
     except ValueError:
         value = None
     if value is None or not abs(value) < limit:
-        raise LandmarkFileError(
-            path, line, f"{name} is {word[:30]!r}: expected a {expected} number"
-        )
+        raise LandmarkFileError(path, line, f"{name} is {word[:30]!r}: expected {expected}")
     return value

@@ -2,8 +2,8 @@
 
 Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
 metres and radians. The field names are those of the format. Values that could not be read back from
-a file raise `LandmarkError`: numbers that are not finite, identifiers of more than 64 bits, names
-that are not one word.
+a file raise `LandmarkError`: numbers that are enormous or not finite, identifiers of more than 64
+bits, names that are not one word.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass
-from math import isfinite
 from operator import attrgetter
 
+from redetect.storage.bounds import FINITE, LARGEST_NUMBER
 from redetect.storage.messages import OneLineError, excerpt
 
 STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
@@ -212,9 +212,9 @@ class Row:
 
 
 def _demand_finite(names: tuple[str, ...], values: tuple[float, ...]) -> None:
-    if not all(map(isfinite, values)):
-        name, value = next(pair for pair in zip(names, values) if not isfinite(pair[1]))
-        raise LandmarkError(f"{name} is {value}: expected a finite number")
+    if not all(map(LARGEST_NUMBER.__ge__, map(abs, values))):
+        name, value = next(p for p in zip(names, values) if not abs(p[1]) <= LARGEST_NUMBER)
+        raise LandmarkError(f"{name} is {value}: expected {FINITE.expected}")
 
 
 def _demand_word(word: str, name: str) -> None:

@@ -16,6 +16,8 @@ from redetect.storage.bounds import (
     whole,
 )
 
+#: Bounds of positions given by flags (m, rad) and of their standard deviations.
+PLACE, PLACE_SIGMA = from_to(-1e12, 1e12), from_to(0.0, 1e12)
 Method = Literal["nearest", "joint"]
 
 

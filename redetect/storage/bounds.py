@@ -41,7 +41,7 @@ class Bounds:
             return False
         try:
             return bool(self.include(value))
-        except TypeError:
+        except (TypeError, ValueError):  # the latter for arrays
             return False
 
 
@@ -62,9 +62,11 @@ def whole(least: int, most: int | None = None) -> Bounds:
     return Bounds(f"a whole number, {words}", lambda x: least <= x <= last, whole=True)
 
 
-FINITE = Bounds("a finite number", lambda x: -inf < x < inf)
-ABOVE_0 = Bounds("above 0", lambda x: 0.0 < x < inf)
-NOT_NEGATIVE = Bounds("0 or more", lambda x: 0.0 <= x < inf)
+#: Largest magnitude of numbers in files and settings: products of some of them are finite.
+LARGEST_NUMBER = 1e24
+FINITE = Bounds(f"a finite number, within +-{LARGEST_NUMBER:g}", lambda x: abs(x) <= LARGEST_NUMBER)
+ABOVE_0 = Bounds(f"above 0, at most {LARGEST_NUMBER:g}", lambda x: 0.0 < x <= LARGEST_NUMBER)
+NOT_NEGATIVE = Bounds(f"0 or more, at most {LARGEST_NUMBER:g}", lambda x: 0 <= x <= LARGEST_NUMBER)
 SHARE = from_to(0.0, 1.0)
 PROBABILITY = inside(0.0, 1.0)
 

@@ -104,10 +104,16 @@ def _is_unread() -> bool:
 
 def _message(error: Exception) -> str:
     """The error's message, with advice if a folder is missing or kernels cannot be cached."""
-    if isinstance(error, FileNotFoundError) and isinstance(error.filename, str | os.PathLike):
-        folder = Path(error.filename).parent
-        if not folder.is_dir():
-            return f"{error.filename}: no such folder: {folder}: make it first, or name another"
+    if isinstance(error, OSError) and isinstance(error.filename, str | os.PathLike):
+        path = Path(error.filename)
+        if isinstance(error, FileExistsError | FileNotFoundError | NotADirectoryError):
+            for place in (path, *path.parents):
+                if place.exists() and not place.is_dir():
+                    return f"{place}: is not a folder: expected one, or the name of a new one"
+        if isinstance(error, IsADirectoryError):
+            return f"{path}: is a folder: expected the name of a file"
+        if isinstance(error, FileNotFoundError) and not path.parent.is_dir():
+            return f"{path}: no such folder: {path.parent}: make it first, or name another"
     if _is_of_cache(error):
         lost = "kept" if isinstance(error, OSError) else "loaded"
         return f"compiled kernels cannot be {lost}: {error}: {_ADVICE}"

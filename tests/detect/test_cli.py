@@ -105,6 +105,11 @@ def test_images_without_step_are_told(small_run: Path, capsys: Captured) -> None
     (small_run / "s.txt").write_text("\n".join(rows[:-1]) + "\n")
     assert main(["circles", str(small_run)]) == 0
     assert "1 images are not named by a STEP row" in capsys.readouterr().out
+    (small_run / "s.txt").write_text("# no row\n")
+    assert main(["circles", str(small_run), "--force"]) == 1
+    assert (
+        "images are not named by a STEP row: left out, and none remain" in capsys.readouterr().err
+    )
 
 
 def test_missing_named_calibration(small_run: Path, capsys: Captured) -> None:

@@ -103,6 +103,8 @@ def test_radius_and_settings(demo_image: Path, demo_camera: rd.Camera) -> None:
     settings = rd.CircleSettings(polarity="dark", threshold=0.9)
     found = rd.detect(demo_image, demo_camera, radius_m=0.06, settings=settings)
     assert found.settings == rd.CircleSettings(polarity="dark", threshold=0.9, radius_m=0.06)
+    single: Any = np.float32(0.0625)
+    assert type(rd.detect(demo_image, demo_camera, radius_m=single).settings.radius_m) is float
     with pytest.raises(rd.Error, match="radius_m is -1"):
         rd.detect(demo_image, demo_camera, radius_m=-1.0)
     wrong: Any = "grey"
@@ -243,6 +245,14 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
         rd.map(demo, circles=False)
     with pytest.raises(rd.Error, match="association is 'all': expected one of known, nearest"):
         rd.localize(demo, landmarks, association="all")
+    with pytest.raises(rd.Error, match=r"^1 poses: expected 81, as in this run"):
+        in_memory.distance(landmarks.path.part(0, 1))
+    with pytest.raises(rd.Error, match="force, reference: of the command only"):
+        rd.localize(demo, landmarks, reference="path.csv", force=True)
+    with pytest.raises(rd.Error, match=r"start is \(0, 0\): expected three numbers"):
+        rd.map(demo, start=(0, 0))
+    moved = rd.map(demo, start=np.array([1.0, 2.0, 0.5]))
+    np.testing.assert_allclose(moved.path.poses[0], [1.0, 2.0, 0.5])
     both = rd.map(demo, more=str(demo))
     assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
     assert len(repr(landmarks)) < 200
@@ -292,6 +302,9 @@ def test_places_where_nothing_can_be_found(
 ) -> None:
     # Looking for another radius takes long; that it is found is tried above.
     monkeypatch.setattr("detect.discs.unfound._radius_at", lambda *_: None)
+    for wrong in ((300.0,), (1, 2, 3), 5, "ab"):
+        with pytest.raises(rd.Error, match=r"at is .*: expected a pixel"):
+            rd.explain(demo_image, demo_camera, wrong)  # type: ignore[arg-type]
     for at, words in (
         ((300.0, 10.0), "does not see the floor"),
         ((900.0, 100.0), "outside the image"),

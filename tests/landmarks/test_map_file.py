@@ -41,6 +41,9 @@ def test_a_map_comes_back(tmp_path: Path) -> None:
     assert len(again.lines) == 0
     with pytest.raises(OutputExistsError):
         write_map(tmp_path / "m.csv", again)
+    # As spreadsheets save it, with a byte order mark.
+    (tmp_path / "marked.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "m.csv").read_bytes())
+    np.testing.assert_array_equal(read_map(tmp_path / "marked.csv").discs.ids, discs.ids)
 
 
 @pytest.mark.parametrize("with_covariance", [True, False])
@@ -73,6 +76,8 @@ def test_a_path_comes_back(tmp_path: Path, with_covariance: bool) -> None:
         (HEAD + "disc,1,0,0,1,2,1,3\n", "covariance is negative"),
         (HEAD + "disc,1,0,0,1,0,1,3\n\ndisc,1,0,0,1,0,1,3\n", ":4: disc 1 is already in the map"),
         (HEAD + "disc,1,0,0,1,0,1\n", ":2: 7 values: expected 8"),
+        (HEAD + "disc,1,0,1e300,1,0,1,3\n", ":2: y_m is '1e300': expected .* within"),
+        (HEAD + "x" * 200_000, ":2: field larger than field limit"),
     ],
 )
 def test_a_malformed_map_names_the_line(tmp_path: Path, text: str, message: str) -> None:

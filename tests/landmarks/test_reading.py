@@ -124,6 +124,7 @@ def test_an_empty_file_has_no_frames(tmp_path: Path) -> None:
         ("LANDMARK_C 1 2 nan 1 0 1", "quality is 'nan': expected a finite number"),
         ("LANDMARK_C 1 inf 0 1 0 1", "py is 'inf': expected a finite number"),
         ("LANDMARK_C 1e999 0 0 1 0 1", "px is inf: expected a finite number"),
+        ("LANDMARK_C -1e300 0 0 1 0 1", "px is -1e+300: expected a finite number, within +-1e+24"),
         ("LANDMARK_C 1_0 0 0 1 0 1", "px is '1_0': expected a finite number"),
         ("LANDMARK_C 1,5 0 0 1 0 1", "px is '1,5': expected a finite number"),
         ("LANDMARK_C 1 2 3 4 5", "LANDMARK_C with 5 values: expected at least 6"),

@@ -13,6 +13,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import read_frames
 from redetect.plane import apply
 from redetect.slam.cli import main
+from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import audit_run
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import LineRows, Recording, read_recording
@@ -169,13 +170,23 @@ def test_what_no_landmark_explains_loses_its_identifier(project_root: Path, tmp_
 
 @pytest.mark.parametrize(
     ("flags", "said"),
-    [(["--gate", "0"], "gate is 0: expected above 0"), (["--lines"], "expected discs")],
+    [
+        (["--gate", "0"], "gate is 0: expected above 0"),
+        (["--gate", "1e300"], "gate is 1e+300: expected above 0, at most 1e+24"),
+        (["--lines"], "expected discs"),
+    ],
 )
 def test_impossible_settings_are_refused(
     project_root: Path, flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["audit", str(project_root / "images" / "e"), *flags]) == 1
     assert said in capsys.readouterr().err
+
+
+def test_a_gate_that_no_row_passes_is_refused() -> None:
+    run = replace(small_run(1, steps=20).recording, lines=LineRows.of())
+    with pytest.raises(SlamError, match=r"no row is certain with gate 0\.001: expected a larger"):
+        audit_run(run, gate=1e-3)
 
 
 @pytest.mark.long

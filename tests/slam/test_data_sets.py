@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -127,9 +128,89 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
     )
     assert main(["import", str(odd / "Robot1_Measurement.dat"), "-o", target]) == 1
     assert "expected a RobotN_Odometry.dat" in capsys.readouterr().err
+    assert main(["import", str(odd / "aa3_dr.mat"), "-o", target]) == 1
+    assert "aa3_dr.mat: cannot be read ([Errno 2] No such" in capsys.readouterr().err
     (odd / "aa3_dr.mat").write_text("no matrix")
     assert main(["import", str(odd / "aa3_dr.mat"), "-o", target]) == 1
     assert "aa3_dr.mat: cannot be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        (
+            "Robot1_Odometry",
+            "5 1 0\n3 1 0\n6 1 0\n",
+            "Odometry.dat: 3.000 is after 5.000: expected order",
+        ),
+        (
+            "Robot1_Odometry",
+            "5000 1 0\n6000 1 0\n",
+            "dat: times 5000.000 to 6000.000, Robot1_Measurement.dat: ",
+        ),
+        (
+            "Robot1_Measurement",
+            "5 100 -1 0\n",
+            "expected a subject for each barcode, and ranges above 0",
+        ),
+        (
+            "Robot1_Measurement",
+            "5 100 1e200 0\n",
+            "dat: expected numbers within +-1e+24",
+        ),
+        ("Barcodes", "6 100\n7 100\n", "expected a subject for each barcode, and ranges above 0"),
+        (
+            "Robot1_Groundtruth",
+            "5 1 0 0\n3 1 0 0\n",
+            "truth.dat: 3.000 is after 5.000: expected order",
+        ),
+        (
+            "Robot1_Groundtruth",
+            "7000 1 0 0\n8000 1 0 0\n",
+            "Robot1_Groundtruth.dat: 7000.000 to 8000.000: expected",
+        ),
+        ("Robot1_Groundtruth", "5 1 0 0\n5.5 1 0 0\n", None),
+        ("Landmark_Groundtruth", "6 1 0 0 0\n6 1 0 0 0\n", "expected landmarks, each once"),
+        ("Landmark_Groundtruth", "6.5 1 0 0 0\n", "expected landmarks, each once, with whole"),
+        ("Landmark_Groundtruth", "", "expected landmarks"),
+    ],
+)
+def test_rows_that_contradict_each_other_are_refused(
+    name: str, text: str, told: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = {
+        "Robot1_Odometry": "4 1 0\n6 1 0\n",
+        "Robot1_Measurement": "5 100 1 0\n",
+        "Barcodes": "6 100\n",
+        "Robot1_Groundtruth": "3 0 0 0\n7 1 0 0\n",
+    }
+    for each, content in (files | {name: text}).items():
+        (tmp_path / f"{each}.dat").write_text(content)
+    of_map = name == "Landmark_Groundtruth"
+    file, output = (f"{name}.dat", "map.csv") if of_map else ("Robot1_Odometry.dat", "run.circles")
+    output = "true.csv" if name == "Robot1_Groundtruth" else output
+    code = main(["import", str(tmp_path / file), "-o", str(tmp_path / output)])
+    assert code == int(told is not None)
+    said = "".join(capsys.readouterr())
+    assert (told or "2 poses, 1 of them outside the true ones: the nearest") in said
+
+
+def test_a_clock_that_is_set_back_a_little_changes_nothing(utias: Path, tmp_path: Path) -> None:
+    written, outputs = [], ("again.circles", "again.csv")
+    for name, swap in (("sorted", 0), ("set back", 1)):
+        folder = tmp_path / name
+        shutil.copytree(utias, folder)
+        for log in ("Odometry", "Groundtruth"):
+            path = folder / f"Robot1_{log}.dat"
+            head, rows = path.read_text().split("\n", 1)
+            lines = rows.splitlines()
+            lines[10], lines[10 + swap] = lines[10 + swap], lines[10]
+            path.write_text("\n".join([head, *lines]) + "\n")
+        for output in outputs:
+            odometry = str(folder / "Robot1_Odometry.dat")
+            assert main(["import", odometry, "-o", str(folder / output)]) == 0
+        written.append([(folder / output).read_bytes() for output in outputs])
+    assert written[0] == written[1]
 
 
 def scan_of(trees: FloatArray, pose: FloatArray, radius_m: float = 0.25) -> FloatArray:
@@ -191,6 +272,31 @@ def test_victoria_park_is_mapped_from_odometry(tmp_path: Path) -> None:
     true = np.stack([scanner[:, 1] - scanner[0, 1], scanner[0, 0] - scanner[:, 0]], axis=1)
     off = path[:, :2] - path[0, :2] - true
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"time": [0, 2, 1]}, "aa3_dr.mat: 1.000 is after 2.000: expected order"),
+        ({"TLsr": [1, 0]}, "aa3_lsr2.mat: 0.000 is after 1.000: expected order"),
+        ({"TLsr": [9, 9]}, "times 0.000 to 2.000, aa3_lsr2.mat: 9.000 to 9.000"),
+        ({"speed": [np.nan, 1, 1]}, "is nan: expected a finite number"),
+        ({"time": [], "speed": [], "steering": []}, "times none, aa3_lsr2.mat: 0.000"),
+    ],
+)
+def test_a_car_out_of_time_is_refused(
+    changed: dict[str, list[float]],
+    told: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    drive = {"time": [0, 1, 2], "speed": [1, 1, 1], "steering": [0, 0, 0], **changed}
+    scans = {"TLsr": [0, 1], "LASER": np.full((2, 361), 10.0), **changed}
+    savemat(tmp_path / "aa3_dr.mat", drive)
+    savemat(tmp_path / "aa3_lsr2.mat", scans)
+    target = str(tmp_path / "run.circles")
+    assert main(["import", str(tmp_path / "aa3_dr.mat"), "-o", target]) == 1
+    assert told in capsys.readouterr().err
 
 
 def test_trunks_are_found_where_nothing_hides_them() -> None:

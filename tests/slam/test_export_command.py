@@ -119,6 +119,9 @@ def test_a_trajectory_with_times(tmp_path: Path, capsys: Capture) -> None:
     np.testing.assert_allclose(exported[:, 1:3], from_dataset(poses)[1:, :2])
     named = [*arguments, str(tmp_path / "f.tum"), "--times"]
     refused([*named, str(run / "a.times")], f"no time of {prefixes[-1]}: expected", capsys)
+    swapped = [rows[0].split()[0] + " 2e9\n", *rows[1:]]
+    (run / "b.times").write_text("".join(swapped))
+    refused([*named, str(run / "b.times")], "b.times: the frames' times go back", capsys)
     (tmp_path / "c.times").write_text(rows[0] + "e.0001 x\n")
     refused([*named, str(tmp_path / "c.times")], "c.times:2: 'e.0001 x': expected", capsys)
     (tmp_path / "c.times").write_text("e.0001\n")

@@ -170,14 +170,18 @@ def test_runs_that_can_not_be_mapped(
     assert not list(tmp_path.glob("slam/*/*"))
 
 
+AWAY = ["--start", "50", "50", "0"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--start-sigma", "0", "-1", "0"], "start_sigma"),
-        (["--start", "0", "nan", "0"], "expected a finite number"),
+        (["--start", "0", "nan", "0"], "start is nan: expected -1e+12 to 1e+12"),
         (["--gate-probability", "1"], "gate_probability"),
         (["--reference", "short.csv"], "short.csv: 2 poses: expected 7"),
-        (["--map", "other.csv"], "no row shows a landmark"),
+        (["--map", "other.csv"], "expected identifiers of the same run, or --association joint"),
+        (["--map", "other.csv", "--association", "joint", *AWAY], "expected some near one, seen"),
         (["--map", "missing.csv"], "cannot be read"),
     ],
 )

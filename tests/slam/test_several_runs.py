@@ -128,7 +128,9 @@ def test_a_run_of_another_building_is_refused(
     assert "the frames from start (" in capsys.readouterr().err
     assert not list(tmp_path.glob("found*"))
     assert main(["map", *files, "-o", str(tmp_path / "map")]) == 1
-    assert "disconnected at step" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"{files[0]}, {files[1]}: disconnected at step" in said
+    assert "(start): odometry is lost or another run begins there, and the parts" in said
 
 
 def test_maps_lie_where_they_are_certain_to() -> None:

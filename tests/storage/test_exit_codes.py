@@ -27,6 +27,16 @@ class WrongFileError(OneLineError, ValueError):
             EXIT_ERROR,
             "error: gone/e.csv: no such folder: gone: make it first, or name another\n",
         ),
+        (
+            NotADirectoryError(20, "Not a directory", f"{__file__}/e.csv"),
+            EXIT_ERROR,
+            f"error: {__file__}: is not a folder: expected one, or the name of a new one\n",
+        ),
+        (
+            IsADirectoryError(21, "Is", "."),
+            1,
+            "error: .: is a folder: expected the name of a file\n",
+        ),
         (KeyboardInterrupt(), EXIT_INTERRUPTED, "interrupted\n"),
     ],
 )

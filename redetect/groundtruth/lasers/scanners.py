@@ -316,7 +316,8 @@ def _read_rows(
     for line, words in read_rows(path, _LARGEST_FILE_BYTES):
         if not rows and words[0].lower() in ("t", "t_s", "time"):
             continue
-        values = np.array(parse_numbers(path, line, words))
+        # Some scanners have the largest float for beams without a return.
+        values = np.array(parse_numbers(path, line, words, below=np.inf))
         if readings is not None and len(values) == readings + 2:
             values = values[1:]
         columns = columns or len(values)

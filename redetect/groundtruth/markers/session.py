@@ -252,6 +252,8 @@ def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[Ma
             raise GroundTruthError(f"{times_path}: no time of image {prefix}")
         time_s = times[prefix] if timed else float(number)
         frames.append(MarkerFrame(camera, prefix, time_s, frame.markers))
+    if not frames:
+        raise GroundTruthError(f"{run / DETECTED_NAME}: no STEP row: expected those of images")
     return frames
 
 

@@ -103,7 +103,8 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
     for line, words in read_rows(path):
         if len(words) not in allowed:
-            expected = f"{' or '.join(map(str, allowed))}: t, x, y, theta and 9 of covariance"
+            expected = f"{' or '.join(map(str, allowed))}: t, x, y, theta"
+            expected += " and 9 of covariance" if _COVARIANCE_COLUMNS in allowed else ""
             raise GroundTruthError(f"{path}:{line}: {len(words)} numbers: expected {expected}")
         allowed = (len(words),)
         rows.append(parse_numbers(path, line, words))

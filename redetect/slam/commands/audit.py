@@ -110,7 +110,7 @@ def _report(recording: Recording, audit: Audit) -> list[str]:
     for name, table in tables.items():
         lines.append(
             f"{name:<12}{table.measurements:>8,}{table.landmarks:>8,}{table.chi_squared:>14,.2f}"
-            f"{table.expected:>10,}{table.factor:>8.2f}"
+            f"{table.expected:>10,}{f'{table.factor:.2f}' if table.expected > 0 else '-':>8}"
         )
     return lines
 

@@ -70,7 +70,10 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
         times = read_times(file)
         missing = [name for name in path.prefixes[1:] if name not in times]
         if not missing:
-            return {name: times[name] for name in path.prefixes[1:]}
+            found = {name: times[name] for name in path.prefixes[1:]}
+            if np.any(np.diff(list(found.values())) < 0.0):
+                raise SlamError(f"{file}: the frames' times go back: expected them in order")
+            return found
         if command.times:
             raise SlamError(f"{file}: no time of {missing[0]}: expected those of all frames")
     return None
@@ -123,7 +126,9 @@ def _import_data_set(command: Import) -> int:
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
         return 0
     if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
-        return _write_path(command, data_sets.read_truth(file))
+        path, repeated = data_sets.read_truth(file)
+        note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
+        return _write_path(command, path, note)
     sigmas = command.range_sigma, command.bearing_sigma
     if file.name.endswith(data_sets.ODOMETRY):
         run = data_sets.read_robot(file, *sigmas)
@@ -144,9 +149,9 @@ def _write_run(command: Import, run: Recording, what: str) -> int:
     return 0
 
 
-def _write_path(command: Import, path: Path2D) -> int:
+def _write_path(command: Import, path: Path2D, note: str = "") -> int:
     write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
-    print(f"{command.output}: {len(path.poses)} poses")
+    print(f"{command.output}: {len(path.poses)} poses{note}")
     return 0
 
 

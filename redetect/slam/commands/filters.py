@@ -41,8 +41,9 @@ from redetect.slam.filters.localizer import Localizer
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
+from redetect.slam.settings import PLACE, PLACE_SIGMA
 from redetect.storage import demand_free, write_bytes
-from redetect.storage.bounds import FINITE, NOT_NEGATIVE, demand
+from redetect.storage.bounds import demand
 
 ERROR_PICTURE = "errors.png"
 
@@ -53,7 +54,7 @@ _Result = tuple[FilterRun, LandmarkMap, list[str]]
 
 def perform(command: Localize | Ekf) -> int:
     """Execute the command; returns the exit code."""
-    demand(command, SlamError, start=FINITE)
+    demand(command, SlamError, start=PLACE)
     name = type(command).__name__.lower()
     output = command.output or default_output(command.run, name)
     names = [PATH_NAME, f"{name}.json", MAP_PICTURE]
@@ -71,8 +72,10 @@ def perform(command: Localize | Ekf) -> int:
         source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
     seconds = time.perf_counter() - began
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
-    reference = _reference_of(command, run)
-    distance = None if reference is None else path_distance(run.path, reference.poses)
+    reference = None if command.reference is None else read_path(command.reference)
+    distance = None
+    if reference is not None:
+        distance = path_distance(run.path, reference.poses, f"{command.reference}: ")
 
     output.mkdir(parents=True, exist_ok=True)
     head = [f"slam {name} {slam.__version__}: {source}"]
@@ -106,19 +109,6 @@ def perform(command: Localize | Ekf) -> int:
     return 0
 
 
-def _reference_of(command: Localize | Ekf, run: FilterRun) -> Path2D | None:
-    """The path to compare with, pose by pose, if a command names one."""
-    if command.reference is None:
-        return None
-    reference = read_path(command.reference)
-    if len(reference.poses) != len(run.path.poses):
-        raise SlamError(
-            f"{command.reference}: {len(reference.poses)} poses: expected "
-            f"{len(run.path.poses)}, the start and one after each step of the run"
-        )
-    return reference
-
-
 def _localized(command: Localize, recording: Recording) -> _Result:
     landmark_map = read_map(command.map)
     said: list[str] = []
@@ -137,7 +127,7 @@ def localized_run_of(
 
     Raises `SlamError` if no row shows a landmark of the map, or a flag is out of its range.
     """
-    demand(command, SlamError, start=FINITE, start_sigma=NOT_NEGATIVE)
+    demand(command, SlamError, start=PLACE, start_sigma=PLACE_SIGMA)
     start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))
     if command.lost:
         start, covariance = _global_start(command, recording, landmark_map)
@@ -153,10 +143,11 @@ def localized_run_of(
     associator = Associator(command.association, command.gate_probability)
     run = run_filter(recording, localizer, associator)
     if not run.count.discs and not run.count.lines:
-        raise SlamError(
-            f"{command.run}: no row shows a landmark of {command.map}: expected identifiers of the "
-            "same run, or --association joint"
-        )
+        expected = "identifiers of the same run, or --association joint"
+        if command.association != "known":
+            expected = "some near one, seen from the pose at --start"
+        lost = f"{command.run}: no row shows a landmark of {command.map}"
+        raise SlamError(f"{lost}: expected {expected}")
     return run
 
 
@@ -199,13 +190,15 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     return run, landmark_map, said
 
 
-def path_distance(path: Path2D, reference: ArrayLike) -> dict[str, float]:
+def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
     """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
 
     Root mean square, median and largest distance of positions (m) and headings (rad), and those of
-    the last pose.
+    the last pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
     """
     other = np.asarray(reference, dtype=np.float64)
+    if len(other) != len(path.poses):
+        raise SlamError(f"{name}{len(other)} poses: expected {len(path.poses)}, as in this run")
     position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
     heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
     return {
@@ -263,9 +256,8 @@ def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
     """Lines for the terminal."""
     count = run.count
     lines = [f"steps             {len(run.path.poses) - 1}"]
-    used = [f"{count.discs} of discs"] * bool(count.discs) + [f"{count.lines} of lines"] * bool(
-        count.lines
-    )
+    rows = {"discs": count.discs, "lines": count.lines}
+    used = [f"{number} of {what}" for what, number in rows.items() if number]
     lines.append(f"rows used         {', '.join(used) or 'none'}")
     for reason, number in sorted(count.left_out.items()):
         lines.append(f"left out          {number} ({reason})")

@@ -40,8 +40,9 @@ from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
+from redetect.slam.settings import PLACE
 from redetect.storage import demand_free, write_bytes
-from redetect.storage.bounds import ABOVE_0, FINITE, demand
+from redetect.storage.bounds import ABOVE_0, demand
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
@@ -101,7 +102,7 @@ def perform(command: Map) -> int:
 
 def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     """The map of a run's rows, as a command asks."""
-    demand(command, SlamError, start=FINITE, loss_scale=ABOVE_0)
+    demand(command, SlamError, start=PLACE, loss_scale=ABOVE_0)
     camera = None
     if command.calibrate or len(recording.lines):
         camera = camera_of_run(command.run, command.camera)
@@ -118,7 +119,7 @@ def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
         weighting,
         start=command.start,
         solver=command.solver,
-        name=str(command.run),
+        name=", ".join(map(str, command.runs)),
     )
 
 
@@ -129,7 +130,7 @@ def _report(mapped: MappedRun, seconds: float) -> list[str]:
     if mapped.mounting is not None:
         lines += _mounting_lines(mapped.mounting)
     lines += _left_out_lines(mapped.left_out)
-    lines.append(f"{mapped.steps} steps, {seconds:.2f} s")
+    lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
 
 
@@ -147,12 +148,12 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
 
 def _left_out_lines(left_out: LeftOut) -> list[str]:
     said = [
-        (left_out.rows_without_id, "rows without an identifier were not used"),
-        (left_out.discs_seen_once, "discs were seen once"),
-        (left_out.lines_without_parallax, "lines had too little parallax and were not used"),
-        (left_out.line_rows, "rows of these lines were not used"),
+        (left_out.rows_without_id, "rows without an identifier, not used"),
+        (left_out.discs_seen_once, "discs seen once"),
+        (left_out.lines_without_parallax, "lines with too little parallax, not used"),
+        (left_out.line_rows, "rows of these lines, not used"),
     ]
-    return [f"{count} {what}" for count, what in said if count]
+    return [f"{what}: {count}" for count, what in said if count]
 
 
 def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:

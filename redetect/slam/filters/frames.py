@@ -418,9 +418,9 @@ def run_filter(
         disc_ids.extend(identified.circles.ids.tolist())
         line_ids.extend(identified.lines.ids)
         poses[k + 1], covariance[k + 1] = estimate.state[:3], estimate.pose_covariance
-    count = estimate.count
-    count.leave_out("disc without ID", disc_ids.count(UNKNOWN_ID))
-    count.leave_out("line without ID", line_ids.count(()))
+    count, what = estimate.count, "ID" if pairing.method == "known" else "match"
+    count.leave_out(f"disc without {what}", disc_ids.count(UNKNOWN_ID))
+    count.leave_out(f"line without {what}", line_ids.count(()))
     return FilterRun(
         path=Path2D(("start", *recording.prefixes), poses, covariance),
         count=count,

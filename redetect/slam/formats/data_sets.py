@@ -30,11 +30,14 @@ from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
+from redetect.storage.bounds import LARGEST_NUMBER
 
 #: Suffixes of the names of a robot's odometry and of the files beside it.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
 LANDMARKS, BARCODES = "Landmark_Groundtruth.dat", "Barcodes.dat"
 _ROBOTS = 5
+#: Most that the clock of a robot's log may go back, seconds.
+_SET_BACK_S = 1.0
 
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
@@ -103,6 +106,8 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
     subject = {int(barcode): int(number) for number, barcode in barcodes}
     ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
+    if len(subject) < len(barcodes) or np.any(seen[:, 2] <= 0.0):
+        raise SlamError(f"{odometry}: expected a subject for each barcode, and ranges above 0")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
     return _Sightings(times, frame, seen[order, 2], seen[order, 3], ids[order])
@@ -113,9 +118,8 @@ def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
 
     Takes the standard deviations of ranges and bearings.
     """
-    velocity, seen = _table(odometry, "time v omega"), _seen_by_robot(odometry)
-    if len(seen.times) == 0 or len(velocity) == 0:
-        raise SlamError(f"{odometry}: no odometry, or no landmark seen: expected both")
+    velocity, seen = _log(odometry, "time v omega"), _seen_by_robot(odometry)
+    _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     steps = _velocity_steps(velocity, seen.times)
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad)
     return _run(seen.times, steps, CircleRows(seen.frame, *rows, seen.ids))
@@ -127,22 +131,25 @@ def _run(times: FloatArray, steps: FloatArray, rows: CircleRows) -> Recording:
     return Recording(_names(times), to_dataset(steps), unstated, rows, LineRows.of())
 
 
-def read_truth(odometry: Path) -> Path2D:
-    """True poses of a robot at the times of its frames, and first that at the start."""
-    times, logged = _seen_by_robot(odometry).times, _table(odometry, "time v omega")
-    truth = _table(_beside(odometry, TRUTH), "time x y theta")
-    if min(len(truth), len(times), len(logged)) == 0:
-        raise SlamError(f"{odometry}: no odometry, landmark seen or true pose: expected some")
+def read_truth(odometry: Path) -> tuple[Path2D, int]:
+    """True poses at a robot's start and its frames; how many lie outside: these are the nearest."""
+    times, logged = _seen_by_robot(odometry).times, _log(odometry, "time v omega")
+    truth = _log(_beside(odometry, TRUTH), "time x y theta")
+    _demand_together(odometry, logged[:, 0], _beside(odometry, MEASUREMENTS), times)
+    _demand_together(odometry, times, _beside(odometry, TRUTH), truth[:, 0])
     at = np.concatenate([[min(logged[0, 0], times[0])], times])
+    repeated = int(np.count_nonzero((at < truth[0, 0]) | (at > truth[-1, 0])))
     columns = (truth[:, 1], truth[:, 2], np.unwrap(truth[:, 3]))
     poses = np.stack([np.interp(at, truth[:, 0], column) for column in columns], axis=1)
-    return Path2D(("start", *_names(times)), to_dataset(poses))
+    return Path2D(("start", *_names(times)), to_dataset(poses)), repeated
 
 
 def read_landmarks(path: Path) -> LandmarkMap:
     """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map."""
     table = _table(path, "subject x y x_sigma y_sigma")
     table = table[np.argsort(table[:, 0])]
+    if not len(table) or np.any(table[:, 0] % 1.0) or not np.all(np.diff(table[:, 0]) > 0.0):
+        raise SlamError(f"{path}: expected landmarks, each once, with whole numbers as subjects")
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
@@ -169,9 +176,31 @@ def _beside(odometry: Path, ending: str) -> Path:
     return odometry.with_name(odometry.name.removesuffix(ODOMETRY) + ending)
 
 
+def _demand_order(path: Path, times: FloatArray, slack: float = 0.0) -> None:
+    """Raise `SlamError` if times go back by more than some slack."""
+    for k in np.flatnonzero(np.diff(times) < -slack)[:1]:
+        raise SlamError(f"{path}: {times[k + 1]:.3f} is after {times[k]:.3f}: expected order")
+
+
+def _demand_together(one: Path, first: FloatArray, other: Path, second: FloatArray) -> None:
+    """Raise `SlamError` unless the times in two files, in order, overlap."""
+    parts = [f"{t[0]:.3f} to {t[-1]:.3f}" if len(t) else "none" for t in (first, second)]
+    if "none" in parts or max(first[0], second[0]) > min(first[-1], second[-1]):
+        raise SlamError(f"{one}: times {parts[0]}, {other.name}: {parts[1]}: expected common ones")
+
+
+def _log(path: Path, names: str) -> FloatArray:
+    """The numbers of a file, by time. A clock that a network sets may go back by some of it."""
+    table = _table(path, names)
+    _demand_order(path, table[:, 0], _SET_BACK_S)
+    return table[np.argsort(table[:, 0], kind="stable")]
+
+
 def _table(path: Path, names: str) -> FloatArray:
     """The numbers of a file."""
     rows = [row for _, row in rows_of_numbers(path, "file of the data set", names, SlamError)]
+    if np.any(np.abs(np.array(rows)) > LARGEST_NUMBER):
+        raise SlamError(f"{path}: expected numbers within +-{LARGEST_NUMBER:g}")
     return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
 
 
@@ -182,6 +211,9 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
     if len({len(time), len(speed), len(steering)}) != 1 or laser.shape != (len(scanned), _BEAMS):
         raise SlamError(f"{drive}: expected rows of equal number, and scans of {_BEAMS} beams")
+    _demand_order(drive, time)
+    _demand_order(drive.with_name(SCANS), scanned)
+    _demand_together(drive, time, drive.with_name(SCANS), scanned)
     usable = scanned >= time[0]
     times, scans = scanned[usable] / 1000.0, laser[usable] / 100.0
     found = [trees_of(scan) for scan in scans]
@@ -228,9 +260,9 @@ def _car_steps(
 
 def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
     try:
-        content = loadmat(path)
+        content = loadmat(str(path))
         return [np.asarray(content[name], dtype=np.float64) for name in names]
-    except (OSError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
+    except (OSError, TypeError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
         raise SlamError(
             f"{path}: cannot be read ({error}): expected a MATLAB file with {', '.join(names)}"
         ) from None

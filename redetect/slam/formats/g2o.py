@@ -14,7 +14,6 @@ Comments are at the end: GTSAM's reader ignores all edges after the first unknow
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -36,6 +35,7 @@ from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage import write_text
 from redetect.storage.bounded import read_text
+from redetect.storage.bounds import FINITE
 
 #: The largest number of a vertex: other tools store it in 31 bits.
 LARGEST_NUMBER = 2**31 - 1
@@ -218,9 +218,7 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
             numbers = tuple(map(float, words[count:]))
         except ValueError:
             vertices, numbers = (), ()
-        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(
-            map(math.isfinite, numbers)
-        )
+        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(map(FINITE.hold, numbers))
         if not usable or len(numbers) != len(names):
             raise SlamError(
                 f"{path}:{line}: {kind} {' '.join(words)[:60]!a}: expected "

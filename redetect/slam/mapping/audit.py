@@ -100,6 +100,8 @@ def audit_run(
     known = np.flatnonzero(ids >= 0)
     squared = np.sum(errors(robust.graph, robust.estimate, plain).discs ** 2, axis=1)
     suspects = known[squared > _SUSPECT_SHARE * gate]
+    if len(suspects) == len(known):
+        raise SlamError(f"{name}: no row is certain with gate {gate:g}: expected a larger one")
     trusted = ids.copy()
     trusted[suspects] = UNKNOWN_ID
     fit = _fit(recording, trusted, robust.estimate, camera, plain)

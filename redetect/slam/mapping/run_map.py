@@ -298,9 +298,9 @@ def _with_parts_in_place(
             first = min(waiting)
             step = int(lost[first - 1])
             raise SlamError(
-                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): its "
-                f"odometry is lost, and the parts before and after share {counts[first].sum()} "
-                f"landmarks: expected at least {_FEWEST_SHARED}"
+                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): odometry "
+                "is lost or another run begins there, and the parts before and after share "
+                f"{counts[first].sum()} landmarks: expected at least {_FEWEST_SHARED}"
             )
         waiting.remove(k)
         known = known | lines[k]

@@ -240,7 +240,10 @@ def test_no_matches_give_clear_results(reference: list[Frame], detected: list[Fr
     assert found.recall == (0 if found.reference else None)
     assert found.precision == (0 if found.detected else None)
     assert json.loads(found.to_json())["error_95_m"] is None
-    assert "error median m -" in " ".join(format_text(found).split())
+    text = " ".join(format_text(found).split())
+    assert "error median m -" in text
+    assert "There are no errors: no rows match." in text
+    assert "0 of 0" not in text
 
 
 def test_json_has_the_figures_in_a_fixed_order() -> None:
@@ -297,6 +300,10 @@ def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
     for files in ((sides[1], tmp_path / "no.lines"), (tmp_path / "no.lines", sides[1])):
         with pytest.raises(CompareError, match=r"circles: its rows are circles: expected lines"):
             comparison_of(Compare(tmp_path, True, *files))
+    write_frames(tmp_path / "other.circles", [frame("f.0000"), frame("f.0001")])
+    for other in (tmp_path / "other.circles", tmp_path / "no.lines"):
+        with pytest.raises(CompareError, match=r"^no image is in both .*map.circles and "):
+            comparison_of(Compare(tmp_path, detected=other))
     (tmp_path / "detected.circles").unlink()
     with pytest.raises(DetectError, match=r"detected\.circles: no such landmark file"):
         comparison_of(Compare(tmp_path))

@@ -243,7 +243,7 @@ def test_the_same_bytes_and_nothing_overwritten(tmp_path: Path, to: str, capsys:
         (None, [], "no such landmark file"),
         ("# nothing\n", ["-o", "o.csv"], None),
         (
-            "STEP a 0 0 0 0 0 0 0 0 0\nLANDMARK_L 0 0 0 1 0.1 0 0 1e300 3\n",
+            "STEP a 0 0 0 0 0 0 0 0 0\nLANDMARK_L 0 0 0 1 0.1 0 0 1e24 3\n",
             ["--to", "mcap", "--rate-hz", "1"],
             None,
         ),

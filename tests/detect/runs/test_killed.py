@@ -241,5 +241,5 @@ def test_a_folder_in_the_place_of_a_result(trial: Trial, kind: str) -> None:
     """Told before anything is done, not when some of the files have taken their places."""
     (trial.output / f"detected.{kind}").mkdir()
     assert main(trial.command()) == 1
-    assert f"Is a directory: '{trial.output / f'detected.{kind}'}'" in trial.said()
+    assert f"{trial.output / f'detected.{kind}'}: is a folder" in trial.said()
     assert [path.name for path in trial.output.iterdir()] == [f"detected.{kind}"]

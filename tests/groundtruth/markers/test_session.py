@@ -69,6 +69,9 @@ def test_times_are_those_of_the_images(tmp_path: Path) -> None:
     (run / "a.times").write_text("002 2.0\n")
     with pytest.raises(GroundTruthError, match=r"a\.times: no time of image 001"):
         read_marker_frames(run, 0)
+    (run / "detected.markers").write_text("# a comment\rSTEP 001 0 0 0 0 0 0 0 0 0\r")
+    with pytest.raises(GroundTruthError, match=r"detected\.markers: no STEP row"):
+        read_marker_frames(run, 0)
 
 
 def test_markers_that_are_not_on_the_rig_are_no_views() -> None:

@@ -80,11 +80,12 @@ def test_what_is_written_is_read_back(
 @pytest.mark.parametrize(
     ("text", "line", "problem"),
     [
-        ("1,2,3,4\n1,2,3\n", 2, "3 numbers: expected 4"),
+        ("1,2,3,4\n1,2,3\n", 2, "3 numbers: expected 4: t, x, y, theta$"),
         ("1,2,3\n", 1, "expected 4 or 13"),
         ("1,2,3,4\n\n0.5,2,3,4\n", 3, "before the row above"),
         ("1,2,nan,4\n", 1, "'nan': expected a finite number"),
         ("1,2,1e999,4\n", 1, "expected a finite number"),
+        ("1,-1e300,3,4\n", 1, "'-1e300': expected a finite number, within"),
         ("1,2,1_0,4\n", 1, "expected a finite number"),
         ("1,2,,4\n", 1, "'': expected a finite number"),
         ("1 2 3 4\n1,2,3,4" + ",0" * 9, 2, "13 numbers: expected 4"),
