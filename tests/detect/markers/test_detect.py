@@ -346,7 +346,7 @@ def test_expected_ids_and_width_narrow_the_search() -> None:
     assert len(detect_markers(image, MarkerSettings(dictionary="6x6_250", width_px=300.0))) == 0
 
 
-@pytest.mark.parametrize("width_px", [200.0, 1e6, 1e300])
+@pytest.mark.parametrize("width_px", [200.0, 1e6, 1e24])
 def test_markers_much_wider_than_the_image(width_px: float) -> None:
     image = np.tile(np.array([0, 255], np.uint8), (2, 25))
     assert len(detect_markers(image, MarkerSettings(width_px=width_px))) == 0

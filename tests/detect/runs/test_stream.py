@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.plan import KEPT_FAILURES, FramePlan, FramesByImage, Job, Known, RunSummary
 from detect.runs.stream import detect_run
@@ -113,13 +114,11 @@ def test_json_is_what_the_library_writes(run_folder: Path, tmp_path: Path) -> No
     assert text == json.dumps(json.loads(text), indent=1) + "\n"
 
 
-def test_a_run_without_frames(small_run: Path, tmp_path: Path) -> None:
+def test_a_run_without_odometry_of_its_images(small_run: Path, tmp_path: Path) -> None:
     (small_run / "s.txt").write_text("# nothing yet\n")
-    as_json = tmp_path / "rows.json"
-    summary = detect(small_run, {"circles": tmp_path / "o", "json": as_json}, circles=LIGHT)
-    assert (summary.frames, summary.images_without_step) == (0, 3)
-    assert json.loads(as_json.read_text())["frames"] == []
-    assert list(read_frames(tmp_path / "o")) == []
+    with pytest.raises(DetectError, match=r"3 images are not named by a STEP row.* none remain"):
+        detect(small_run, {"circles": tmp_path / "o"}, circles=LIGHT)
+    assert not (tmp_path / "o").exists()
 
 
 def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) -> None:
