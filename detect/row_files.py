@@ -117,7 +117,7 @@ class RunRows:
     def sight(self, camera: Camera) -> Sight:
         """The projection of discs into the images of a camera."""
         level = "circles" in self.reference and read_head(self.reference["circles"]).level
-        return Sight(camera, self.circle_settings.radius_m, level)
+        return Sight.by(camera, self.circle_settings, level)
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:

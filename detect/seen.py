@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from camera.model_checks import checked_pose
 from camera.rotations import rotation_of
-from detect.settings import USUAL_TILT_DEG
+from detect.settings import USUAL_TILT_DEG, CircleSettings
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
 from redetect.plane import chain_steps
@@ -24,9 +24,8 @@ Tilt = tuple[float, float]
 
 #: Lower bound of the gate in the image, for small discs (px).
 LEAST_GATE_PX = 3.0
-#: Unknown tilt by which rows that are not levelled may be off from level ones: three usual
-#: standard deviations.
-_UNKNOWN_TILT_RAD = 3.0 * math.radians(USUAL_TILT_DEG)
+#: Deviations of the unknown tilt by which rows that are not levelled may be off from level ones.
+_TILT_GATE = 3.0
 _POINTS = 64
 
 
@@ -98,10 +97,18 @@ class Sight:
 
     camera: Camera
     radius_m: float = 0.10  # of the discs
+    #: Standard deviation of the tilt of rows that are not levelled.
+    tilt_sigma_rad: float = math.radians(USUAL_TILT_DEG)
     #: Reference rows are level but do not state their tilt: that of the detected rows is used.
     reference_level: bool = False
     reference_by: Tilt | None = None
     detected_by: Tilt | None = None
+
+    @classmethod
+    def by(cls, camera: Camera, settings: CircleSettings, reference_level: bool = False) -> Sight:
+        """The mapping for discs that were detected with some settings."""
+        sigma_rad = max(settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
+        return cls(camera, settings.radius_m, sigma_rad, reference_level)
 
     def of(self, reference: Frame | None, detected: Frame | None) -> Sight:
         """The mapping for a frame with these rows."""
@@ -140,5 +147,6 @@ class Sight:
         high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
         gates = np.maximum(0.5 * (high - low), LEAST_GATE_PX)
         if self.reference_level and self.detected_by is None:
-            gates += _UNKNOWN_TILT_RAD * np.array([self.camera.scale_x, self.camera.scale_y])
+            focal_px = np.array([self.camera.scale_x, self.camera.scale_y])
+            gates += _TILT_GATE * self.tilt_sigma_rad * focal_px
         return np.asarray(gates)

@@ -81,7 +81,7 @@ def perform(options: Tune) -> int:
         compare_frames,
         [rows for _, rows in pairs],
         options=options.matching,
-        sight=Sight(run.camera, base.radius_m, read_head(path).level),
+        sight=Sight.by(run.camera, base, read_head(path).level),
         unlisted=list(read_frames(uncounted)) if uncounted.is_file() else None,
     )
     count = len(grid) * len(pairs)

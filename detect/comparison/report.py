@@ -59,8 +59,8 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
         if camera is None:
             at = command.camera
             camera = camera_in(command.run) if at is None else read_camera(at)
-        radius_m = read_head(detected).circle_settings.radius_m
-        sight = None if camera is None else Sight(camera, radius_m, read_head(reference).level)
+        settings, level = read_head(detected).circle_settings, read_head(reference).level
+        sight = None if camera is None else Sight.by(camera, settings, level)
     return compare_with_file(
         kind,
         reference,

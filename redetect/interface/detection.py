@@ -197,7 +197,7 @@ class Detection(Table):
     def picture(self) -> NDArray[np.uint8]:
         """(H + h, W, 3) the image with the detections, in OpenCV's order blue, green, red."""
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
-        sight = Sight(self.camera, self.settings.radius_m)
+        sight = Sight.by(self.camera, self.settings)
         return draw_rows(self.image, sight, rows, self.settings, self.name)
 
     def __str__(self) -> str:

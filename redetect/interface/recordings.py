@@ -140,6 +140,6 @@ def compare(
         in_file,
         [one.frame for one in found],
         options,
-        sight=Sight(seen_by, found[0].settings.radius_m, read_head(in_file).level),
+        sight=Sight.by(seen_by, found[0].settings, read_head(in_file).level),
         names=(str(in_file), "detections"),
     )

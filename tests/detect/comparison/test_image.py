@@ -20,6 +20,7 @@ from detect.comparison.result import DiscComparison
 from detect.levelling import levelled
 from detect.options import CompareOptions
 from detect.seen import Sight, image_positions, level_seen
+from detect.settings import CircleSettings
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -179,7 +180,10 @@ def test_level_truth_is_seen_through_the_tilt_of_what_was_detected(
     assert not compare(published_camera, raw, level).reference_level
 
 
-def test_rows_that_are_not_levelled_match_level_truth(published_camera: Camera) -> None:
+@pytest.mark.parametrize(("tilt_deg", "sigma_deg"), [(0.7, None), (2.5, 1.0)])
+def test_rows_that_are_not_levelled_match_level_truth(
+    published_camera: Camera, tilt_deg: float, sigma_deg: float | None
+) -> None:
     camera = replace(
         published_camera, width=2304, height=1728, scale_x=1394.0, scale_y=1394.0,
         offset_x=1152.0, offset_y=864.0,
@@ -187,11 +191,12 @@ def test_rows_that_are_not_levelled_match_level_truth(published_camera: Camera) 
     rng, truth, seen = np.random.default_rng(3), [], []
     for k in range(20):
         xy = places(rng)
-        by = tuple(np.radians(rng.uniform(-0.7, 0.7, 2)))
+        by = tuple(np.radians(rng.uniform(-tilt_deg, tilt_deg, 2)))
         truth.append(frame(k, xy))
         seen.append(frame(k, camera.floor_from_pixel(image_positions(camera, xy, by))))
 
-    found = compare_frames(truth, seen, sight=Sight(camera, reference_level=True))
+    sight = Sight.by(camera, CircleSettings(tilt_sigma_deg=sigma_deg), reference_level=True)
+    found = compare_frames(truth, seen, sight=sight)
 
     assert (found.recall, found.extra) == (1.0, 0)
     assert "not corrected for the robot's tilt" in found.sentences()[2]
