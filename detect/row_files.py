@@ -16,7 +16,6 @@ from detect.runs.plan import FramesByImage
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import word_value
-from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun
 from redetect.landmarks import Frame, FrameTilt, read_tilts
 
@@ -145,8 +144,3 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
         if kind in detected and path.is_file():
             reference[kind] = path
     return RunRows(detected, reference)
-
-
-def picture_name(prefix: str) -> str:
-    """Name of an image's picture without its ending, which cannot lead out of a folder."""
-    return image_name(prefix) or "frame"

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from detect import __version__
-from detect.comparison.compare import compare_frames
+from detect.comparison.compare import compare_frames, rows_beside
 from detect.comparison.result import DiscComparison
 from detect.errors import DetectError
 from detect.options import Tune
@@ -35,13 +35,7 @@ from detect.sources.opening import demand_recording, open_run
 from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
-from redetect.landmarks import (
-    Frame,
-    LandmarkFileError,
-    frames_of_rows,
-    parse_rows,
-    read_frames,
-)
+from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
 
@@ -76,13 +70,12 @@ def perform(options: Tune) -> int:
     demand_free([output / name for name in names], overwrite=options.force)
     path = options.reference or run.folder / "map.circles"
     pairs = _with_reference(frames, path)
-    uncounted = path.parent / "unlisted.circles"
     compare = partial(
         compare_frames,
         [rows for _, rows in pairs],
         options=options.matching,
         sight=Sight.by(run.camera, base, read_head(path).level),
-        unlisted=list(read_frames(uncounted)) if uncounted.is_file() else None,
+        unlisted=rows_beside(path, "unlisted"),
     )
     count = len(grid) * len(pairs)
     workers = local_workers(default_jobs(count) if options.jobs is None else options.jobs)

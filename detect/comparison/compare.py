@@ -83,18 +83,20 @@ def compare_with_file(
     images = map(frames_by_image, (wanted, detected), names)
     if not set.intersection(*map(set, images)):
         raise CompareError(f"no image is in both {names[0]} and {names[1]}: expected one run")
-
-    def rows(name: str, path: Path | None) -> list[Frame] | None:
-        usual = reference.parent / f"{name}.{kind}"
-        return list(read_frames(path or usual)) if path or usual.is_file() else None
-
-    uncounted = rows("unlisted", unlisted)
+    beside = rows_beside(reference, "unlisted", kind)
+    uncounted = beside if unlisted is None else list(read_frames(unlisted))
     if kind == "lines":
         return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
-    alike = rows("lookalikes", None)
+    alike = rows_beside(reference, "lookalikes")
     return compare_frames(
         wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
     )
+
+
+def rows_beside(reference: Path, name: str, kind: Kind = "circles") -> list[Frame] | None:
+    """The rows of a file of some name beside the reference; None without such a file."""
+    path = reference.parent / f"{name}.{kind}"
+    return list(read_frames(path)) if path.is_file() else None
 
 
 def read_kind(kind: Kind, path: Path) -> list[Frame]:

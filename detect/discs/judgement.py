@@ -230,6 +230,7 @@ def glance(
 @kernel()
 def pairs_of_steps(grey: FloatArray) -> FloatArray:
     """Profiles as the network sees them: means of pairs of steps."""
+    # Loops, here and below: expressions of arrays take several times as long to compile.
     pairs = np.empty((len(grey), grey.shape[1] // 2))
     for k in range(len(grey)):
         for m in range(grey.shape[1] // 2):

@@ -99,6 +99,7 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
             for k, fit in enumerate(whole):
                 if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
                     nominal = Size(scene.radius, RADIUS_SIGMA * scene.radius)
+                    # Assigning the row takes two seconds to compile.
                     radii[k, 0], radii[k, 1] = _radius_seen(fit, nominal)
             parts, known = whole.copy(), radii.copy()
         elif stage == _LAST:

@@ -12,10 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, picture_name, png_of
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
-from detect.row_files import RunRows, open_rows, picture_name
+from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image

@@ -28,6 +28,7 @@ from detect.options import CompareOptions
 from detect.row_files import SeenRows
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
+from detect.sources.image_files import image_name
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
@@ -203,6 +204,11 @@ def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
         canvas[unseen] //= 3
         canvas[unseen] += np.array([0, 0, 80], np.uint8)
     return canvas
+
+
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending, which cannot lead out of a folder."""
+    return image_name(prefix) or "frame"
 
 
 def png_of(picture: ByteArray) -> bytes:

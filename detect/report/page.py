@@ -12,11 +12,11 @@ from detect import __version__
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison, number
-from detect.drawing.frame import draw_rows
+from detect.drawing.frame import draw_rows, picture_name
 from detect.errors import DetectError, FrameError
 from detect.options import Report, RowFiles
 from detect.report import figures
-from detect.row_files import RunRows, SeenRows, open_rows, picture_name
+from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image

@@ -179,9 +179,14 @@ def detect_run(
     frames are in another file (`outputs.frames_tilt_place`). By default, this process is the only
     worker; `on_progress` is called once after every frame.
 
-    Raises DetectError if another run is writing the same files, a frame fails in strict mode, or
-    the dictionary of markers is unknown; lut.TableError if no table can be made for the camera;
-    redetect.storage.OutputExistsError if an output must not be replaced; WorkerError.
+    Raises
+    ------
+    DetectError
+        If another run is writing the same files, no image has odometry, a frame fails in strict
+        mode, or the dictionary of markers is unknown.
+    lut.TableError, redetect.storage.OutputExistsError, WorkerError
+        If no table can be made for the camera, an output exists and must not be replaced, or there
+        are no workers.
     """
     workers = workers or local_workers(1, large=job.run.frames.ships_images)
     summary = RunSummary()

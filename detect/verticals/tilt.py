@@ -133,7 +133,7 @@ def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate,
     pitch, roll = _vote_for_tilt(lines, numbers)
     prior = math.radians(numbers.tilt_prior_deg)
     pitch, roll = _refine_tilt(lines, pitch, roll, prior, covariance, agrees)
-    count = 0
+    count = 0  # np.count_nonzero takes longer to compile than this kernel
     for agreeing in agrees:
         count += int(agreeing)
     largest = max(abs(pitch), abs(roll))

@@ -167,8 +167,12 @@ def write_whole(path: str | os.PathLike[str], *, overwrite: bool) -> Iterator[Bi
     It is written to a hidden file in the same folder, which replaces `path` (or, if that is a
     symbolic link, its target) in one step when the block ends, and is removed if it raises.
 
-    Raises OutputExistsError if `path` exists and `overwrite` is false, and another OSError if it is
-    not a regular file, its folder cannot be written to, or the disk is full.
+    Raises
+    ------
+    OutputExistsError
+        If `path` exists and `overwrite` is false.
+    OSError
+        If `path` is not a regular file, its folder cannot be written to, or the disk is full.
     """
     path = Path(path)
     demand_place(path, overwrite=overwrite)
