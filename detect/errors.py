@@ -37,5 +37,5 @@ def imported_for(
         raise error(f"{use}: install it by pip install 'redetect[{extra}]'{otherwise}") from None
 
 
-class CompareError(ValueError):
+class CompareError(OneLineError, ValueError):
     """Two runs that cannot be compared; the message names the file or frame and the reason."""

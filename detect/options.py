@@ -16,6 +16,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from redetect.storage.bounds import (
     ABOVE_0,
+    NOT_NEGATIVE,
     SHARE,
     MaybeFloat,
     MaybeInt,
@@ -24,6 +25,7 @@ from redetect.storage.bounds import (
     MaybeStr,
     NotNegative,
     Positive,
+    demand,
     demand_fields,
     whole,
 )
@@ -162,6 +164,9 @@ class Lines(DetectorFlags):
     #: Draw all tracks instead, rejected ones with the reason; repeats the detection.
     rejected: bool = False
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
+
+    def __post_init__(self) -> None:
+        demand(self, DetectError, join_threshold=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,12 +12,13 @@ import select
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
+from io import StringIO
 from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -182,12 +183,13 @@ class Program:
             for name, kind in self.commands.items()
         )
         choice: Any = reduce(or_, commands)
-        return tyro.cli(
-            Annotated[choice, arg(name="")],
-            prog=self.name,
-            description=f"{self.description}\n\n{FOR_ALL}",
-            args=["--help" if word == _HELP_ALL else word for word in words],
-        )
+        with _settings_rejected_on_one_line():
+            return tyro.cli(
+                Annotated[choice, arg(name="")],
+                prog=self.name,
+                description=f"{self.description}\n\n{FOR_ALL}",
+                args=["--help" if word == _HELP_ALL else word for word in words],
+            )
 
     def carry_out(self, command: Any) -> int:
         """Execute a command; returns the exit code."""
@@ -219,6 +221,23 @@ def end_with(words: str) -> None:
     """Exit because of a wrong command line, with a message."""
     print(f"error: {words}", file=sys.stderr)
     raise SystemExit(EXIT_WRONG_COMMAND_LINE)
+
+
+@contextmanager
+def _settings_rejected_on_one_line() -> Iterator[None]:
+    """Show only the message of settings that reject a value, without tyro's own words around it."""
+    shown = StringIO()
+    try:
+        with redirect_stderr(shown):
+            yield
+    except SystemExit as end:
+        cause: BaseException | None = end
+        while cause is not None and not isinstance(cause, OneLineError):
+            cause = cause.__context__
+        if cause is not None:
+            end_with(str(cause))
+        sys.stderr.write(shown.getvalue())
+        raise
 
 
 @contextmanager

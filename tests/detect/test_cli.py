@@ -288,6 +288,24 @@ def test_wrong_command_lines(small_run: Path, capsys: Captured, wrong: list[str]
     assert files_in(small_run) == before
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["circles", "images/e", "--radius-m", "-1"], "radius_m is -1: expected above 0"),
+        (["lines", "images/e", "--join-threshold", "-0.1"], "join_threshold is -0.1: expected 0"),
+        (["compare", "images/e", "--gate-m", "0"], "gate_m is 0: expected above 0"),
+    ],
+)
+def test_a_setting_out_of_its_bounds_is_one_line(
+    capsys: Captured, wrong: list[str], said: str
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(wrong)
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {said}")
+
+
 def test_refused_settings_are_named(small_run: Path, capsys: Captured) -> None:
     with pytest.raises(SystemExit):
         main(["circles", str(small_run), "--threshold", "1.5"])
