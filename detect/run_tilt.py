@@ -44,6 +44,9 @@ COMMON_RAD = math.radians(0.15)
 _EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
 #: Derivative of the outlines' pitch (rad) by the camera's height, relative to that height.
 OUTLINE_PITCH_PER_HEIGHT = 0.45
+#: Where hardly any verticals are visible: standard deviation of the lean, and of the error common
+#: to the pitch of all outlines (mainly the height's), with and without a calibration's covariance.
+_UNSURE_STATED_RAD, _UNSURE_RAD = math.radians(0.5), _APART_RAD
 #: Correlated share of the variance of a frame's error (a scene stays visible), and its correlation.
 LASTING_SHARE, LASTING = 0.5, 0.9
 #: Share of frames with an outlier of the tilt, and its standard deviation (rad): a consensus of
@@ -86,6 +89,7 @@ class RunTilt:
     variance: FloatArray
     #: Relative standard deviation of the camera's height, if the calibration has no covariance.
     height_sigma: float = 0.0
+    by_verticals: bool = True  #: Otherwise mainly from the outlines of discs.
 
     @property
     def usual_rad(self) -> float:
@@ -98,8 +102,9 @@ class RunTilt:
             f"{math.degrees(lean):.2f} +- {math.degrees(sigma):.2f}"
             for lean, sigma in zip(self.lean, self.lean_sigma)
         )
+        by = "" if self.by_verticals else ", by the outlines of discs"
         return (
-            f"the camera leans {pitch} (pitch) and {roll} degrees (roll) from its calibration: "
+            f"the camera leans {pitch} (pitch) and {roll} degrees (roll) from its calibration{by}: "
             "levelled by it"
         )
 
@@ -112,12 +117,13 @@ def tilt_of_run(
     """Estimate the tilt of a run from the tilts of its frames, in their order.
 
     The tilts are those from the verticals of each frame and, optionally, from the outlines of its
-    discs; None if fewer than `LEAST_FRAMES` frames have a tilt from verticals. `common_variance`,
+    discs; None if fewer than `LEAST_FRAMES` frames have one. `common_variance`,
     (2,) rad^2, is that of the error of pitch and roll common to all frames, if the calibration
     states it: then the lean is that of the verticals, otherwise it depends on the outlines, too.
     """
     if np.count_nonzero(verticals.known) < LEAST_FRAMES:
-        return None
+        unsure = _UNSURE_RAD if common_variance is None else _UNSURE_STATED_RAD
+        return None if outlines is None else _tilt_by_outlines(verticals, outlines, unsure)
     if outlines is None or np.count_nonzero(outlines.known & verticals.known) < LEAST_FRAMES:
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
@@ -142,6 +148,37 @@ def tilt_of_run(
         tilt + 0.5 * between,
         of_deviation + share**2 * lean_variance + common_variance,
         pitch_sigma / OUTLINE_PITCH_PER_HEIGHT,
+    )
+
+
+def _tilt_by_outlines(verticals: FrameTilts, outlines: FrameTilts, unsure: float) -> RunTilt | None:
+    """The tilt of a run of which few frames show verticals, mainly from the outlines of discs.
+
+    What all outlines show may be the camera's lean or an error of the calibration: `unsure` is the
+    standard deviation of either (rad).
+    """
+    information = np.stack(
+        [np.where(of.known[:, None], 1.0 / of.variance, 0.0) for of in (verticals, outlines)]
+    )
+    total = information.sum(axis=0)
+    weighted = (information * np.nan_to_num([verticals.tilt, outlines.tilt])).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = FrameTilts(weighted / total, 1.0 / total)
+        by_outlines = np.where(total > 0.0, information[1] / total, 1.0)
+    if np.count_nonzero(mean.known) < LEAST_FRAMES:
+        return None
+    run = tilt_of_run(mean, None, np.zeros(2))
+    assert run is not None
+    error = np.hypot(COMMON_RAD, [unsure, 0.0])
+    believed = unsure**2 / (unsure**2 + error**2 + run.lean_sigma**2)
+    lean_variance = (1.0 - believed) * unsure**2
+    common = by_outlines**2 * lean_variance + (1.0 - by_outlines) ** 2 * COMMON_RAD**2
+    return RunTilt(
+        believed * run.lean,
+        np.sqrt(lean_variance),
+        run.tilt - by_outlines * (1.0 - believed) * run.lean,
+        run.variance + common,
+        by_verticals=False,
     )
 
 

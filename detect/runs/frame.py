@@ -440,12 +440,14 @@ def _levelled(
     height_sigma = 0.0
     if run is not None:
         height_sigma = run.height_sigma  # as a share of the camera's height
-        if common is not None:  # included in the calibration's errors
+        if common is not None and run.by_verticals:  # included in the calibration's errors
             tilt_covariance = tilt_covariance - np.diag(common)
     floor_xy, covariance, down = level_discs(camera, xy, covariance, tilt, tilt_covariance)
     from_camera = floor_xy - camera.centre[:2]
     covariance += height_sigma**2 * from_camera[:, :, None] * from_camera[:, None, :]
-    by_verticals = np.array([run is not None or by.lines > 0 for by in tilts], np.bool_)
+    by_verticals = np.array(
+        [by.lines > 0 if run is None else run.by_verticals for by in tilts], np.bool_
+    )
     covariance += common_covariance(camera, xy, calibration_px, by_verticals=by_verticals)
     level = circle_landmarks(floor_xy[down], numbers[down, 2], covariance[down])
     for k, row in zip(np.flatnonzero(down).tolist(), level):

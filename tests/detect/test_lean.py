@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,6 +22,7 @@ from detect.seen import leaning_camera
 from detect.settings_files import read_settings
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
 from tests.detect.commands import Captured
+from tests.detect.painted_floor import LIGHT, PaintedFloor
 
 Rows = list[NDArray[np.float64]]
 
@@ -101,6 +103,43 @@ def test_frames_that_are_levelled_by_themselves_say_so(
     said = capsys.readouterr().out
     assert "not levelled" not in said
     assert "assumed level within 1." in said
+
+
+def test_on_a_bare_floor_discs_level_the_run(
+    published_camera: Camera, tmp_path: Path, capsys: Captured
+) -> None:
+    """A robot on springs, and nothing upright in sight."""
+    rng = np.random.default_rng(1)
+    (tmp_path / "run" / "images").mkdir(parents=True)
+    places, tilt = [], np.zeros(2)
+    for k in range(30):
+        tilt = 0.8 * tilt + np.radians(0.6) * rng.normal(size=2)
+        pitch, roll = tilt.tolist()
+        floor = PaintedFloor(leaning_camera(published_camera, (pitch, roll)))
+        grid = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-1.4, -2.2, -3.0]), axis=-1)
+        place = grid.reshape(-1, 2) + rng.uniform(-0.2, 0.2, (9, 2))
+        for xy in place:
+            floor.disc(xy, LIGHT)
+        places.append(place)
+        cv2.imwrite(str(tmp_path / "run" / "images" / f"{k:02d}.png"), floor.image(seed=k))
+    write_camera(published_camera, tmp_path / "run" / "run.cam")
+    assert main(["all", str(tmp_path / "run")]) == 0
+    assert "from its calibration, by the outlines of discs" in capsys.readouterr().out
+    off, seen_off, covariances = [], [], []
+    assert main(["all", str(tmp_path / "run"), "--tilt", "none", "-o", str(tmp_path)]) == 0
+    level, seen = (
+        read_frames(folder / "detected.circles") for folder in (tmp_path / "run", tmp_path)
+    )
+    for place, row, raw in zip(places, level, seen, strict=True):
+        found = circle_arrays(row.circles)
+        nearest = np.hypot(*(found.xy[:, None] - place).T).argmin(axis=0)
+        off.append(found.xy - place[nearest])
+        seen_off.append(circle_arrays(raw.circles).xy - place[nearest])
+        covariances.append(found.covariance)
+    errors = np.concatenate(off)
+    assert len(errors) == 30 * 9
+    assert np.median(np.hypot(*errors.T)) < 0.6 * np.median(np.hypot(*np.concatenate(seen_off).T))
+    assert squared_mahalanobis(errors, np.concatenate(covariances)).mean() / 2.0 < 1.5
 
 
 def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Path) -> None:

@@ -135,6 +135,34 @@ def test_the_lean_is_between_those_of_verticals_and_outlines(wrong: str) -> None
     assert normalised < 2.5
 
 
+@pytest.mark.parametrize("with_verticals", [0, LEAST_FRAMES - 1])
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_without_verticals_the_outlines_level(seed: int, stated: bool, with_verticals: int) -> None:
+    """A camera that looks down; a wrong height adds to the pitch of all outlines."""
+    true, measured, variance = sequence(seed, spread=0.5, strays=0.0, jumps=0.0)
+    true, measured = true - 0.8 * LEAN, measured - 0.8 * LEAN
+    rng = np.random.default_rng(seed)
+    sigma = np.radians(0.2)
+    outlines = true + sigma * rng.standard_normal(true.shape)
+    outlines[:, 0] += np.radians(0.5 if stated else 1.0) * rng.uniform(-1.0, 1.0)
+    outlines[::7] = np.nan
+    measured[with_verticals:] = np.nan
+    run = found_tilt(
+        FrameTilts(measured, variance),
+        FrameTilts(outlines, np.full(true.shape, sigma**2)),
+        np.zeros(2) if stated else None,
+    )
+    assert not run.by_verticals
+    assert "outlines" in run.sentence()
+    assert np.all(np.abs(run.lean - 0.2 * LEAN) < 2.5 * run.lean_sigma)
+    assert np.all(np.std(run.tilt - true, axis=0) < 0.6 * np.std(true, axis=0))
+    assert np.all(np.mean((run.tilt - true) ** 2 / run.variance, axis=0) < 2.5)
+    if with_verticals:  # their frames do not depend on the height
+        some = slice(0, with_verticals)
+        assert run.variance[some, 0].mean() < 0.7 * run.variance[with_verticals:, 0].mean()
+
+
 def test_few_outlines_are_left_out() -> None:
     true, measured, variance = sequence(8)
     outlines = np.full(true.shape, np.nan)
