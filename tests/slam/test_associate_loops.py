@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +18,6 @@ from redetect.slam.association.loop_closing import (
     merge_labels,
     pairs_by_position,
     pairs_by_votes,
-    seen_together,
     solve_path,
 )
 from redetect.slam.association.loops import (
@@ -161,12 +162,20 @@ def test_merging_never_joins_what_was_seen_together_and_never_splits(
     assert len(set(zip(frames.tolist(), merged.tolist()))) == len(rows)  # still apart in a frame
     for label in range(count):
         assert len(set(merged[labels == label].tolist())) == 1
-    apart = seen_together(frames, labels)
-    together = [(a, b) for a, others in enumerate(apart) for b in others]
+    together = [(labels[i], labels[j]) for i, j in permutations(range(len(rows)), 2)
+                if frames[i] == frames[j]]  # fmt: skip
     groups = {label: int(merged[labels == label][0]) for label in range(count)}
     assert all(groups[a] != groups[b] for a, b in together)
     if usable and (min(usable[0]), max(usable[0])) not in together:
         assert groups[usable[0][0]] == groups[usable[0][1]]
+
+
+def test_labels_that_clutter_keeps_apart_in_a_tenth_of_their_frames_are_merged() -> None:
+    frames = np.r_[0:10, 9:29]
+    labels = np.repeat([0, 1], [10, 20])
+    assert merge_labels(frames, labels, [(0, 1)])[1] == 0
+    assert merge_labels(frames, labels, [(0, 1)], 0.1)[1] == 1
+    assert merge_labels(np.r_[0:10, 8:28], labels, [(0, 1)], 0.1)[1] == 0
 
 
 def test_pairs_are_in_the_order_of_their_votes() -> None:

@@ -11,7 +11,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import between, chain_steps
 from redetect.slam.association.frame_to_frame import associate_locally
-from redetect.slam.association.run import associate_run
+from redetect.slam.association.run import associate_run, without_clutter
 from redetect.slam.association.score import score_association
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import CircleRows, LineRows, Recording
@@ -274,3 +274,38 @@ def test_a_run_without_landmarks_is_associated_to_nothing() -> None:
     found = associate_run(recording)
     assert len(found.circle_labels) == 0
     assert len(found.line_labels) == 0
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_corridor_with_regular_pairs_of_discs_is_not_laid_on_itself(seed: int) -> None:
+    """Odometry alone would allow the corridor to bend until its end lies on its beginning."""
+    path = chain_steps(np.tile([0.0, -0.2, 0.0], (300, 1)))
+    along = -np.arange(0.0, 62.0, 1.5)
+    sides = [np.column_stack([np.full(len(along), side), along]) for side in (-1.2, 1.2)]
+    discs = np.concatenate(sides)
+    discs += np.random.default_rng(seed).normal(0.0, 0.02, discs.shape)
+    covariance = OdometryNoise().covariance(between(path[:-1], path[1:]))
+    recording = drive(path, discs, NO_LINES, seed, covariance)
+    found = associate_run(recording)
+    score = score_association(found.circle_labels, ids_of(recording))
+    assert score.pair_precision == 1.0
+    assert score.pair_recall > 0.99
+
+
+def test_clutter_does_not_keep_the_labels_of_a_disc_apart() -> None:
+    path = chain_steps(np.tile([0.0, -0.1, 0.0], (12, 1)))
+    discs = np.array([[0.5 * (i % 3), -3.0 - 0.5 * (i // 3)] for i in range(8)])
+    rows = [(k, disc_in_robot(path[k + 1], xy), i) for k in range(12) for i, xy in enumerate(discs)]
+    rows.insert(24, (2, np.array([0.0, -2.2]), 8))
+    recording = Recording(
+        tuple(map(str, range(12))),
+        between(path[:-1], path[1:]),
+        np.tile(1e-6 * np.eye(3), (12, 1, 1)),
+        CircleRows.of((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, xy, i in rows),
+        LineRows.of(),
+    )
+    ids, frame = recording.circles.ids, recording.circles.frame
+    # From frame 6 on, the first disc has the label of the clutter.
+    labels = np.where((ids == 0) & (frame >= 6), 8, ids)
+    found = without_clutter(recording, labels, path, AssociateSettings())
+    assert found.tolist() == np.where(ids == 8, -1, ids).tolist()

@@ -57,6 +57,7 @@ class LabelledMap(NamedTuple):
     path: FloatArray  # (N + 1, 3): start and pose after each step; theta is not wrapped
     circle_xy: FloatArray  # (M, 2), by label (m)
     line_xy: FloatArray  # (L, 2), by label (m); NaN if unknown
+    cost: float  # of all errors, by the robust loss
 
 
 def intersect_bearings(
@@ -114,44 +115,38 @@ def solve_path(
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
     start = Estimate(poses, disc_xy, places[known])
-    found = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance).at
+    minimum = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance)
+    found = minimum.at
     places[known] = found.line_xy
-    return LabelledMap(found.poses, found.disc_xy, places)
-
-
-def seen_together(frames: IntArray, labels: IntArray) -> list[set[int]]:
-    """For each label, those in the same frame: distinct landmarks, never to be merged.
-
-    Takes `frames, labels` (n,).
-    """
-    together: list[set[int]] = [set() for _ in range(int(labels.max(initial=-1)) + 1)]
-    for group in np.split(labels, np.flatnonzero(np.diff(frames)) + 1):
-        here = set(group.tolist())
-        for label in here:
-            together[label] |= here - {label}
-    return together
+    return LabelledMap(found.poses, found.disc_xy, places, minimum.costs[-1])
 
 
 def merge_labels(
-    frames: IntArray, labels: IntArray, pairs: Iterable[tuple[int, int]]
+    frames: IntArray,
+    labels: IntArray,
+    pairs: Iterable[tuple[int, int]],
+    most_together: float = 0.0,
 ) -> tuple[IntArray, int]:
     """Merge labels that are the same landmark.
 
+    Labels with rows in the same frames are distinct landmarks, unless these frames are at most a
+    share `most_together` of those of either: clutter beside a landmark, of one label with it.
+
     Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
-    apart = seen_together(frames, labels)
-    same = DisjointSet(range(len(apart)))
+    seen: list[set[int]] = [set() for _ in range(int(labels.max(initial=-1)) + 1)]
+    for frame, label in zip(frames.tolist(), labels.tolist()):
+        seen[label].add(frame)
+    same = DisjointSet(range(len(seen)))
     for first, second in pairs:
         a, b = same[int(first)], same[int(second)]
-        if a == b or b in apart[a]:
+        together = len(seen[a] & seen[b])
+        if a == b or together > most_together * min(len(seen[a]), len(seen[b])):
             continue
         same.merge(a, b)
-        root = same[a]
-        apart[root] = apart[a] | apart[b]
-        for other in apart[root]:
-            apart[other].add(root)
-    roots = np.array([same[label] for label in range(len(apart))], dtype=np.int64)
-    return in_order(roots[labels]), len(apart) - same.n_subsets
+        seen[same[a]] = seen[a] | seen[b]
+    roots = np.array([same[label] for label in range(len(seen))], dtype=np.int64)
+    return in_order(roots[labels]), len(seen) - same.n_subsets
 
 
 def in_order(labels: IntArray) -> IntArray:

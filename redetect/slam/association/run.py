@@ -16,7 +16,7 @@ are closed again in the whole.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import chain_steps, compose, rotation
 from redetect.slam.association.frame_to_frame import associate_locally
@@ -63,6 +63,14 @@ _SAME_PLACE = 0.999
 _LINE_REACH_M = 0.05
 # Covariance of a step that leads nowhere (m^2, rad^2).
 _HARDLY_ANY = 1e-6 * np.eye(3)
+# Discs with rows in the same frames are distinct, unless these are at most this share of the frames
+# of either. Lines always are, since they are often confused from frame to frame.
+_MOST_TOGETHER = 0.1
+# Largest increase of the cost of all rows by a loop, for each disc that it merges. A right loop
+# costs a few, up to 20 with odometry that is wrong by 20 %; a wrong one hundreds.
+_MOST_COST = 100.0
+# Matches that may contain a wrong one are divided into at most this many parts.
+_MOST_PARTS = 16
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
 # Least gap between frames, longer than a landmark stays visible or is waited for locally.
@@ -120,7 +128,7 @@ def associate_run(
         path, matches = closed.path, closed.matches
         if by_discs:
             labels = closed.labels
-            circle_labels = _without_clutter(recording, labels, path, settings)
+            circle_labels = without_clutter(recording, labels, path, settings)
             if len(line_labels):
                 report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
@@ -162,6 +170,15 @@ def _associated_locally(
         # Discs help to associate lines; lines are often confused and would only harm the discs.
         circle_labels, _ = associate_locally(_without_lines(recording), settings)
     return circle_labels, line_labels
+
+
+class _Solved(NamedTuple):
+    """Least squares of a run with some labels."""
+
+    labels: IntArray  # (n,): see `_Closed`
+    path: FloatArray  # (N + 1, 3)
+    xy: FloatArray  # (M, 2): the landmarks' positions (m)
+    cost: float
 
 
 class _Closed(NamedTuple):
@@ -216,7 +233,7 @@ def _closed_by_parts(
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
     own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
     laid = [compose(motion, path) for motion, path in zip(motions, own)]
-    labels, _ = merge_labels(frames, together, pairs_by_votes(pairs))
+    labels, _ = merge_labels(frames, together, pairs_by_votes(pairs), _most_together(recording))
     whole = _closed(recording, labels, settings, camera_xy, report, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
     return whole._replace(matches=tuple(matches))
@@ -240,8 +257,7 @@ def _closed(
             most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
         )
 
-    def solved(path: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """Path and positions of the landmarks with these labels."""
+    def solved(labels: IntArray, path: FloatArray | None) -> _Solved:
         line_xy = None
         if not by_discs:
             start = chain_steps(recording.steps) if path is None else path
@@ -255,37 +271,72 @@ def _closed(
             camera_xy=camera_xy,
             sigma_scale=settings.sigma_scale,
         )
-        return found.path, found.circle_xy if by_discs else found.line_xy
+        xy = found.circle_xy if by_discs else found.line_xy
+        return _Solved(labels, found.path, xy, found.cost)
 
-    path, xy = solved(path)
+    at = solved(labels, path)
     matches: list[Match] = []
     for number in range(1, _MOST_ROUNDS + 1):
         report(f"loops, round {number}")
-        compared = stretches_of(frames, labels, xy, len(recording), most=MOST_COMPARED)
+        before = len(at.xy)
+        compared = stretches_of(frames, at.labels, at.xy, len(recording), most=MOST_COMPARED)
         found = find_matches(compared, search)
-        found = consistent_matches(found, matches, path, recording.step_covariance)
-        labels, matched = merge_labels(
-            frames, labels, pairs_by_votes(match.pairs for match in found)
-        )
-        path, xy = solved(closed_path(path, found, recording.lost) if found else path)
-        stretches = stretches_of(frames, labels, xy, len(recording))
-        spread = _isotropic(len(xy), REACH_M)
+        found = consistent_matches(found, matches, at.path, recording.step_covariance)
+        at, found = _with_matches(recording, at, found, solved)
+        stretches = stretches_of(frames, at.labels, at.xy, len(recording))
+        spread = _isotropic(len(at.xy), REACH_M)
         if by_discs:
-            spread = _spread(swayed, path, labels, settings.sigma_scale)
+            spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
         pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
-        labels, by_position = merge_labels(frames, labels, pairs)
+        labels, by_position = merge_labels(frames, at.labels, pairs, _most_together(recording))
         if by_position:
-            path, xy = solved(path)
+            at = solved(labels, at.path)
         matches += found
-        if matched + by_position == 0 and search == _EVERYWHERE:
+        if len(at.xy) == before and search == _EVERYWHERE:
             break
         search = _EVERYWHERE
-    return _Closed(labels, path, xy, tuple(matches))
+    return _Closed(at.labels, at.path, at.xy, tuple(matches))
+
+
+def _with_matches(
+    recording: Recording,
+    before: _Solved,
+    matches: Sequence[Match],
+    solved: Callable[[IntArray, FloatArray | None], _Solved],
+) -> tuple[_Solved, list[Match]]:
+    """The run with matches closed, except those that its rows contradict, and the closed ones.
+
+    Rooms may look so alike that odometry cannot exclude a wrong match. It bends the path, and the
+    errors of all rows along it increase the cost far more than errors of a right match.
+    """
+    frames, lost = _frames_of_labels(recording), recording.lost
+    at, closed = before, list[Match]()
+    waiting = [sorted(matches, key=lambda match: (match.later_frame, match.earlier_frame))]
+    fewest = math.ceil(len(matches) / _MOST_PARTS)
+    while waiting:
+        some = waiting.pop()
+        if not some:
+            continue
+        together = [*closed, *some]
+        pairs = pairs_by_votes(match.pairs for match in together)
+        labels, _ = merge_labels(frames, before.labels, pairs, _most_together(recording))
+        trial = solved(labels, closed_path(before.path, together, lost))
+        allowed = _MOST_COST * (len(at.xy) - len(trial.xy))
+        if not len(recording.circles) or trial.cost - at.cost <= allowed:
+            at, closed = trial, together
+        elif len(some) > fewest:
+            half = len(some) // 2
+            waiting += [some[half:], some[:half]]
+    return at, closed
 
 
 def _frames_of_labels(recording: Recording) -> IntArray:
     """(n,) frames of the rows of discs, or of lines if there are none."""
     return recording.circles.frame if len(recording.circles) else recording.lines.frame
+
+
+def _most_together(recording: Recording) -> float:
+    return _MOST_TOGETHER if len(recording.circles) else 0.0
 
 
 def _without_lines(recording: Recording) -> Recording:
@@ -301,26 +352,54 @@ def _with_sway(recording: Recording, settings: AssociateSettings) -> Recording:
     return replace(recording, circles=replace(recording.circles, covariance=covariance))
 
 
-def _without_clutter(
+def without_clutter(
     recording: Recording, labels: IntArray, path: FloatArray, settings: AssociateSettings
 ) -> IntArray:
-    """Labels of discs, -1 for outliers, and for rows of discs with too few rows."""
+    """Labels of discs, -1 for outliers, and for rows of discs with too few rows.
+
+    Clutter kept some labels of one disc apart: without it, they are merged.
+
+    Takes `labels` (n,), numbered from 0 without gaps, and their `path` (N + 1, 3); returns (n,).
+    """
     gate = chdtri(2, 1.0 - settings.kept_probability)
-    circles = recording.circles
+    circles, frames = recording.circles, recording.circles.frame
+    swayed = _with_sway(recording, settings)
     kept = np.ones(len(labels), dtype=np.bool_)
     none = np.zeros(0, dtype=np.int64)
     # The second pass excludes the rows found by the first.
-    for _ in range(2):
+    for last in (False, True):
         known, numbers = np.unique(labels[kept], return_inverse=True)
         fitting = _without_lines(replace(recording, circles=circles.only(kept)))
         solution = solve_path(fitting, numbers, none, path)
         path = solution.path
         places = np.full((int(labels.max(initial=-1)) + 1, 2), np.nan)
         places[known] = solution.circle_xy
-        off = disc_in_robot(path[circles.frame + 1], places[labels]) - circles.xy
-        kept = squared_mahalanobis(off, circles.covariance) <= gate
+        off = disc_in_robot(path[frames + 1], places[labels]) - circles.xy
+        squared = squared_mahalanobis(off, circles.covariance)
+        kept = (squared <= gate) & _nearest_of_frame(frames, labels, squared)
         kept &= np.bincount(labels[kept], minlength=len(places))[labels] >= settings.fewest_rows
+        if not last and np.any(kept):
+            known, numbers = np.unique(labels[kept], return_inverse=True)
+            rows = replace(swayed, circles=swayed.circles.only(kept))
+            stretches = stretches_of(frames[kept], numbers, places[known], len(recording))
+            spread = _spread(rows, path, numbers, settings.sigma_scale)
+            pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
+            merged, _ = merge_labels(frames[kept], numbers, pairs)
+            of_merged = known[numbers[np.unique(merged, return_index=True)[1]]]
+            renamed = np.arange(len(places))
+            renamed[known[numbers]] = of_merged[merged]
+            labels = renamed[labels]
     return np.where(kept, labels, -1)
+
+
+def _nearest_of_frame(frames: IntArray, labels: IntArray, squared: FloatArray) -> BoolArray:
+    """(n,) mask of the rows with the least squared error of those with one label in a frame."""
+    order = np.lexsort((squared, labels, frames))
+    first = np.ones(len(order), dtype=np.bool_)
+    first[1:] = (np.diff(frames[order]) != 0) | (np.diff(labels[order]) != 0)
+    nearest = np.zeros(len(order), dtype=np.bool_)
+    nearest[order] = first
+    return nearest
 
 
 def _spread(
