@@ -14,8 +14,9 @@ from camera.rotations import rotation_of
 from camera.uncertainty import covariance_of, with_covariance
 from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
-from redetect.plane import chain_steps
+from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
+from redetect.slam.mapping.filtered_start import filtered_poses
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import PLACE_PRIOR_M, Weighting
 from redetect.slam.mapping.initial_lines import place_lines
@@ -428,3 +429,32 @@ def test_singular_covariances_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(SlamError, match=r"step 1 \(a\).*positive definite"):
         recording_of_frames(list(read_frames(path)), str(path))
+
+
+def test_odometry_that_winds_up_does_not_wind_the_map() -> None:
+    """Each turn is wrong by ten standard deviations, the heading in the end by more than a turn."""
+    run = small_run(1, steps=120)
+    recording = _only_discs(run)
+    recording = replace(recording, steps=recording.steps + np.array([0.0, 0.0, 0.06]))
+    graph = graph_of_recording(recording)
+    from_odometry = solve(graph, first_sight(graph), Weighting())
+    from_truth = solve(graph, first_sight(graph, poses=run.poses), Weighting())
+    assert from_odometry.costs[-1] > 1.5 * from_truth.costs[-1]
+    mapped = map_run(recording)
+    assert mapped.cost == pytest.approx(from_truth.costs[-1], rel=1e-6)
+    assert np.max(np.abs(mapped.estimate.poses[:, 2] - run.poses[:, 2])) < np.pi / 2
+
+
+def test_filtered_start_begins_again_after_a_lost_step() -> None:
+    run = small_run(2)
+    recording = _only_discs(run)
+    steps, covariance = recording.steps.copy(), recording.step_covariance.copy()
+    steps[30] += [5.0, 5.0, 1.0]
+    covariance[30] = np.diag([1e6, 1e6, 1e2])
+    poses = filtered_poses(replace(recording, steps=steps, step_covariance=covariance))
+    true = between(run.poses[:1], run.poses)
+    assert np.hypot(*(poses[:31] - true[:31]).T[:2]).max() < 0.5
+    # The second part is displaced, but has the same shape.
+    assert poses[31] == pytest.approx(move(poses[30], steps[30]), abs=1e-9)
+    shape = between(poses[31:32], poses[31:]) - between(run.poses[31:32], run.poses[31:])
+    assert np.hypot(*shape.T[:2]).max() < 0.5

@@ -112,12 +112,14 @@ def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
     )
 
 
-def first_sight(graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0)) -> Estimate:
+def first_sight(
+    graph: Graph, start: ArrayLike = (0.0, 0.0, 0.0), poses: FloatArray | None = None
+) -> Estimate:
     """Poses chained by odometry from the first (3,), discs where they were first seen.
 
-    Lines have no initial position: `line_xy` is NaN.
+    Other poses (N + 1, 3) may be given. Lines have no initial position: `line_xy` is NaN.
     """
-    poses = chain_steps(graph.steps, start)
+    poses = chain_steps(graph.steps, start) if poses is None else poses
     _, first = np.unique(graph.disc_index, return_index=True)
     return Estimate(
         poses=poses,

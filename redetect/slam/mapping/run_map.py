@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Literal
@@ -19,6 +20,7 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landm
 from redetect.least_squares.solver import LossKind, Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
+from redetect.slam.mapping.filtered_start import filtered_poses
 from redetect.slam.mapping.graph import (
     Estimate,
     Graph,
@@ -37,6 +39,8 @@ from redetect.slam.recording import Recording
 _FEWEST_SHARED = 2
 # Tolerance before the final optimisation.
 _COARSE = 1e-3
+# A larger ratio of chi-squared to its expectation may be due to a wrong start.
+_PLAUSIBLE_FACTOR = 2.5
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
@@ -220,10 +224,8 @@ def map_run(
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
-    begin = first_sight(graph, start)
+    begin = _in_place(recording, graph, first_sight(graph, start), name)
     plain = Weighting()
-    if len(recording.lost):
-        begin = _with_parts_in_place(recording, graph, begin, name)
     descend = _descent(solver, wanted.loss)
     trail: list[Minimum[Estimate]] = []
 
@@ -233,7 +235,7 @@ def map_run(
 
     more = len(recording.lines) > 0
     only_start = more or wanted != plain or solver != "separable"
-    estimate = keep(solve(graph, begin, plain, tolerance=_COARSE if only_start else 1e-10))
+    estimate = keep(_plain(recording, graph, begin, _COARSE if only_start else 1e-10, name))
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     if more:
         placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
@@ -267,9 +269,35 @@ def map_run(
     )
 
 
-def _with_parts_in_place(
-    recording: Recording, graph: Graph, begin: Estimate, name: str
-) -> Estimate:
+def _plain(
+    recording: Recording, graph: Graph, begin: Estimate, tolerance: float, name: str
+) -> Minimum[Estimate]:
+    """Least squares of odometry and discs.
+
+    If the errors are much larger than their covariances, the start may have been wrong: then also
+    from the poses of a filter, and the lower minimum counts.
+    """
+    found, error = None, None
+    try:
+        found = solve(graph, begin, Weighting(), tolerance=tolerance)
+    except SlamError as raised:
+        error = raised
+    expected = max(2 * (len(graph.disc_pose) - len(graph.disc_ids)), 1)
+    if found is not None and found.costs[-1] <= _PLAUSIBLE_FACTOR * expected:
+        return found
+    with suppress(SlamError):
+        poses = filtered_poses(recording, begin.poses[0])
+        again = _in_place(recording, graph, first_sight(graph, poses=poses), name)
+        other = solve(graph, again, Weighting(), tolerance=tolerance)
+        if found is None or other.costs[-1] < found.costs[-1]:
+            found = other
+    if found is None:
+        assert error is not None
+        raise error
+    return found
+
+
+def _in_place(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
     """An initial estimate with the parts between lost steps registered by their common discs.
 
     Each part is mapped separately. The first stays; the next is always the part with most discs in
@@ -277,10 +305,12 @@ def _with_parts_in_place(
     odometry. Raises `SlamError` if a part shares fewer than two landmarks with the others.
     """
     lost, discs = recording.lost, len(graph.disc_ids)
+    if not len(lost):
+        return begin
     part = np.searchsorted(lost, graph.disc_pose - 1, side="right")
     own, index = np.unique(part * discs + graph.disc_index, return_inverse=True)
     alone = replace(graph, disc_ids=own, disc_index=index)
-    begun = first_sight(alone, begin.poses[0])
+    begun = first_sight(alone, poses=begin.poses)
     found = solve(alone, begun, Weighting(loss="huber"), tolerance=_COARSE).at
     places = np.full((len(lost) + 1, discs, 2), np.nan)
     places[own // discs, own % discs] = found.disc_xy
