@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -28,6 +29,7 @@ from redetect.slam.commands.files import (
 )
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.odometry_check import OdometryCheck
 from redetect.slam.mapping.run_map import (
     LeftOut,
     MappedRun,
@@ -46,6 +48,12 @@ from redetect.storage.bounds import ABOVE_0, demand
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
+
+# Systematic errors of odometry are reported if they exceed this many standard deviations, and these
+# relative changes of lengths and turns (rad/m).
+_SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN = 5.0, 0.02, 0.01
+# Factor of odometry alone above which its covariances are too small.
+_MOST_FACTOR = 2.5
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
 MOST_LANDMARKS_TOGETHER = 5000
@@ -82,8 +90,9 @@ def perform(command: Map) -> int:
     ends = first_poses(runs)
     for first, end, own in zip(ends, ends[1:], paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
-    write_json(output / TABLE_NAME, _results(mapped, command), overwrite=command.force)
-    for line in _report(mapped, seconds):
+    check = mapped.odometry_check()
+    write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
+    for line in _report(mapped, check, seconds):
         print(line)
     if not few:
         print(
@@ -123,14 +132,46 @@ def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     )
 
 
-def _report(mapped: MappedRun, seconds: float) -> list[str]:
+def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str]:
     lines = table_lines(mapped.table)
+    for name, factor in (("odometry", check.odometry_factor), ("rows", check.rows_factor)):
+        if not math.isnan(factor):
+            lines.append(f"{f'factor of {name} alone':<28}{factor:>12.2f}")
     if mapped.cost < mapped.table.chi_squared * (1.0 - 1e-9):
         lines.append(f"{'minimised, under the loss':<28}{mapped.cost:>12,.2f}")
     if mapped.mounting is not None:
         lines += _mounting_lines(mapped.mounting)
     lines += _left_out_lines(mapped.left_out)
+    lines += odometry_lines(check, mapped.table.root)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
+    return lines
+
+
+def odometry_lines(check: OdometryCheck, root: float) -> list[str]:
+    """Systematic errors of odometry that are large and significant, in words.
+
+    `root` is the factor on the standard deviations of the map.
+    """
+    least = _SIGNIFICANT * max(root, 1.0)
+    lines = []
+    if abs(check.length) > max(least * check.length_sigma, _LEAST_LENGTH):
+        percent, way = 100.0 * abs(check.length), "longer" if check.length > 0.0 else "shorter"
+        lines.append(
+            f"odometry does not fit the rows: its steps would have to be {percent:.1f} % {way}; is "
+            "it in metres, is the discs' radius right (--radius-m), does the camera lean or have "
+            "another height (--calibrate)?"
+        )
+    if abs(check.turn_per_metre) > max(least * check.turn_per_metre_sigma, _LEAST_TURN):
+        side = "left" if check.turn_per_metre > 0.0 else "right"
+        lines.append(
+            "odometry does not fit the rows: it would have to turn to the "
+            f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
+        )
+    if check.odometry_factor > _MOST_FACTOR:
+        lines.append(
+            f"errors of odometry are {math.sqrt(check.odometry_factor):.1f} times as large as its "
+            "covariances state: those of the map are larger than stated, too"
+        )
     return lines
 
 
@@ -156,11 +197,12 @@ def _left_out_lines(left_out: LeftOut) -> list[str]:
     return [f"{what}: {count}" for count, what in said if count]
 
 
-def _results(mapped: MappedRun, command: Map) -> dict[str, Any]:
+def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str, Any]:
     results: dict[str, Any] = {
         "version": slam.__version__,
         "configuration": flags_of(command, ("output", "force", "interactive")),
         "table": as_json(mapped.table),
+        "odometry": as_json(check),
         "minimised": mapped.cost,
         "steps": mapped.steps,
         "left_out": asdict(mapped.left_out),

@@ -30,6 +30,7 @@ from redetect.slam.mapping.graph import (
 )
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
+from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
@@ -113,8 +114,8 @@ def table_lines(table: ChiSquared) -> list[str]:
     return [f"{name:<28}{value:>12}" for name, value in rows]
 
 
-def as_json(table: ChiSquared) -> dict[str, float | int | None]:
-    """The table for a JSON file; NaN becomes null."""
+def as_json(table: ChiSquared | OdometryCheck) -> dict[str, float | int | None]:
+    """A table for a JSON file; NaN becomes null."""
     return {
         name: None if isinstance(value, float) and math.isnan(value) else value
         for name, value in asdict(table).items()
@@ -184,6 +185,10 @@ class MappedRun:
         """The map with the joint covariance of its landmarks."""
         joint = joint_covariance(self.graph, self.estimate, self.weighting)
         return replace(self.landmarks, joint_covariance=joint)
+
+    def odometry_check(self) -> OdometryCheck:
+        """Do odometry and rows fit each other?"""
+        return check_odometry(self.graph, self.estimate, self.weighting, self.table.expected)
 
 
 def map_run(

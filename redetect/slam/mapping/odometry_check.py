@@ -1,0 +1,84 @@
+"""Do odometry and landmark rows fit each other? Their errors apart, and what odometry does wrong.
+
+The factor of a map, chi-squared over its expectation, may be near 1 although odometry is far worse
+than its covariances state: most numbers are those of rows. So the expectation is divided: that of
+odometry is the sum of its redundancies, the share of each number that the others check (W.
+Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, chapter 4). Systematic errors of all
+steps, as of a wheel's radius or a unit, are estimated as further unknowns, from the minimum without
+them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from redetect.least_squares.covariance import diagonal_blocks
+from redetect.least_squares.solver import normal_equations
+from redetect.slam.mapping.graph import Estimate, Graph
+from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
+from redetect.slam.models import between_jacobians
+
+#: Fewest redundant numbers from which a factor is meaningful.
+FEWEST_NUMBERS = 10.0
+
+
+@dataclass(frozen=True)
+class OdometryCheck:
+    """Errors of odometry and of rows, and systematic errors of odometry.
+
+    The latter are corrections by which its steps would fit the rows, with standard deviations; NaN
+    if the camera's mounting is unknown, since its height has the scale of odometry.
+    """
+
+    odometry_factor: float  # chi-squared of odometry over its expectation; NaN without redundancy
+    rows_factor: float  # the same of landmark rows
+    length: float  # relative change of the lengths of all steps
+    length_sigma: float
+    turn_per_metre: float  # additional turn (rad/m)
+    turn_per_metre_sigma: float
+
+
+def check_odometry(
+    graph: Graph, estimate: Estimate, weighting: Weighting, expected: int
+) -> OdometryCheck:
+    """Check a minimum of `solve`; `expected` is the expectation of chi-squared of the map.
+
+    Raises `numpy.linalg.LinAlgError` if the measurements do not determine the unknowns.
+    """
+    problem, count = linearise(graph, estimate, weighting), len(graph.steps)
+    if not weighting.calibrate:
+        by_change = np.zeros((count, 3, 2))
+        by_change[:, :2, 0] = -graph.steps[:, :2]
+        by_change[:, 2, 1] = -np.hypot(graph.steps[:, 0], graph.steps[:, 1])
+        border = np.zeros((len(problem.residual), 2))
+        border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 2)
+        problem = problem._replace(border=border)
+    equations = normal_equations(problem)
+    # Of each pose with the next; the first one is known.
+    pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
+    found, spread = diagonal_blocks(equations, [pairs, (3, np.zeros(1, dtype=np.int64))])
+    by_poses = graph.step_whitening @ np.concatenate(
+        between_jacobians(estimate.poses[:-1], estimate.poses[1:]), axis=2
+    )
+    first, others = by_poses[:1, :, 3:], by_poses[1:]
+    estimated = sum(
+        float(np.einsum("nij,njk,nik->", by, covariance, by))
+        for by, covariance in ((others, found[0]), (first, found[1]))
+    )
+    odometry, rows = 3.0 * count - estimated, expected - 3.0 * count + estimated
+    error = errors(graph, estimate, weighting)
+    squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
+    change, sigma = np.full(2, math.nan), np.full(2, math.nan)
+    if not weighting.calibrate:
+        change, sigma = equations.step(0.0)[1], np.sqrt(np.diag(spread))
+    return OdometryCheck(
+        odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
+        rows_factor=sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
+        length=float(change[0]),
+        length_sigma=float(sigma[0]),
+        turn_per_metre=float(change[1]),
+        turn_per_metre_sigma=float(sigma[1]),
+    )

@@ -1,0 +1,84 @@
+"""Whether odometry and rows fit each other, with known errors of odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from redetect.landmarks import write_frames
+from redetect.slam.cli import main
+from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.recording import LineRows, Recording, frames_of_discs
+from tests.slam.small_run import small_run
+
+
+def _run(seed: int) -> Recording:
+    return replace(small_run(seed, steps=120, weave_rad=0.1).recording, lines=LineRows.of())
+
+
+def _check(recording: Recording) -> OdometryCheck:
+    return map_run(recording).odometry_check()
+
+
+def test_factors_of_odometry_and_of_rows_are_one_if_covariances_are_right() -> None:
+    checks = [_check(_run(seed)) for seed in range(1, 9)]
+    assert np.mean([check.odometry_factor for check in checks]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([check.rows_factor for check in checks]) == pytest.approx(1.0, abs=0.1)
+    lengths = np.array([check.length / check.length_sigma for check in checks])
+    turns = np.array([check.turn_per_metre / check.turn_per_metre_sigma for check in checks])
+    # The mean of eight squares, with a standard deviation of 0.5.
+    assert 0.1 < np.mean(lengths**2) < 2.5
+    assert 0.1 < np.mean(turns**2) < 2.5
+
+
+def test_covariances_of_odometry_that_are_too_small_show_in_its_factor_alone() -> None:
+    runs = [_run(seed) for seed in range(1, 5)]
+    checks = [_check(replace(run, step_covariance=run.step_covariance / 4.0)) for run in runs]
+    assert np.mean([check.odometry_factor for check in checks]) > 2.5
+    assert np.mean([check.rows_factor for check in checks]) < 1.3
+
+
+def test_wrong_lengths_and_turns_of_odometry_are_found() -> None:
+    run = _run(1)
+    steps = run.steps * [0.8, 0.8, 1.0]
+    found = _check(replace(run, steps=steps))
+    assert found.length == pytest.approx(0.25, abs=4.0 * found.length_sigma + 0.02)
+    assert abs(found.turn_per_metre) < 0.02
+    steps = run.steps.copy()
+    steps[:, 2] += 0.03 * np.hypot(steps[:, 0], steps[:, 1])
+    found = _check(replace(run, steps=steps))
+    assert found.turn_per_metre == pytest.approx(-0.03, abs=4.0 * found.turn_per_metre_sigma)
+    assert abs(found.length) < 0.02
+
+
+def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
+    run = _run(2)
+    mapped = map_run(run.part(0, 6))
+    assert np.isnan(mapped.odometry_check().odometry_factor)
+    one = map_run(run.part(0, 1))
+    found = check_odometry(one.graph, one.estimate, Weighting(), one.table.expected)
+    assert np.isnan(found.odometry_factor)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.8])
+def test_slam_map_says_what_odometry_does_wrong(
+    scale: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _run(3)
+    steps = run.steps * [scale, scale, 1.0]
+    write_frames(tmp_path / "map.circles", frames_of_discs(replace(run, steps=steps)))
+    assert main(["map", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "factor of odometry alone" in said
+    if scale == 1.0:
+        assert "does not fit" not in said
+        assert "errors of odometry" not in said
+    else:
+        (line,) = [line for line in said.splitlines() if "does not fit the rows" in line]
+        assert "% longer" in line
+        assert 22.0 < float(line.split(" % ")[0].split()[-1]) < 28.0
