@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from redetect.landmarks import CircleLandmark, LineLandmark, read_frames, read_rows
+from redetect.landmarks import (
+    CircleLandmark,
+    LineLandmark,
+    Step,
+    read_frames,
+    read_rows,
+    write_rows,
+)
 from redetect.slam.cli import main
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import read_recording
@@ -113,3 +121,24 @@ def test_relative_noise_is_that_multiple_of_the_rows_own(project_root: Path) -> 
     assert with_relative_noise(recording, 0.0, seed=4).circles.xy.tolist() == (
         recording.circles.xy.tolist()
     )
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"), [(0.001, "most rows match no disc"), (100.0, "metres?")]
+)
+def test_odometry_in_another_unit_is_doubted(
+    scale: float, said: str, project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = read_rows(project_root / "images" / "e" / "map.circles")
+    scaled = []
+    for row in rows:
+        step = row.record
+        if isinstance(step, Step):
+            own = (scale * step.dx, scale * step.dy, step.dphi)
+            row = row.with_record(Step(step.prefix, *own, *np.zeros(6).tolist()))
+        scaled.append(row)
+    write_rows(tmp_path / "map.circles", scaled)
+    main(["associate", str(tmp_path)])
+    assert said in capsys.readouterr().err
+    main(["associate", str(project_root / "images" / "e"), "-o", str(tmp_path / "right.circles")])
+    assert "metres" not in capsys.readouterr().err

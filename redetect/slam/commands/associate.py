@@ -19,6 +19,7 @@ from redetect.slam.association.score import AssociationScore, score_association
 from redetect.slam.commands.files import (
     camera_xy_of,
     files_of,
+    lengths_of,
     recordings_of,
     write_json,
 )
@@ -77,6 +78,9 @@ def perform(options: Associate) -> int:
         rows, labels = list(read_rows(source)), (of_discs[k], of_lines[k])
         write_rows(target, identified_rows(rows, *labels, source), overwrite=options.force)
         print(f"{target}: {_counted(rows, *labels)}")
+    for run, own in zip(runs, of_discs):
+        if 2 * np.count_nonzero(own < 0) > len(own):
+            print(_doubt(run), file=sys.stderr)
     content = {
         "version": slam.__version__,
         "run": str(options.run),
@@ -153,6 +157,16 @@ def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray
             if np.any(labels < 0):
                 parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that match none of them"
     return ", ".join(parts) or "no landmarks"
+
+
+def _doubt(run: Recording) -> str:
+    """What may be wrong with a run most of whose rows of discs match none."""
+    way, reach = lengths_of(run)
+    return (
+        "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
+        f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
+        "radians, and the axes of the robot, X left and Y backward"
+    )
 
 
 def _target(options: Associate, run: int, source: Path, several: bool) -> Path:
