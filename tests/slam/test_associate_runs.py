@@ -309,3 +309,16 @@ def test_clutter_does_not_keep_the_labels_of_a_disc_apart() -> None:
     labels = np.where((ids == 0) & (frame >= 6), 8, ids)
     found = without_clutter(recording, labels, path, AssociateSettings())
     assert found.tolist() == np.where(ids == 8, -1, ids).tolist()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_dozen_discs_round_which_the_robot_drives_slowly_are_found_again(seed: int) -> None:
+    """Steps of 0.1 m: fifty frames show too few discs to recognise a place by."""
+    fast = circuit(2.5, 4.0)
+    steps = np.repeat(0.5 * between(fast[:-1], fast[1:]), 2, axis=0)
+    path, covariance = chain_steps(steps), OdometryNoise().covariance(steps)
+    recording = drive(path, scattered(seed, 12, 0.8, 4.0), NO_LINES, seed, covariance)
+    score = score_association(associate_run(recording).circle_labels, ids_of(recording))
+    assert score.pair_precision == 1.0
+    assert score.splits == 0
+    assert score.found_landmarks == score.true_landmarks

@@ -35,8 +35,8 @@ REACH_M = 0.12
 _COVER_M = 0.6
 # Spacing at which the area is measured.
 _GRID_M = 0.15
-#: Number of frames whose landmarks form a constellation, and from one constellation to the next.
-STRETCH_FRAMES, STRIDE_FRAMES = 50, 10
+#: Least number of frames whose landmarks form a constellation, and constellations in their length.
+STRETCH_FRAMES, _OVERLAPPING = 50, 5
 #: Most landmarks of a constellation that is compared with others, at the cost of their number to
 #: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
 MOST_COMPARED = 80
@@ -61,6 +61,7 @@ class Search(NamedTuple):
     # A stretch that shares landmarks with one at least this many frames earlier is part of the map
     # already and not matched again; 0 to match all.
     attached_frames: int = 0
+    stretch_frames: int = STRETCH_FRAMES  # Length of the stretches.
 
 
 class _Cells(NamedTuple):
@@ -222,24 +223,26 @@ def stretches_of(
     xy: FloatArray,
     count: int,
     *,
-    stride: int = STRIDE_FRAMES,
+    length: int = STRETCH_FRAMES,
+    stride: int | None = None,
     least: int = Search().least_agreeing,
     most: int | None = None,
 ) -> list[Stretch]:
     """The constellations with enough landmarks along a run of `count` frames.
 
-    Of more landmarks than `most`, those with most rows are used. Takes `frames, labels` (n,), `xy`
+    They consist of `length` frames, and begin every `stride` frames, by default a fifth of it. Of
+    more landmarks than `most`, those with most rows are used. Takes `frames, labels` (n,), `xy`
     (M, 2).
     """
     found = []
-    for start in range(0, max(count - STRETCH_FRAMES // 2, 1), stride):
-        first, last = np.searchsorted(frames, [start, start + STRETCH_FRAMES])
+    for start in range(0, max(count - length // 2, 1), stride or length // _OVERLAPPING):
+        first, last = np.searchsorted(frames, [start, start + length])
         seen, rows = np.unique(labels[first:last], return_counts=True)
         known = np.isfinite(xy[seen, 0])
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:
-            middle = min(start + STRETCH_FRAMES // 2, count - 1)
+            middle = min(start + length // 2, count - 1)
             found.append(Stretch(middle, seen, xy[seen]))
     return found
 
@@ -273,7 +276,7 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
         later = stretches[k]
         shared = together[[k], :k].toarray()[0]
         gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
-        apart = (gap >= STRETCH_FRAMES) & (shared < SHARED_BY_ONE_PLACE)
+        apart = (gap >= search.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
         if search.attached_frames and np.any(~apart & (gap >= search.attached_frames)):
             continue
         near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (

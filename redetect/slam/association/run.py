@@ -71,6 +71,9 @@ _MOST_TOGETHER = 0.1
 _MOST_COST = 100.0
 # Matches that may contain a wrong one are divided into at most this many parts.
 _MOST_PARTS = 16
+# Stretches are longer, at most of this many frames, if they have fewer discs that are seen often
+# (median) than are enough to recognise a place.
+_LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
 # Least gap between frames, longer than a landmark stays visible or is waited for locally.
@@ -188,6 +191,7 @@ class _Closed(NamedTuple):
     path: FloatArray  # (N + 1, 3): the path solved with these labels
     xy: FloatArray  # (M, 2): the landmarks' positions (m)
     matches: tuple[Match, ...]  # the loops
+    stretch_frames: int  # length of the stretches that were matched
 
 
 def _closed_by_parts(
@@ -216,7 +220,8 @@ def _closed_by_parts(
         stretches.append(
             stretches_of(
                 *(_frames_of_labels(part), closed.labels, closed.xy, len(part)),
-                stride=STRETCH_FRAMES,
+                length=closed.stretch_frames,
+                stride=closed.stretch_frames,
                 least=ANYWHERE.least_agreeing,
             )
         )
@@ -276,26 +281,48 @@ def _closed(
 
     at = solved(labels, path)
     matches: list[Match] = []
-    for number in range(1, _MOST_ROUNDS + 1):
-        report(f"loops, round {number}")
-        before = len(at.xy)
-        compared = stretches_of(frames, at.labels, at.xy, len(recording), most=MOST_COMPARED)
-        found = find_matches(compared, search)
-        found = consistent_matches(found, matches, at.path, recording.step_covariance)
-        at, found = _with_matches(recording, at, found, solved)
-        stretches = stretches_of(frames, at.labels, at.xy, len(recording))
-        spread = _isotropic(len(at.xy), REACH_M)
-        if by_discs:
-            spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
-        pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
-        labels, by_position = merge_labels(frames, at.labels, pairs, _most_together(recording))
-        if by_position:
-            at = solved(labels, at.path)
-        matches += found
-        if len(at.xy) == before and search == _EVERYWHERE:
-            break
-        search = _EVERYWHERE
-    return _Closed(at.labels, at.path, at.xy, tuple(matches))
+    length = search.stretch_frames
+    while True:
+        for number in range(1, _MOST_ROUNDS + 1):
+            report(f"loops, stretches of {length} frames, round {number}")
+            before = len(at.xy)
+            some = (frames, at.labels, at.xy, len(recording))
+            found = find_matches(stretches_of(*some, length=length, most=MOST_COMPARED), search)
+            found = consistent_matches(found, matches, at.path, recording.step_covariance)
+            at, found = _with_matches(recording, at, found, solved)
+            stretches = stretches_of(frames, at.labels, at.xy, len(recording), length=length)
+            spread = _isotropic(len(at.xy), REACH_M)
+            if by_discs:
+                spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
+            pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
+            labels, by_position = merge_labels(frames, at.labels, pairs, _most_together(recording))
+            if by_position:
+                at = solved(labels, at.path)
+            matches += found
+            if len(at.xy) == before and search.most_shift_m == math.inf:
+                break
+            search = _everywhere(length)
+        if not by_discs or length == _LONGEST or not _sparse(frames, at, len(recording), length):
+            return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
+        length = min(2 * length, _LONGEST)
+        search = Search(stretch_frames=length)
+
+
+def _everywhere(length: int) -> Search:
+    """The search for stretches of a length everywhere in the map."""
+    return _EVERYWHERE._replace(
+        stretch_frames=length,
+        attached_frames=_EVERYWHERE.attached_frames * length // STRETCH_FRAMES,
+    )
+
+
+def _sparse(frames: IntArray, at: _Solved, count: int, length: int) -> bool:
+    """Whether stretches of a length have too few discs to be recognised."""
+    often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
+    stretches = stretches_of(
+        frames[often], at.labels[often], at.xy, count, length=length, stride=length, least=0
+    )
+    return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
 
 
 def _with_matches(
