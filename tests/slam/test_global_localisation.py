@@ -69,6 +69,18 @@ def test_where_the_building_repeats_itself_nothing_is_certain() -> None:
     np.testing.assert_allclose(one.pose, [3.0, 5.0, 0.3], atol=0.4)
 
 
+@pytest.mark.parametrize("pairs", [6, 12])
+def test_a_corridor_of_regular_pairs_looks_alike_a_period_on_and_from_its_other_end(
+    pairs: int,
+) -> None:
+    """All its discs are in both places: none is left beside those that agree."""
+    along = np.repeat(-1.5 * np.arange(pairs), 2)
+    disc_xy = np.column_stack([np.tile([-1.2, 1.2], pairs), along])
+    for seed, ahead in enumerate((1.0, -0.8, -2.0)):
+        seen = drive(disc_xy, np.array([0.3, ahead, 0.0]), seed)
+        assert localise_globally(seen, disc_xy) is None
+
+
 def test_another_building_has_no_place_for_it() -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)

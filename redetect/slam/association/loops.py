@@ -29,6 +29,8 @@ _CELL_M = 0.05
 _NEIGHBOURS = 5
 # Largest difference of the lengths of two pairs of landmarks that vote, and least length (m).
 _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
+# Motions of a constellation are different ones from this shift of its centre or turn on.
+_OTHER_SHIFT_M, _OTHER_TURN_RAD = 0.5, 0.3
 #: Largest distance of landmarks that agree (m).
 REACH_M = 0.12
 # A constellation covers the area within this distance of its landmarks.
@@ -134,14 +136,25 @@ def _agreement(
 
 
 @kernel()
+def _near(turn: float, x: float, y: float, others: FloatArray) -> bool:
+    """Whether a rotation and a shift are near one of others (k, 3)."""
+    for k in range(len(others)):
+        off = math.hypot(x - others[k, 1], y - others[k, 2])
+        if off < _OTHER_SHIFT_M and math.cos(turn - others[k, 0]) > math.cos(_OTHER_TURN_RAD):
+            return True
+    return False
+
+
+@kernel()
 def _best_motion(
-    moved: FloatArray, fixed: FloatArray, search: Search
+    moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
     Every pair of landmarks of the first with every pair of the second of the same length gives a
     motion; agreeing landmarks are counted. Returns the rotation about the first constellation's
-    centre and the shift, the number of agreeing landmarks, and the number of motions tried.
+    centre and the shift, the number of agreeing landmarks, and the number of motions tried. Motions
+    near those `besides` (k, 3) are not considered.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -177,6 +190,8 @@ def _best_motion(
                     new_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
                     shift_x, shift_y = new_x - centre_x, new_y - centre_y
                     if math.hypot(shift_x, shift_y) > search.most_shift_m:
+                        continue
+                    if _near(turn, shift_x, shift_y, besides):
                         continue
                     tried += 1
                     motion = (cos, sin, new_x, new_y)
@@ -307,10 +322,18 @@ class Motion(NamedTuple):
     tried: int  # number of motions tried
 
 
-def motion_onto(moved: FloatArray, fixed: FloatArray, search: Search) -> Motion:
-    """The motion under which most landmarks (n, 2) fall on those of another constellation."""
-    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search)
+def motion_onto(
+    moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray | None = None
+) -> Motion:
+    """The motion under which most landmarks (n, 2) fall on those of another constellation.
+
+    With `besides` (3,), the best one that is not near this pose.
+    """
     centre = moved.sum(axis=0) / max(len(moved), 1)
+    others = np.zeros((0, 3))
+    if besides is not None:
+        others = np.array([[besides[2], *(apply(besides, centre) - centre)]])
+    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search, others)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 

@@ -121,12 +121,9 @@ def located(
     alarms = log10_false_alarms(len(pairs), len(discs), chance, motion.tried)
     if alarms > math.log10(false_alarms):
         return None
-    others = np.delete(disc_xy, pairs[:, 0], axis=0)
-    if len(others) >= least:
-        rival = motion_onto(discs, others, ANYWHERE)
-        if rival.agreeing > _RIVAL_SHARE * len(pairs):
-            return None
-    return pose, pairs
+    # Also one on the same discs: pairs in a corridor look alike from both ends, and a period on.
+    rival = motion_onto(discs, disc_xy, ANYWHERE, besides=pose)
+    return None if rival.agreeing > _RIVAL_SHARE * len(pairs) else (pose, pairs)
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
