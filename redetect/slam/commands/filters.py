@@ -46,6 +46,8 @@ from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounds import demand
 
 ERROR_PICTURE = "errors.png"
+# The pose is lost if this many frames with discs in succession match none of them.
+_LOST_FRAMES = 20
 
 
 #: Results of a filter: the run, the map, and further lines for the terminal.
@@ -71,6 +73,8 @@ def perform(command: Localize | Ekf) -> int:
         run, landmark_map, said = _mapped(command, recording)
         source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
     seconds = time.perf_counter() - began
+    if command.association != "known":
+        said += lost_lines(run, recording)
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference = None if command.reference is None else read_path(command.reference)
     distance = None
@@ -149,6 +153,22 @@ def localized_run_of(
         lost = f"{command.run}: no row shows a landmark of {command.map}"
         raise SlamError(f"{lost}: expected {expected}")
     return run
+
+
+def lost_lines(run: FilterRun, recording: Recording) -> list[str]:
+    """The longest stretch of frames with discs that match none, in words, if it is long."""
+    frames, of_row = np.unique(recording.circles.frame, return_inverse=True)
+    matched = np.flatnonzero(np.bincount(of_row[run.disc_ids >= 0], minlength=len(frames)))
+    ends = np.concatenate([[-1], matched, [len(frames)]])
+    without = np.diff(ends) - 1
+    longest = int(np.argmax(without))
+    if without[longest] < _LOST_FRAMES:
+        return []
+    first = frames[ends[longest] + 1]
+    return [
+        f"lost              {without[longest]} frames with discs, from {recording.prefixes[first]} "
+        "on, match none of the map: poses from there on may be wrong"
+    ]
 
 
 def _global_start(
