@@ -82,3 +82,17 @@ def test_slam_map_says_what_odometry_does_wrong(
         (line,) = [line for line in said.splitlines() if "does not fit the rows" in line]
         assert "% longer" in line
         assert 22.0 < float(line.split(" % ")[0].split()[-1]) < 28.0
+
+
+def test_wrong_identifiers_are_not_blamed_on_odometry(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _run(4)
+    ids = run.circles.ids.copy()
+    ids[20::40] = ids[20::40] % 14 + 1  # of the next disc
+    wrong = replace(run, circles=replace(run.circles, ids=ids))
+    write_frames(tmp_path / "map.circles", frames_of_discs(wrong))
+    assert main(["map", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "times as large as their covariances state: `slam audit`" in said
+    assert "errors of odometry" not in said

@@ -52,7 +52,7 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
 # relative changes of lengths and turns (rad/m).
 _SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN = 5.0, 0.02, 0.01
-# Factor of odometry alone above which its covariances are too small.
+# Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
@@ -142,13 +142,13 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
     if mapped.mounting is not None:
         lines += _mounting_lines(mapped.mounting)
     lines += _left_out_lines(mapped.left_out)
-    lines += odometry_lines(check, mapped.table.root)
+    lines += doubts_of(check, mapped.table.root)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
 
 
-def odometry_lines(check: OdometryCheck, root: float) -> list[str]:
-    """Systematic errors of odometry that are large and significant, in words.
+def doubts_of(check: OdometryCheck, root: float) -> list[str]:
+    """What does not fit, in words: large and significant errors of odometry, or of rows.
 
     `root` is the factor on the standard deviations of the map.
     """
@@ -167,7 +167,13 @@ def odometry_lines(check: OdometryCheck, root: float) -> list[str]:
             "odometry does not fit the rows: it would have to turn to the "
             f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
         )
-    if check.odometry_factor > _MOST_FACTOR:
+    if check.rows_factor > _MOST_FACTOR:
+        lines.append(
+            f"errors of rows are {math.sqrt(check.rows_factor):.1f} times as large as their "
+            "covariances state: `slam audit` finds wrong identifiers, and --loss geman-mcclure "
+            "maps without them"
+        )
+    elif check.odometry_factor > _MOST_FACTOR:
         lines.append(
             f"errors of odometry are {math.sqrt(check.odometry_factor):.1f} times as large as its "
             "covariances state: those of the map are larger than stated, too"
