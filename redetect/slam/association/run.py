@@ -333,8 +333,8 @@ def _with_matches(
 ) -> tuple[_Solved, list[Match]]:
     """The run with matches closed, except those that its rows contradict, and the closed ones.
 
-    Rooms may look so alike that odometry cannot exclude a wrong match. It bends the path, and the
-    errors of all rows along it increase the cost far more than errors of a right match.
+    In a regular pattern of discs, odometry cannot exclude every wrong match. These bend the path,
+    so that errors of all rows along it increase the cost far more than those of a right match.
     """
     frames, lost = _frames_of_labels(recording), recording.lost
     at, closed = before, list[Match]()
