@@ -96,3 +96,17 @@ def test_wrong_identifiers_are_not_blamed_on_odometry(
     said = capsys.readouterr().out
     assert "times as large as their covariances state: `slam audit`" in said
     assert "errors of odometry" not in said
+
+
+def test_a_slip_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = _run(5)
+    assert _check(run).outliers == 0
+    steps = run.steps.copy()
+    steps[50] += [0.05, 0.3, 0.2]
+    slipped = replace(run, steps=steps)
+    found = _check(slipped)
+    assert found.outliers >= 1
+    assert abs(found.worst_step - 50) <= 2
+    write_frames(tmp_path / "map.circles", frames_of_discs(slipped))
+    assert main(["map", str(tmp_path)]) == 0
+    assert f"most at {run.prefixes[found.worst_step]}\n" in capsys.readouterr().out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -142,15 +143,15 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
     if mapped.mounting is not None:
         lines += _mounting_lines(mapped.mounting)
     lines += _left_out_lines(mapped.left_out)
-    lines += doubts_of(check, mapped.table.root)
+    lines += doubts_of(check, mapped.table.root, mapped.prefixes)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
 
 
-def doubts_of(check: OdometryCheck, root: float) -> list[str]:
+def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[str]:
     """What does not fit, in words: large and significant errors of odometry, or of rows.
 
-    `root` is the factor on the standard deviations of the map.
+    `root` is the factor on the standard deviations of the map, `names` those of its poses.
     """
     least = _SIGNIFICANT * max(root, 1.0)
     lines = []
@@ -166,6 +167,11 @@ def doubts_of(check: OdometryCheck, root: float) -> list[str]:
         lines.append(
             "odometry does not fit the rows: it would have to turn to the "
             f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
+        )
+    if check.outliers:
+        lines.append(
+            f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
+            f"are wrong, most at {names[check.worst_step + 1]}"
         )
     if check.rows_factor > _MOST_FACTOR:
         lines.append(

@@ -14,6 +14,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
 from redetect.least_squares.covariance import diagonal_blocks
 from redetect.least_squares.solver import normal_equations
@@ -23,6 +24,8 @@ from redetect.slam.models import between_jacobians
 
 #: Fewest redundant numbers from which a factor is meaningful.
 FEWEST_NUMBERS = 10.0
+# Largest squared error of a step by chance.
+_MOST_SQUARED = float(chdtri(3, 1e-6))
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class OdometryCheck:
     length_sigma: float
     turn_per_metre: float  # additional turn (rad/m)
     turn_per_metre_sigma: float
+    outliers: int  # steps that are wrong beyond any chance: slips, or rows there are wrong
+    worst_step: int  # the one with the largest error
 
 
 def check_odometry(
@@ -71,6 +76,7 @@ def check_odometry(
     odometry, rows = 3.0 * count - estimated, expected - 3.0 * count + estimated
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
+    of_steps = np.sum(error.odometry**2, axis=1)
     change, sigma = np.full(2, math.nan), np.full(2, math.nan)
     if not weighting.calibrate:
         change, sigma = equations.step(0.0)[1], np.sqrt(np.diag(spread))
@@ -81,4 +87,6 @@ def check_odometry(
         length_sigma=float(sigma[0]),
         turn_per_metre=float(change[1]),
         turn_per_metre_sigma=float(sigma[1]),
+        outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
+        worst_step=int(np.argmax(of_steps)),
     )
