@@ -337,6 +337,9 @@ def _with_matches(
     so that errors of all rows along it increase the cost far more than those of a right match.
     """
     frames, lost = _frames_of_labels(recording), recording.lost
+    if not len(recording.circles) and not matches:
+        # The lines intersect elsewhere along the solved path.
+        return solved(before.labels, before.path), []
     at, closed = before, list[Match]()
     waiting = [sorted(matches, key=lambda match: (match.later_frame, match.earlier_frame))]
     fewest = math.ceil(len(matches) / _MOST_PARTS)
