@@ -152,7 +152,7 @@ class LaserSettings(_Bounded):
 class SyncSettings(_Bounded):
     """Settings of the synchronisation of clocks."""
 
-    largest_offset_s: Positive = 1.0  # Bound of the time offset, either way (s).
+    largest_offset_s: Positive = 60.0  # Bound of the time offset, either way (s).
     # Bound of the drift, the relative difference of the clocks' rates.
     largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
     segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).

@@ -34,7 +34,7 @@ def perform(options: Sync) -> int:
     for segment in segments:
         print(_line(segment))
     if not determined:
-        print("no segment turns enough: the clocks cannot be aligned by headings")
+        print("no segment could be synchronised: no clock file is written")
         return 1
     model = ClockModel(segments)
     document: dict[str, Any] = {

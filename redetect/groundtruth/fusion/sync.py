@@ -2,7 +2,8 @@
 
 The headings of odometry and ground truth are those of one robot; the offset and the rate between
 their clocks minimise the squared difference, with the angle between their axes eliminated in closed
-form (RAWSEEDS D2.1 part 2). That search is global and derivative-free and needs no initial value.
+form (RAWSEEDS D2.1 part 2). That search is global within a second and derivative-free; farther
+offsets are found before, from movements over seconds (`redetect.groundtruth.fusion.coarse_offset`).
 But odometry's heading drifts, which a sum of squares would partly explain by a time offset. So the
 clock is then refined by maximising the likelihood of the measured poses, given odometry's movements
 and their errors: once for the headings of the ground truth alone, and once for its full poses, if
@@ -30,6 +31,7 @@ from redetect.groundtruth.fusion.clock import (
     knots_of,
     on_one_line,
 )
+from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, roughness
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
@@ -61,6 +63,7 @@ _LEAST_DETERMINED = 0.1
 # The same for the drift, which is assumed to be 0 if it is not determined.
 _DETERMINED_DRIFT = 0.025
 _NEAR_S = 0.1
+_ANOTHER_START_S = 0.2
 _MOST_JUMPS = 3
 _JUMP_OFFSETS = np.arange(-40, 41)
 _JUMP_SPACING_S = 0.005
@@ -107,9 +110,22 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     odometry = _smoothed(odometry)
+    search = OffsetSearch(odometry, bounds.largest_offset_s)
+    parts = [
+        groundtruth.only(part)
+        for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
+    ]
+    # Of all segments together, and of those before or after the clock was set.
+    common_s = search.offset_s(parts, 0.0)
+    near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))
     found: list[ClockSegment] = []
-    for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s):
-        found += _segment(odometry, groundtruth.only(part), bounds, _MOST_JUMPS)
+    for part in parts:
+        around_s = search.offset_s([part], common_s)
+        own = PlanarPoses(odometry.times_s - around_s, odometry.poses)
+        start_s = search.nearest_s(part, around_s) - around_s
+        for clock in _segment(own, part, near, start_s, _MOST_JUMPS):
+            clock = replace(clock, offset_s=clock.offset_s + around_s)
+            found.append(_if_matching(clock, part, search, bounds))
     if all(segment.note == _NO_ODOMETRY for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
@@ -119,10 +135,28 @@ def synchronise(
     return tuple(_interpolated(on_one_line(found)))
 
 
+def _if_matching(
+    clock: ClockSegment, segment: PlanarPoses, search: OffsetSearch, bounds: SyncSettings
+) -> ClockSegment:
+    """A segment's clock, undetermined if the streams' movements do not agree by it."""
+    here = segment.only(segment.during(clock.from_s, clock.to_s))
+    if clock.status == "no turns" or search.matches(here, clock.offset_s):
+        return clock
+    note = f"no offset within {bounds.largest_offset_s:g} s makes odometry's movements agree"
+    return _undetermined(here, clock.turned_rad, note)
+
+
 def _segment(
-    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, jumps_left: int
+    odometry: PlanarPoses,
+    segment: PlanarPoses,
+    bounds: SyncSettings,
+    start_s: float,
+    jumps_left: int,
 ) -> list[ClockSegment]:
-    """One segment's clock; several parts if the clock was set within it."""
+    """One segment's clock; several parts if the clock was set within it.
+
+    `start_s`: an offset from which the refinement by whole poses also starts.
+    """
     headings = np.unwrap(segment.poses[:, 2])
     # Means of ten, with less noise.
     means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
@@ -146,7 +180,14 @@ def _segment(
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
     if measured.covariances is not None and driven >= _LEAST_WAY_M:
-        moving = _most_likely_clock(own, jittered, pair.reference_s, best.clock, bounds)
+        # Headings of a robot that hardly turns are a poor start.
+        starts = [best.clock]
+        if abs(start_s - best.clock[0]) > _ANOTHER_START_S:
+            starts.append(np.array([start_s, 0.0]))
+        fits = [_most_likely_clock(own, jittered, pair.reference_s, at, bounds) for at in starts]
+        moving = min(
+            (fit for fit in fits if fit is not None), key=lambda fit: fit.deviance, default=None
+        )
         if moving is not None and moving.uncertainty(measured) < best.uncertainty(measured):
             best = moving
     # If the clock was set in between, the parts have clocks of their own.
@@ -154,7 +195,8 @@ def _segment(
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
-            parts += _segment(odometry, segment.only(which), bounds, jumps_left - 1)
+            part = segment.only(which)
+            parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [
                 replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
@@ -228,16 +270,6 @@ class HeadingPair:
         return np.asarray(self.sign * (self.headings - np.interp(times, self.other_s, self.other)))
 
 
-def roughness(values: FloatArray) -> float:
-    """Standard deviation of the noise of values (N,), in their unit.
-
-    Third differences cancel smooth changes; their median is robust against single jumps.
-    """
-    third = np.diff(values, 3)
-    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
-
-
 def _mean_angle(differences: FloatArray) -> float:
     return float(np.angle(np.mean(np.exp(1j * differences))))
 
@@ -261,6 +293,11 @@ class ClockFit(NamedTuple):
     sigmas: FloatArray  # (2,)
     problem_at: Callable[[FloatArray], MovementProblem]  # By the clock
     noise: FloatArray  # (4,): odometry's random errors
+
+    @property
+    def deviance(self) -> float:
+        """Minus twice the log-likelihood."""
+        return self.problem_at(self.clock).innovations(self.noise).deviance
 
     def squared(self, clock: FloatArray) -> FloatArray:
         """(M,) squared normalised errors of the measured poses with another clock, gated."""

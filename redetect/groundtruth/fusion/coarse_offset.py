@@ -1,0 +1,186 @@
+"""The clocks' offset to a tenth of a second, from turns and ways over a second at many offsets.
+
+The refinement of the clock needs a start within a second. Offsets of many seconds, and robots that
+hardly turn, are found here: the movements of both streams, over windows of a second, are compared
+at all offsets of a grid. An offset far from the expected one is only taken if it explains the
+movements much better than those near it, and than any other place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from redetect.array_types import BoolArray, FloatArray
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+
+#: Offsets this near the expected one are left to the refinement of the clock.
+NEAR_S = 1.0
+_WINDOW_S, _STEP_S = 1.0, 0.1
+_MOST_SAMPLES = 3000
+_FEWEST_SAMPLES = 20
+# Movements are not interpolated over longer gaps, or this many of a stream's usual intervals.
+_LONGEST_GAP_S, _INTERVALS = 1.0, 3.0
+# Errors of odometry's turns and ways, as a share of what is usual in the ground truth.
+_SHARE = 0.1
+_LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
+# Least share of the largest possible number of movements that an offset must compare.
+_COVERED = 0.5
+# Largest ratio of the squared errors at an offset that is taken to those near the expected one, of
+# other movements, and, beyond the width of its own minimum, elsewhere.
+_MUCH_BETTER, _ALONE, _OWN_WIDTH_S = 0.25, 0.5, 3.0
+# Movements do not match if their squared errors are larger than this share of those of unrelated
+# ones, in segments with much movement.
+_UNRELATED, _MUCH_MOVEMENT = 0.5, 10.0
+
+
+def roughness(values: FloatArray) -> float:
+    """Standard deviation of the noise of values (N,), in their unit.
+
+    Third differences cancel smooth changes; their median is robust against single jumps.
+    """
+    third = np.diff(values, 3)
+    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0)) if len(third) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Movements:
+    """Turns (rad) and ways (m) over windows of a second, on a grid of times."""
+
+    first: int  # Step of the grid, since time 0, of the first one
+    values: FloatArray  # (N, 2)
+    known: BoolArray  # (N,)
+    noise: FloatArray  # (2,) variances of their noise
+
+    @classmethod
+    def of(cls, poses: PlanarPoses, first: int, last: int) -> Movements:
+        """The movements of a stream at the grid's steps from `first` to `last`."""
+        middle = _STEP_S * np.arange(first, last + 1)
+        interval = float(np.median(np.diff(poses.times_s)))
+        longest = max(_LONGEST_GAP_S, _INTERVALS * interval)
+        x, y, heading = poses.poses.T
+        ends, known = [], np.ones(len(middle), dtype=np.bool_)
+        for times in (middle - 0.5 * _WINDOW_S, middle + 0.5 * _WINDOW_S):
+            at = np.clip(np.searchsorted(poses.times_s, times), 1, len(poses) - 1)
+            known &= poses.times_s[at] - poses.times_s[at - 1] <= longest
+            known &= (times >= poses.times_s[0]) & (times <= poses.times_s[-1])
+            ends.append(
+                [np.interp(times, poses.times_s, v) for v in (x, y, np.unwrap(heading))]
+            )
+        dx, dy, turn = np.array(ends[1]) - np.array(ends[0])
+        jitter = [roughness(v) for v in (x, y, np.unwrap(heading))]
+        noise = 2.0 * np.array([jitter[2] ** 2, 0.5 * (jitter[0] ** 2 + jitter[1] ** 2)])
+        return cls(first, np.column_stack([turn, np.hypot(dx, dy)]), known, noise)
+
+
+def _steps(poses: PlanarPoses) -> tuple[int, int]:
+    return int(np.floor(poses.times_s[0] / _STEP_S)), int(np.ceil(poses.times_s[-1] / _STEP_S))
+
+
+class OffsetSearch:
+    """The search of offsets of one odometry.
+
+    Parameters
+    ----------
+    odometry : PlanarPoses
+        The robot's own poses on its own clock, with distinct times.
+    largest_s : float
+        Bound of the offset, either way.
+    """
+
+    def __init__(self, odometry: PlanarPoses, largest_s: float) -> None:
+        self._own = Movements.of(odometry, *_steps(odometry))
+        self._largest = int(np.ceil(largest_s / _STEP_S))
+
+    def offset_s(self, parts: Sequence[PlanarPoses], around_s: float) -> float:
+        """Robot time minus ground truth time for parts of the ground truth.
+
+        `around_s`, the expected offset, unless another one explains their movements much better.
+        """
+        compared = self._compared(parts)
+        if compared is None:
+            return around_s
+        steps = np.arange(-self._largest, self._largest + 1)
+        errors = compared.errors(steps)
+        near = np.abs(_STEP_S * steps - around_s) <= NEAR_S
+        best = int(np.argmin(errors))
+        beside = np.abs(steps - steps[best]) > _OWN_WIDTH_S / _STEP_S
+        least = errors[best]
+        if (
+            near[best]
+            or not least < _MUCH_BETTER * compared.unrelated
+            or not least < _MUCH_BETTER * np.min(errors[near], initial=np.inf)
+            or not least < _ALONE * np.min(errors[beside], initial=np.inf)
+        ):
+            return around_s
+        return float(_STEP_S * steps[best])
+
+    def nearest_s(self, part: PlanarPoses, around_s: float) -> float:
+        """The best offset near the expected one."""
+        compared = self._compared([part])
+        if compared is None:
+            return around_s
+        near = int(NEAR_S / _STEP_S)
+        steps = round(around_s / _STEP_S) + np.arange(-near, near + 1)
+        return float(_STEP_S * steps[int(np.argmin(compared.errors(steps)))])
+
+    def matches(self, part: PlanarPoses, offset_s: float) -> bool:
+        """Whether the movements of a part agree at an offset, unless there is hardly any."""
+        compared = self._compared([part])
+        if compared is None or compared.unrelated < _MUCH_MOVEMENT:
+            return True
+        errors = compared.errors(np.round(np.array([offset_s]) / _STEP_S).astype(np.int64))
+        return bool(not np.isfinite(errors[0]) or errors[0] < _UNRELATED * compared.unrelated)
+
+    def _compared(self, parts: Sequence[PlanarPoses]) -> _Compared | None:
+        moved = [Movements.of(part, *_steps(part)) for part in parts if len(part) > 1]
+        at = [one.first - self._own.first + np.flatnonzero(one.known) for one in moved]
+        if sum(map(len, at)) < _FEWEST_SAMPLES or not np.any(self._own.known):
+            return None
+        values = np.concatenate([one.values[one.known] for one in moved])
+        noise = np.mean([one.noise for one in moved], axis=0) + self._own.noise
+        floor = np.array([_LEAST_TURN_RAD, _LEAST_WAY_M])
+        usual = np.sqrt(np.array([np.mean(values[:, 0] ** 2), np.var(values[:, 1])]))
+        weights = 1.0 / (noise + (_SHARE * usual) ** 2 + floor**2)
+        # Odometry without ways, as from a gyroscope, has nothing to compare.
+        if np.max(self._own.values[self._own.known, 1]) < _LEAST_WAY_M:
+            weights[1] = 0.0
+        stride = 1 + len(values) // _MOST_SAMPLES
+        return _Compared(self._own, np.concatenate(at)[::stride], values[::stride], weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """Movements of the ground truth, and those of odometry with which they are compared."""
+
+    own: Movements
+    at: FloatArray  # (M,) steps of odometry's grid with the same times
+    values: FloatArray  # (M, 2)
+    weights: FloatArray  # (2,) inverse variances of the differences
+
+    @property
+    def unrelated(self) -> float:
+        """Mean squared normalised error that is expected of unrelated movements."""
+        own = self.own.values[self.own.known]
+        apart = np.var(self.values, axis=0) + np.var(own, axis=0)
+        return float((apart + (self.values.mean(axis=0) - own.mean(axis=0)) ** 2) @ self.weights)
+
+    def errors(self, steps: FloatArray) -> FloatArray:
+        """(K,) mean squared normalised errors at offsets of so many steps (K,); infinite where
+        too few movements are compared.
+        """
+        count = len(self.own.known)
+        errors, compared = np.full(len(steps), np.inf), np.zeros(len(steps))
+        for k, step in enumerate(steps):
+            at = self.at + step
+            inside = (at >= 0) & (at < count)
+            inside[inside] = self.own.known[at[inside]]
+            compared[k] = np.count_nonzero(inside)
+            if compared[k] >= _FEWEST_SAMPLES:
+                apart = self.values[inside] - self.own.values[at[inside]]
+                errors[k] = np.mean(np.square(apart), axis=0) @ self.weights
+        errors[compared < _COVERED * compared.max(initial=0.0)] = np.inf
+        return errors
