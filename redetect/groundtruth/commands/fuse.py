@@ -21,6 +21,9 @@ from redetect.groundtruth.trajectories.streams import (
     write_planar_poses,
 )
 
+#: Share of a stream's poses above which rejections are warned of.
+_MANY_REJECTED = 0.1
+
 
 def perform(options: Fuse) -> int:
     """Carry out ``groundtruth fuse``; returns the exit code."""
@@ -53,6 +56,8 @@ def perform(options: Fuse) -> int:
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "left_out": [asdict(segment) for segment in left_out],
         "covariances_repaired": fusion.repaired,
+        "deviations_raised": fusion.raised,
+        "slips_s": fusion.slips_s,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
         "rejected": [asdict(rejected) for rejected in fusion.rejected],
@@ -76,6 +81,7 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
         f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
         f"median sigma {sigma:.1f} mm"
     )
+    _print_contradictions(options, fusion)
     if fusion.localisation is not None:
         print(
             f"{options.odometry} is treated as a localisation: its errors are stationary, of "
@@ -96,5 +102,32 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
             f"warning: {options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
             f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: the robot's path there is "
             "unknown, and covariances are increased",
+            file=sys.stderr,
+        )
+
+
+def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
+    """Say where odometry, measured poses and their covariances contradict each other."""
+    for name, factor in fusion.raised.items():
+        if factor > 1.0:
+            print(
+                f"warning: the poses of {name} jitter {factor:.1f} times as much as their "
+                "covariances allow: their deviations were raised by this factor",
+                file=sys.stderr,
+            )
+    for name, count in fusion.used.items():
+        rejected = sum(one.stream == name for one in fusion.rejected)
+        if rejected > _MANY_REJECTED * (count + rejected):
+            print(
+                f"warning: {rejected} of {count + rejected} poses of {name} contradict the others "
+                f"and {options.odometry}: the clock, or the poses, may be wrong",
+                file=sys.stderr,
+            )
+    if fusion.slips_s:
+        begin, end = max(fusion.slips_s, key=lambda slip: slip[1] - slip[0])
+        print(
+            f"warning: {options.odometry}: contradicts the measured poses {len(fusion.slips_s)} "
+            f"times, as after a slip of the wheels, the longest from {begin:.3f} s to {end:.3f} s "
+            "on the ground truth's clock",
             file=sys.stderr,
         )

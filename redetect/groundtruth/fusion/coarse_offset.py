@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.groundtruth.fusion.jitter import roughness
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 #: Offsets this near the expected one are left to the refinement of the clock.
@@ -34,16 +35,6 @@ _MUCH_BETTER, _ALONE, _OWN_WIDTH_S = 0.25, 0.5, 3.0
 # Movements do not match if their squared errors are larger than this share of those of unrelated
 # ones, in segments with much movement.
 _UNRELATED, _MUCH_MOVEMENT = 0.5, 10.0
-
-
-def roughness(values: FloatArray) -> float:
-    """Standard deviation of the noise of values (N,), in their unit.
-
-    Third differences cancel smooth changes; their median is robust against single jumps.
-    """
-    third = np.diff(values, 3)
-    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
-    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0)) if len(third) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +58,7 @@ class Movements:
             at = np.clip(np.searchsorted(poses.times_s, times), 1, len(poses) - 1)
             known &= poses.times_s[at] - poses.times_s[at - 1] <= longest
             known &= (times >= poses.times_s[0]) & (times <= poses.times_s[-1])
-            ends.append(
-                [np.interp(times, poses.times_s, v) for v in (x, y, np.unwrap(heading))]
-            )
+            ends.append([np.interp(times, poses.times_s, v) for v in (x, y, np.unwrap(heading))])
         dx, dy, turn = np.array(ends[1]) - np.array(ends[0])
         jitter = [roughness(v) for v in (x, y, np.unwrap(heading))]
         noise = 2.0 * np.array([jitter[2] ** 2, 0.5 * (jitter[0] ** 2 + jitter[1] ** 2)])
@@ -157,7 +146,7 @@ class _Compared:
     """Movements of the ground truth, and those of odometry with which they are compared."""
 
     own: Movements
-    at: FloatArray  # (M,) steps of odometry's grid with the same times
+    at: IntArray  # (M,) steps of odometry's grid with the same times
     values: FloatArray  # (M, 2)
     weights: FloatArray  # (2,) inverse variances of the differences
 
@@ -168,7 +157,7 @@ class _Compared:
         apart = np.var(self.values, axis=0) + np.var(own, axis=0)
         return float((apart + (self.values.mean(axis=0) - own.mean(axis=0)) ** 2) @ self.weights)
 
-    def errors(self, steps: FloatArray) -> FloatArray:
+    def errors(self, steps: IntArray) -> FloatArray:
         """(K,) mean squared normalised errors at offsets of so many steps (K,); infinite where
         too few movements are compared.
         """

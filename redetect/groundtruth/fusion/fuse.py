@@ -20,9 +20,11 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas
+from redetect.groundtruth.fusion.jitter import with_jitter_covered
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.fusion.slips import slipped_intervals
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -190,6 +192,12 @@ class Fusion:
     # Number of covariances that were not positive definite as written, by stream; they were
     # increased by their file's rounding.
     repaired: dict[str, int]
+    # Factor by which deviations were raised, by stream, since the poses jitter more from one to the
+    # next than their covariances allow; 1 if they do not.
+    raised: dict[str, float]
+    # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
+    # wheels or a reset: the covariances do not rely on it there.
+    slips_s: tuple[tuple[float, float], ...]
     # Pauses of odometry within the poses' time. Motion that it may have missed there, at the
     # robot's usual rates, increases the covariances.
     pauses_s: tuple[tuple[float, float], ...]
@@ -217,6 +225,7 @@ def fuse(
         repaired.
     """
     chosen = settings or FuseSettings()
+    streams, raised = _with_jitter_covered(streams)
     problem = movement_problem(odometry, streams, chosen)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
@@ -228,7 +237,7 @@ def fuse(
     # Odometry's random errors, and its systematic errors as part of the state.
     noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)
     inflation = variance_inflation(problem, noise) if chosen.learn_noise else 1.0
-    smoothed, spread, innovations = problem.smooth(noise, inflation)
+    smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
     deviations = _systematic_deviations(spread)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
@@ -242,12 +251,12 @@ def fuse(
             distance_scale_sigma=way,
         )
         problem = replace(problem, settings=fewer)
-        smoothed, spread, innovations = problem.smooth(noise, inflation)
+        smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.
     at = np.searchsorted(problem.times_s, inside)
     path = _path(inside, smoothed[at], spread[at])
-    states, spreads = problem.filtered(noise)
+    states, spreads = problem.filtered(noise, slips)
     restarted = innovations.restarted > 0
     # The errors of a localisation are stationary.
     localisation = None
@@ -277,12 +286,26 @@ def fuse(
         ),
         localisation=localisation,
         repaired=problem.repaired,
+        raised=raised,
+        slips_s=slipped_intervals(problem.times_s, slips),
         pauses_s=tuple(
             (begin, end)
             for begin, end in pauses_of(last_of_each_time(odometry))
             if end > first and begin < last
         ),
     )
+
+
+def _with_jitter_covered(
+    streams: Mapping[str, PlanarPoses],
+) -> tuple[dict[str, PlanarPoses], dict[str, float]]:
+    """Streams with covariances raised to their jitter, and the factors of the deviations."""
+    covered, raised = {}, {}
+    for name, stream in streams.items():
+        covered[name], raised[name] = stream, 1.0
+        if stream.covariances is not None:
+            covered[name], raised[name] = with_jitter_covered(last_of_each_time(stream))
+    return covered, raised
 
 
 def _systematic_deviations(spread: FloatArray) -> FloatArray:

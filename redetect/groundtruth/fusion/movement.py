@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ from redetect.groundtruth.fusion.kernels import (
     filter_forward,
     smooth_backward,
 )
+from redetect.groundtruth.fusion.slips import slip_variances
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -85,6 +87,15 @@ def predicted_backward(
     )
     states, spreads = history.filtered * mirror, history.filtered_covariance
     return states[::-1], (spreads * mirror * mirror[:, None])[::-1]
+
+
+class Smoothed(NamedTuple):
+    """The smoothed path of a movement problem with N nodes."""
+
+    states: FloatArray  # (N, 6)
+    covariances: FloatArray  # (N, 6, 6)
+    innovations: Innovations
+    slips: FloatArray  # (N, 3): variances of movements that were added where odometry slipped
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,26 +175,28 @@ class MovementProblem:
         measured = MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
         return replace(self, measured=measured, streams=self.streams[kept])
 
-    def filtered(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone."""
+    def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone.
+
+        `slips` (N, 3): variances of movements that are added for slips.
+        """
         history = empty_history(len(self.times_s))
-        self._forward(self._variances(noise), history=history)
+        self._forward(self._variances(noise) + slips, history=history)
         return history.filtered, history.filtered_covariance
 
-    def smooth(
-        self, noise: FloatArray, looser_in_gaps: float = 1.0
-    ) -> tuple[FloatArray, FloatArray, Innovations]:
+    def smooth(self, noise: FloatArray, looser_in_gaps: float = 1.0) -> Smoothed:
         """Smoothed states, their covariances, and the use of the measurements.
 
         `noise` (4,): odometry's random errors, see `redetect.groundtruth.fusion.inputs.noise_of`.
-        `looser_in_gaps`: factor on their variances where nothing is measured. Returns `states`,
-        `covariances` (N, 6), (N, 6, 6).
+        `looser_in_gaps`: factor on their variances where nothing is measured.
         """
         variances = self._variances(noise)
         nodes = self.measured.nodes
         after = np.flatnonzero(np.diff(self.measured_s) > UNMEASURED_S)
         for begin, end in zip(nodes[after], nodes[after + 1]):
             variances[begin + 1 : end + 1] *= looser_in_gaps
+        slips = slip_variances(self, variances, UNMEASURED_S)
+        variances += slips
         history = empty_history(len(self.times_s))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
@@ -209,7 +222,7 @@ class MovementProblem:
                 break
         for begin, end in gaps:
             self._anchor(begin, end, variances, states, covariances, carried=bool(carried[end]))
-        return states, covariances, innovations
+        return Smoothed(states, covariances, innovations, slips)
 
     def _ends_that_did_not_fit(self, innovations: Innovations) -> list[int]:
         """Nodes after gaps at which the rejections began that made the filter restart."""
@@ -252,6 +265,10 @@ class MovementProblem:
             share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
             other = share[:, None, None] * apart[:, :, None] * apart[:, None]
             covariances[begin + 1 : end, :POSE, :POSE] += other
+
+    def filtered_forward(self, variances: FloatArray) -> Innovations:
+        """Innovations with variances (N, 3) of the movements to nodes."""
+        return self._forward(variances)
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""

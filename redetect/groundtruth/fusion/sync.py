@@ -31,8 +31,9 @@ from redetect.groundtruth.fusion.clock import (
     knots_of,
     on_one_line,
 )
-from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, roughness
+from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
+from redetect.groundtruth.fusion.jitter import roughness, with_jitter_covered
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -110,6 +111,8 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     odometry = _smoothed(odometry)
+    if groundtruth.covariances is not None:
+        groundtruth, _ = with_jitter_covered(groundtruth)
     search = OffsetSearch(odometry, bounds.largest_offset_s)
     parts = [
         groundtruth.only(part)

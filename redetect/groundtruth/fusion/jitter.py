@@ -1,0 +1,70 @@
+"""The jitter of a stream of poses from sample to sample, and covariances that are below it.
+
+Differences of a high order cancel the motion, and their median is robust against single jumps.
+Errors that change slowly are not seen, so jitter is a lower bound of a stream's errors.
+"""
+
+from __future__ import annotations
+
+from math import comb
+
+import numpy as np
+
+from redetect.array_types import FloatArray
+from redetect.groundtruth.trajectories.streams import PlanarPoses
+
+# Median of the absolute value of a standard normal number.
+_MEDIAN_OF_NORMAL = 0.6745
+# Order of the differences that are compared with covariances: fifth ones cancel the motion even at
+# four poses a second, the fewest.
+_ORDER = 5
+_LEAST_RATE_HZ = 4.0
+_FEWEST = 50
+# Differences over longer gaps, in usual intervals, do not count.
+_LONGEST_INTERVALS = 1.5
+# Covariances are raised if the jitter exceeds their deviations by more than this factor.
+_BELIEVED = 1.5
+
+
+def roughness(values: FloatArray) -> float:
+    """Standard deviation of the noise of values (N,), in their unit, from third differences."""
+    third = np.diff(values, 3)
+    if not len(third):
+        return 0.0
+    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
+    return float(np.median(np.abs(third)) / _MEDIAN_OF_NORMAL / np.sqrt(20.0))
+
+
+def jitter_ratio(poses: PlanarPoses) -> float:
+    """Jitter of poses with covariances, in their standard deviations: about 1 if they are right.
+
+    The largest of x, y and the heading; 0 if the poses are too few or too slow to tell.
+    """
+    assert poses.covariances is not None
+    count = len(poses) - _ORDER
+    if count < _FEWEST:
+        return 0.0
+    intervals = np.diff(poses.times_s)
+    usual = float(np.median(intervals))
+    over = poses.times_s[_ORDER:] - poses.times_s[:-_ORDER]
+    counted = over <= _LONGEST_INTERVALS * _ORDER * usual
+    if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
+        return 0.0
+    weights = np.array([comb(_ORDER, k) for k in range(_ORDER + 1)], dtype=np.float64)
+    values = np.column_stack([poses.poses[:, :2], np.unwrap(poses.poses[:, 2])])
+    variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
+    expected = sum(w**2 * variances[k : k + count] for k, w in enumerate(weights))
+    normalised = np.abs(np.diff(values, _ORDER, axis=0)) / np.sqrt(np.maximum(expected, 1e-18))
+    return float(np.max(np.median(normalised[counted], axis=0)) / _MEDIAN_OF_NORMAL)
+
+
+def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
+    """Poses with covariances raised to their jitter, and the factor of the deviations.
+
+    The factor is 1, and the poses are unchanged, if their covariances can be right.
+    """
+    factor = jitter_ratio(poses)
+    if factor <= _BELIEVED:
+        return poses, 1.0
+    assert poses.covariances is not None
+    return PlanarPoses(poses.times_s, poses.poses, factor**2 * poses.covariances), factor

@@ -1,0 +1,128 @@
+"""Slips of odometry while the robot is measured: wheels that spin, a push, poses that were reset.
+
+After a slip the measured poses contradict odometry for good, although they agree with each other.
+Without more, a filter rejects them until it gives up. So odometry's variances are increased where
+a long run of rejections begins, for as long as makes the measurements fit again. A run after which
+the measurements return to the path as predicted is one of gross errors of theirs, and is left out.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from redetect.array_types import FloatArray, IntArray
+from redetect.groundtruth.fusion.kernels import AFTER_REJECTIONS, Innovations
+
+if TYPE_CHECKING:
+    from redetect.groundtruth.fusion.movement import MovementProblem
+
+# Least number of consecutive rejections, and the same at the end of a segment, where it is not
+# known whether the measurements would have returned.
+_LEAST_RUN, _LEAST_LAST_RUN = 10, 20
+# A squared innovation beyond this share of the gate is no return to the predicted path.
+_NO_RETURN = 1.0 / 3.0
+# Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried.
+# A measurement that contradicts nothing any more costs about as much as a rejected one.
+_TRIED_LENGTHS, _TRIED_RATES = (1, 2, 4, 8, 16, 32), (1.0, 100.0)
+_COST_OF_LENGTH = {1.0: 20.0, 100.0: 50.0}
+# The run's squared errors must become smaller by this factor.
+_LEAST_GAIN = 0.8
+_ROUNDS = 12
+
+
+def slip_variances(
+    problem: MovementProblem, variances: FloatArray, longest_gap_s: float
+) -> FloatArray:
+    """(N, 3) by how much variances (N, 3) of movements to nodes are too small for slips.
+
+    Rejections that begin after a gap longer than `longest_gap_s` are no sign of slips.
+    """
+    slips = np.zeros_like(variances)
+    nodes, times_s, gate = problem.measured.nodes, problem.measured_s, problem.gate()
+    found = problem.filtered_forward(variances)
+    hopeless: set[int] = set()
+    for _ in range(_ROUNDS):
+        runs = [
+            (begin, end)
+            for begin, end in _runs(found, nodes)
+            if begin not in hopeless
+            and times_s[begin] - times_s[begin - 1] <= longest_gap_s
+            and _is_slip(found, times_s, begin, end, gate, longest_gap_s)
+        ]
+        if not runs:
+            break
+        clipped = np.minimum(found.squared, gate)
+        least = [_LEAST_GAIN * float(np.sum(clipped[begin:end])) for begin, end in runs]
+        chosen: list[FloatArray | None] = [None] * len(runs)
+        for length in _TRIED_LENGTHS:
+            for rate in _TRIED_RATES:
+                added = [
+                    _slip(
+                        problem,
+                        int(nodes[begin - 1]),
+                        int(nodes[min(begin + length, end) - 1]),
+                        rate,
+                    )
+                    for begin, end in runs
+                ]
+                tried = problem.filtered_forward(variances + slips + sum(added))
+                clipped = np.minimum(tried.squared, gate)
+                for i, (begin, end) in enumerate(runs):
+                    cost = float(np.sum(clipped[begin:end])) + length * _COST_OF_LENGTH[rate]
+                    if cost < least[i]:
+                        least[i], chosen[i] = cost, added[i]
+        hopeless.update(begin for (begin, _), one in zip(runs, chosen) if one is None)
+        if any(one is not None for one in chosen):
+            slips += sum(one for one in chosen if one is not None)
+            found = problem.filtered_forward(variances + slips)
+    return slips
+
+
+def slipped_intervals(times_s: FloatArray, slips: FloatArray) -> tuple[tuple[float, float], ...]:
+    """Begin and end (s) of the slips; `times_s` (N,) of the nodes, `slips` (N, 3)."""
+    slipped = np.concatenate([[False], slips[:, 0] > 0.0, [False]]).astype(np.int8)
+    edges = np.flatnonzero(np.diff(slipped))
+    return tuple(
+        (float(times_s[max(begin - 1, 0)]), float(times_s[end - 1]))
+        for begin, end in zip(edges[::2], edges[1::2])
+    )
+
+
+def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
+    """Begin and end of long runs of rejections, after an accepted measurement.
+
+    The measurement at which the filter restarted belongs to the run.
+    """
+    rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rejected, [False]]).astype(np.int8)))
+    return [
+        (int(begin), int(end))
+        for begin, end in zip(edges[::2], edges[1::2])
+        if begin > 0 and end - begin >= _LEAST_RUN
+    ]
+
+
+def _is_slip(
+    found: Innovations,
+    times_s: FloatArray,
+    begin: int,
+    end: int,
+    gate: float,
+    longest_gap_s: float,
+) -> bool:
+    """Whether the measurements after a run of rejections do not return to the predicted path."""
+    if end == len(times_s) or times_s[end] - times_s[end - 1] > longest_gap_s:
+        return end - begin >= _LEAST_LAST_RUN
+    restarted = bool(found.accepted[end - 1])
+    return restarted or bool(found.squared[end] > _NO_RETURN * gate)
+
+
+def _slip(problem: MovementProblem, first: int, last: int, rate: float) -> FloatArray:
+    """(N, 3) variances of a slip at a rate (m/s, rad/s) after node `first`, until `last`."""
+    added = np.zeros((len(problem.times_s), 3))
+    passed = np.diff(problem.times_s[first : last + 1])
+    usual = (problem.times_s[last] - problem.times_s[first]) / max(len(passed), 1)
+    added[first + 1 : last + 1] = (rate**2 * usual * passed)[:, None]
+    return added
