@@ -26,6 +26,7 @@ from redetect.groundtruth.lasers.tracking import (
     combined_poses,
     excess_shifts,
     track_without_suspects,
+    usual_sets_per_pose,
 )
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
@@ -38,7 +39,8 @@ _DISTURBED = 3
 
 def perform(options: Laser) -> int:
     """Execute the command; returns the exit code: 1 without a single pose."""
-    demand(options, GroundTruthError, average=whole(1))
+    if options.average is not None:
+        demand(options, GroundTruthError, average=whole(1))
     output = options.output or options.session / "laser.csv"
     per_set, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
     check_outputs([output, per_set, summary], options.force)
@@ -48,12 +50,13 @@ def perform(options: Laser) -> int:
     scanners, robot, fixed, sets = load_session(options.session, calibration)
     track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
-    poses = combined_poses(track, options.average)
+    average = options.average or usual_sets_per_pose(track)
+    poses = combined_poses(track, average)
     write_planar_poses(output, poses, overwrite=options.force)
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
-    content = {**provenance(options.settings, files), "sets_per_pose": options.average, **described}
+    content = {**provenance(options.settings, files), "sets_per_pose": average, **described}
     write_json(summary, content, overwrite=options.force)
 
     expected = int(np.sum(track.status != LOST))

@@ -128,7 +128,9 @@ class Laser:
     session: Positional[Path]  # Folder with robot.json, the scans, and the scans of the empty area.
     # Poses of the fixed scanners; by default aligned.json in the session, else scanners.json.
     scanners: MaybePath = None
-    average: int = 6  # Number of sets of scans per written pose; no set is used twice.
+    # Number of sets of scans per written pose, none of which is used twice; by default those of
+    # 0.08 s.
+    average: MaybeInt = None
     # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. A
     # report on every set of scans is written to a .jsonl, settings and version to a .json beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

@@ -46,6 +46,7 @@ _FRONT_SAMPLE = 60
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 #: Sets farther apart than this are not of one block (s).
 LARGEST_GAP_S = 0.05
+_AVERAGED_S = 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,6 +416,18 @@ def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArra
             allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
             excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
     return excess
+
+
+def usual_sets_per_pose(track: LaserTrack) -> int:
+    """Number of consecutive sets that are close enough to average, at least 1.
+
+    While the robot speeds up or begins to turn, the mean of poses over a time T is off by a T^2/24,
+    which is less than their noise over this time only.
+    """
+    intervals = np.diff(track.times_s)
+    if not len(intervals):
+        return 1
+    return max(1, round(_AVERAGED_S / max(float(np.median(intervals)), 1e-9)))
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
