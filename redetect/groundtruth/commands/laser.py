@@ -14,7 +14,7 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.lasers.acquisition import load_session
-from redetect.groundtruth.lasers.scanners import Scanner
+from redetect.groundtruth.lasers.scanners import Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -35,6 +35,8 @@ from redetect.storage.bounds import demand, whole
 
 #: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
 _DISTURBED = 3
+#: Share of beams through the robot above which a warning is printed: edges cause some per cent.
+_MOST_SEEN_THROUGH = 0.08
 
 
 def perform(options: Laser) -> int:
@@ -47,7 +49,15 @@ def perform(options: Laser) -> int:
     calibration = options.scanners or options.session / "aligned.json"
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
+        print(
+            f"warning: no {options.session / 'aligned.json'}: the scanners' poses are those of "
+            f"{calibration}; their errors are common to all poses, and do not average out in a "
+            "fusion",
+            file=sys.stderr,
+        )
     scanners, robot, fixed, sets = load_session(options.session, calibration)
+    for line in noise_warnings(read_scanners(calibration), scanners, calibration):
+        print(line, file=sys.stderr)
     track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
     average = options.average or usual_sets_per_pose(track)
@@ -66,6 +76,13 @@ def perform(options: Laser) -> int:
         f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
         f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
     )
+    share = seen_through(track)
+    if share > _MOST_SEEN_THROUGH:
+        print(
+            f"warning: {100.0 * share:.0f} % of the beams that should meet the robot see what is "
+            "behind it: the outline in robot.json is too large, or the pose of a scanner is wrong",
+            file=sys.stderr,
+        )
     for segment in described["segments"]:
         print(f"  {segment['from_s']:.2f} to {segment['to_s']:.2f} s: front: {segment['front']}")
     for scanner in described["scanners"]:
@@ -79,6 +96,13 @@ def perform(options: Laser) -> int:
                 file=sys.stderr,
             )
     return 0 if len(poses) else 1
+
+
+def seen_through(track: LaserTrack) -> float:
+    """Share of the beams that should meet the robot, but see the background behind it."""
+    totals = np.sum(track.beams[np.isin(track.status, (OK, REACQUIRED))], axis=0)
+    counts = BeamCounts(*np.asarray(totals, dtype=np.int64).reshape(-1).tolist())
+    return counts.through / max(counts.expected, 1)
 
 
 def set_lines(track: LaserTrack) -> list[str]:

@@ -15,8 +15,10 @@ from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import (
     Scanner,
     find_scans,
+    noise_warnings,
     read_scanners,
     read_scans,
+    with_measured_noise,
     write_scanners,
 )
 from redetect.groundtruth.report.pictures import draw_alignment
@@ -36,10 +38,13 @@ def perform(options: Lasers) -> int:
     picture = output.with_suffix(".png")
     check_outputs([output, picture], options.force)
     by_hand = session / "scanners.json"
-    measured = read_scanners(by_hand)
+    stated = read_scanners(by_hand)
     map_file = find_building(session)
     building = read_building(map_file)
-    empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in measured]
+    empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in stated]
+    measured = with_measured_noise(stated, empties)
+    for line in noise_warnings(stated, measured, by_hand):
+        print(line, file=sys.stderr)
     alignment = align_scanners(measured, empties, building, options.settings)
 
     far_off = [

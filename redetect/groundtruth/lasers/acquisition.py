@@ -28,6 +28,7 @@ from redetect.groundtruth.lasers.scanners import (
     read_robot,
     read_scanners,
     read_scans,
+    with_measured_noise,
 )
 from redetect.groundtruth.lasers.tracking_kernels import (
     Body,
@@ -172,6 +173,8 @@ def load_session(
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
     """Read fixed scanners, robot and scans, and learn the background.
 
+    Scanners whose readings of the empty area scatter far more than stated get that noise.
+
     Raises `GroundTruthError` if a file is missing or does not fit the others.
     """
     scanners = read_scanners(calibration)
@@ -180,6 +183,7 @@ def load_session(
         [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
         for place in (folder / "empty", folder)
     )
+    scanners = with_measured_noise(scanners, empties)
     return scanners, robot, fixed_scanners(scanners, empties), sets_of_scans(scans)
 
 

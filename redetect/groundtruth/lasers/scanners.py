@@ -18,7 +18,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, cast
 
@@ -45,6 +45,11 @@ _MILLIMETRE = 1e-3
 _LARGEST_FILE_BYTES = 1 << 30
 # Far above what 16 bits hold; longer ranges are read as this, and are no readings then.
 _FARTHEST_M = 1e3
+# Noise is measured on beams with this number of readings at least. Stated noise is believed unless
+# readings scatter by this factor more than it, or than what rounding to millimetres explains.
+_FEWEST_FOR_NOISE = 20
+_BELIEVED_NOISE = 1.5
+_LEAST_NOISE_M = 1e-3
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
@@ -108,6 +113,46 @@ class Robot:
     largest_speed_m_s: float  # Upper bound of its speed
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
+
+
+def measured_noise_m(ranges_mm: NDArray[np.uint16], max_range_m: float) -> float:
+    """Standard deviation of readings (m) from scans (N, readings) of an empty area, rounding
+    included.
+
+    That of a usual beam, which neither jumps along an edge nor is crossed; 0 if there are too few.
+    """
+    metres = ranges_mm * _MILLIMETRE
+    hit = (ranges_mm > 0) & (metres < max_range_m)
+    beams = hit.sum(axis=0) >= max(_FEWEST_FOR_NOISE, 0.5 * len(ranges_mm))
+    if not np.any(beams):
+        return 0.0
+    masked = np.where(hit[:, beams], metres[:, beams], np.nan)
+    return float(np.median(np.nanstd(masked, axis=0)))
+
+
+def with_measured_noise(
+    scanners: Sequence[Scanner], empties: Sequence[Scans]
+) -> tuple[Scanner, ...]:
+    """The scanners; those whose readings of the empty area scatter far more than stated get that
+    noise.
+    """
+    found = []
+    for scanner, empty in zip(scanners, empties):
+        measured = measured_noise_m(empty.ranges_mm, scanner.max_range_m)
+        if measured > _BELIEVED_NOISE * max(scanner.sigma_m, _LEAST_NOISE_M):
+            scanner = replace(scanner, sigma_m=measured)
+        found.append(scanner)
+    return tuple(found)
+
+
+def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Path) -> list[str]:
+    """What to say about scanners that are used with another noise than stated in a file."""
+    return [
+        f"warning: scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
+        f"mm, not by {1e3 * a.sigma_m:.1f} mm as in {path}: the larger value is used"
+        for a, b in zip(stated, used)
+        if b.sigma_m > a.sigma_m
+    ]
 
 
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
