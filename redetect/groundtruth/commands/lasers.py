@@ -10,7 +10,7 @@ import numpy as np
 
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
-from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step, still_scan
+from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import (
     Scanner,
@@ -21,6 +21,7 @@ from redetect.groundtruth.lasers.scanners import (
     with_measured_noise,
     write_scanners,
 )
+from redetect.groundtruth.lasers.walls import still_scan
 from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.storage import write_bytes
@@ -64,6 +65,11 @@ def perform(options: Lasers) -> int:
         "far_off_measured": far_off,
         "undetermined": list(alignment.undetermined),
         "inconsistent": list(alignment.inconsistent),
+        "map_sigma_m": alignment.map_sigma_m,
+        "covariance": {
+            "scanners": [s.name for s in alignment.scanners],
+            "matrix": alignment.covariance.tolist(),
+        },
     }
     del extra["version"]  # that of the file's form is there
     write_scanners(output, alignment.scanners, extra, overwrite=options.force)
@@ -92,6 +98,12 @@ def _print_differences(
             f"{np.degrees(shift[2]):.3f} deg; sigma {1e3 * sigma[0]:.2f}, "
             f"{1e3 * sigma[1]:.2f} mm, {np.degrees(sigma[2]):.4f} deg; {alignment.matched[k]} "
             f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
+        )
+    if alignment.map_sigma_m > 0.0:
+        print(
+            f"warning: the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm: the "
+            "scanners were aligned with it as one body, and their errors are common to all",
+            file=sys.stderr,
         )
     for name in far_off:
         print(

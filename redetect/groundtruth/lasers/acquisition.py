@@ -25,6 +25,7 @@ from redetect.groundtruth.lasers.scanners import (
     Scanner,
     Scans,
     find_scans,
+    read_joint_covariance,
     read_robot,
     read_scanners,
     read_scans,
@@ -110,8 +111,17 @@ class ScanSets:
         return ScanSet(self.ranges_mm, self.rows[index], self.ages_s[index])
 
 
-def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> FixedScanners:
-    """Arrange scanners, and the background from their scans of the empty area, for the kernels."""
+def fixed_scanners(
+    scanners: Sequence[Scanner],
+    empties: Sequence[Scans],
+    covariance: FloatArray | None = None,
+) -> FixedScanners:
+    """Arrange scanners, and the background from their scans of the empty area, for the kernels.
+
+    `covariance` (3 scanners, 3 scanners): of their poses, jointly; by default they are independent.
+    """
+    if covariance is None:
+        covariance = block_diag(*(scanner.covariance for scanner in scanners))
     if not scanners:
         raise GroundTruthError("no scanners: expected some")
     backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
@@ -129,7 +139,7 @@ def fixed_scanners(scanners: Sequence[Scanner], empties: Sequence[Scans]) -> Fix
         np.stack([scanner.pose[:2] for scanner in scanners]),
         # Rounding adds an error that is uniform over a quantum.
         np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
-        block_diag(*(scanner.covariance for scanner in scanners)),
+        covariance,
     )
 
 
@@ -184,7 +194,8 @@ def load_session(
         for place in (folder / "empty", folder)
     )
     scanners = with_measured_noise(scanners, empties)
-    return scanners, robot, fixed_scanners(scanners, empties), sets_of_scans(scans)
+    fixed = fixed_scanners(scanners, empties, read_joint_covariance(calibration, scanners))
+    return scanners, robot, fixed, sets_of_scans(scans)
 
 
 def outline_faces(outline: ArrayLike) -> FloatArray:

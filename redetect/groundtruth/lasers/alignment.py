@@ -7,14 +7,12 @@ scans, in rounds until none moves; finally all as one body, then each scanner, w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
@@ -25,10 +23,11 @@ from redetect.groundtruth.lasers.icp import (
     fit_outline,
     scan_normals,
 )
+from redetect.groundtruth.lasers.map_errors import body_on_inexact_map
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.tracking_kernels import NewReadings, OutlineFit, refine_outline
+from redetect.groundtruth.lasers.walls import FLOOR_M, WallFit, fit_to_walls, still_scan
 from redetect.groundtruth.settings import AlignmentSettings
-from redetect.plane import apply, between, compose, fitted, invert, rotation
+from redetect.plane import apply, between, compose, fitted, invert
 
 #: The steps in the published order; results are named after them.
 STEPS = ("pairs", "merged", "realigned", "together", "map as a whole", "each to the map")
@@ -40,9 +39,7 @@ _JUDGED_M = 0.05
 _ROUNDS = 50
 #: Standard deviations of readings, wall and map together, as the fit to the map narrows (m).
 _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
-_FLOOR_M = 0.001
 _WEAK_M = 0.02
-_LONE_STEPS = 30
 _MOST_STEPS = 500
 # Start headings of the pairs, relative to the measured ones.
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
@@ -61,124 +58,12 @@ class Alignment:
     pairs: dict[tuple[int, int], float]
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
+    # (3 scanners, 3 scanners): covariance of their poses, jointly
+    covariance: FloatArray
+    # Standard deviation of the walls' offsets from the map (m); 0 if it is exact to a millimetre.
+    map_sigma_m: float
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
-
-
-class StillScan(NamedTuple):
-    """Readings of a scanner while nothing moves, averaged beam by beam."""
-
-    range_m: FloatArray  # (n,)
-    direction: FloatArray  # (n, 2): of the beams, in the scanner's frame
-    sigma_m: float  # Standard deviation of an averaged reading
-
-    @property
-    def points(self) -> FloatArray:
-        """(n, 2) points in the scanner's frame, in the order of the beams (m)."""
-        return self.range_m[:, None] * self.direction
-
-
-def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
-    """Average scans (N, readings) in which nothing moves.
-
-    Excluded are beams without a reading in half of the scans and those along an edge, which jump
-    between near and far; also a beam's readings far from its median, of passing objects.
-    """
-    metres = ranges_mm * 1e-3
-    hit = scanner.has_return(ranges_mm)
-    masked = np.where(hit, metres, np.nan)
-    usable = hit.sum(axis=0) >= max(1.0, 0.5 * len(ranges_mm))
-    median = np.full(scanner.readings, np.nan)
-    median[usable] = np.nanmedian(masked[:, usable], axis=0)
-    close = np.abs(masked - median) < 4.0 * max(scanner.sigma_m, 0.005)
-    count = close.sum(axis=0)
-    usable &= count >= 0.8 * hit.sum(axis=0)
-    mean = np.where(close, metres, 0.0).sum(axis=0)[usable] / count[usable]
-    angle = scanner.angles_rad[usable]
-    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    readings = float(np.median(count[usable])) if usable.any() else 1.0
-    return StillScan(mean, direction, max(scanner.sigma_m, 0.003) / math.sqrt(readings))
-
-
-class WallFit(NamedTuple):
-    """Pose of rigidly connected scanners, from the walls that they see."""
-
-    pose: FloatArray  # (3,): of their common frame on the map
-    covariance: FloatArray  # (3, 3): from the residuals' size and the geometry
-    by_mounts: FloatArray  # (3, 3 scanners): derivative of the pose by theirs in the common frame
-    used: int  # Number of readings used
-    rms_m: float  # Of their distances from the walls
-    open_directions: int  # Number of directions that the walls do not determine
-
-
-def fit_to_walls(
-    scans: Sequence[StillScan],
-    mounts: FloatArray,
-    walls: FloatArray,
-    start: FloatArray,
-    gate_m: float,
-    narrowing_m: Sequence[float],
-    weak_sigma_m: float,
-) -> WallFit:
-    """Most likely pose of scanners on the map, near a start.
-
-    A reading belongs to the wall that its beam meets first. Readings of objects in front of a wall
-    are far from the wall that the beam would hit, and are excluded as the fit narrows.
-
-    Parameters
-    ----------
-    scans : sequence of StillScan
-        One of each scanner.
-    mounts : (scanners, 3) float64
-        Poses of the scanners in their common frame.
-    walls : (S, 4) float64
-        Pieces of wall on the map, seen from both sides (m).
-    start : (3,) float64
-        Of the common frame on the map.
-    gate_m : float
-        Largest distance of a reading from its wall at first.
-    narrowing_m : sequence of float
-        Joint standard deviations of readings, wall and map as the fit narrows; readings farther
-        away than three of them are rejected. In the last step the residuals determine it.
-    weak_sigma_m : float
-        Directions along which the standard deviation would be larger are undetermined, and are
-        held at the start.
-
-    Raises
-    ------
-    GeometryError
-        If fewer than ten readings match walls.
-    """
-    # The kernel moves faces onto points: here the map into the scanners' frame.
-    faces = np.vstack([walls, walls[:, [2, 3, 0, 1]]])
-    seen = NewReadings(
-        np.concatenate([apply(mount, scan.points) for mount, scan in zip(mounts, scans)]),
-        np.repeat(np.arange(len(scans)), [len(scan.range_m) for scan in scans]),
-        np.concatenate([s.direction @ rotation(m[2]).T for m, s in zip(mounts, scans)]),
-        np.concatenate([scan.range_m for scan in scans]),
-    )
-    origins, sigmas = mounts[:, :2].copy(), np.array([scan.sigma_m for scan in scans])
-    pose, ratio = invert(start), 1.0
-    for floor in (*narrowing_m, None):
-        floor = max(_FLOOR_M, narrowing_m[-1] * math.sqrt(ratio)) if floor is None else floor
-        fit = OutlineFit(floor, 0.25, 3.0, gate_m, 0.5, weak_sigma_m, 1.0, _LONE_STEPS)
-        found = refine_outline(seen, faces, pose, origins, sigmas, fit)
-        if found.used < 10:
-            raise GeometryError(f"{found.used} readings lie on the map: expected 10 or more")
-        pose, ratio = found.pose, found.chi2 / (found.used - 3.0)
-    world = invert(pose)
-    # The inverse's derivatives: x' = -R' t and theta' = -theta.
-    c, s = math.cos(world[2]), math.sin(world[2])
-    jacobian = np.array([[-c, s, world[1]], [-s, -c, -world[0]], [0.0, 0.0, -1.0]])
-    covariance = max(ratio, 0.1) * jacobian @ found.covariance @ jacobian.T
-    return WallFit(
-        world,
-        0.5 * (covariance + covariance.T),
-        jacobian @ found.by_scanner,
-        found.used,
-        found.rms_m,
-        found.open_directions,
-    )
 
 
 def align_scanners(
@@ -224,8 +109,9 @@ def align_scanners(
     steps["realigned"] = _round(scans, steps["merged"], s)
     steps["together"] = _together(scans, steps["realigned"], s)
     steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
-    narrowing = (*(n for n in _NARROWING_M if n <= s.gate_m), _FLOOR_M)
-    fits = []
+    narrowing = (*(n for n in _NARROWING_M if n <= s.gate_m), FLOOR_M)
+    fits: list[WallFit | None] = []
+    failed: GeometryError | None = None
     for scanner, still, start in zip(scanners, stills, steps["map as a whole"]):
         try:
             fits.append(
@@ -234,20 +120,38 @@ def align_scanners(
                 )
             )
         except GeometryError as error:
-            raise GeometryError(f"scanner {scanner.name}: {error}") from None
-    steps["each to the map"] = np.stack([fit.pose for fit in fits])
-    moved = steps["each to the map"] - steps["map as a whole"]
+            fits.append(None)
+            failed = failed or GeometryError(f"scanner {scanner.name}: {error}")
+    body = body_on_inexact_map(
+        stills, fits, steps["map as a whole"], building, narrowing, s.gate_m, _WEAK_M
+    )
+    if body is None and failed is not None:
+        raise failed
+    steps["each to the map"] = np.stack(
+        [whole if fit is None else fit.pose for whole, fit in zip(steps["map as a whole"], fits)]
+    )
+    poses = steps["each to the map"]
+    moved = poses - steps["map as a whole"]
     far = np.hypot(moved[:, 0], moved[:, 1]) > _INCONSISTENT_M
+    if body is not None:
+        poses, covariance, map_sigma_m = body.poses, body.covariance, body.map_sigma_m
+        fits = [fit or body.fit._replace(used=0) for fit in fits]
+    found = [fit for fit in fits if fit is not None]
+    if body is None:
+        covariance, map_sigma_m = block_diag(*(fit.covariance for fit in found)), 0.0
+    blocks = [covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(scanners))]
     return Alignment(
         scanners=tuple(
-            replace(scanner, pose=fit.pose, covariance=fit.covariance)
-            for scanner, fit in zip(scanners, fits)
+            replace(scanner, pose=pose, covariance=block)
+            for scanner, pose, block in zip(scanners, poses, blocks)
         ),
         steps=steps,
         pairs=shares,
-        matched=np.array([fit.used for fit in fits]),
-        rms_m=np.array([fit.rms_m for fit in fits]),
-        undetermined=tuple(one.name for one, fit in zip(scanners, fits) if fit.open_directions),
+        matched=np.array([fit.used for fit in found]),
+        rms_m=np.array([fit.rms_m for fit in found]),
+        covariance=covariance,
+        map_sigma_m=map_sigma_m,
+        undetermined=tuple(one.name for one, fit in zip(scanners, found) if fit.open_directions),
         inconsistent=tuple(one.name for one, is_far in zip(scanners, far) if is_far),
     )
 

@@ -115,6 +115,23 @@ class Robot:
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
 
+def read_joint_covariance(
+    path: str | os.PathLike[str], scanners: Sequence[Scanner]
+) -> FloatArray | None:
+    """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
+
+    Raises `GroundTruthError` if it is not one of these scanners, in their order.
+    """
+    content = JsonObject.read(path)
+    if "covariance" not in content:
+        return None
+    joint = content.values["covariance"]
+    names = [scanner.name for scanner in scanners]
+    if not isinstance(joint, dict) or joint.get("scanners") != names:
+        raise content.wrong("covariance", f"an object with scanners {excerpt(names)} and matrix")
+    return JsonObject(f"{content.place}: covariance", joint).covariance("matrix", 3 * len(names))
+
+
 def measured_noise_m(ranges_mm: NDArray[np.uint16], max_range_m: float) -> float:
     """Standard deviation of readings (m) from scans (N, readings) of an empty area, rounding
     included.

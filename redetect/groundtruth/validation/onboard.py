@@ -20,9 +20,9 @@ from scipy.special import chdtrc
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
-from redetect.groundtruth.lasers.alignment import StillScan, fit_to_walls, still_scan
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.lasers.walls import StillScan, fit_to_walls, still_scan
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
