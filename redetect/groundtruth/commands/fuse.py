@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,12 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
+from redetect.groundtruth.fusion.common_errors import (
+    COMMON,
+    read_common_covariance,
+    with_common,
+    without_common,
+)
 from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -44,7 +50,17 @@ def perform(options: Fuse) -> int:
             raise GroundTruthError(
                 f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
             )
+    # Errors that the laser's poses have in common do not average out.
+    common = np.zeros((3, 3))
+    if options.laser is not None:
+        known = read_common_covariance(options.laser)
+        streams["laser"], common = without_common(streams["laser"], known)
     fusion = fuse(odometry, streams, settings)
+    fusion = replace(
+        fusion,
+        poses=with_common(fusion.poses, common),
+        filtered=with_common(fusion.filtered, common),
+    )
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     document = {
         **provenance(
@@ -55,6 +71,7 @@ def perform(options: Fuse) -> int:
         "odometry": asdict(fusion.odometry),
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "left_out": [asdict(segment) for segment in left_out],
+        COMMON: common.tolist(),
         "covariances_repaired": fusion.repaired,
         "deviations_raised": fusion.raised,
         "slips_s": fusion.slips_s,

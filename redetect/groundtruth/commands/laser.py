@@ -13,6 +13,7 @@ from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion.common_errors import COMMON
 from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking import (
@@ -153,9 +154,12 @@ def describe(
                 "left_out": out,
             }
         )
+    good = np.isin(track.status, (OK, REACQUIRED))
+    shared = (track.covariances - track.noise)[good]
     counts = np.bincount(track.status, minlength=len(STATUS)).tolist()
     return {
         "sets": {status: count for status, count in zip(STATUS, counts) if count},
         "segments": segments,
+        COMMON: (shared.mean(axis=0) if len(shared) else np.zeros((3, 3))).tolist(),
         "scanners": entries,
     }
