@@ -55,6 +55,9 @@ _MEASURED = 0.5
 # interpolated over a longer one.
 _SEGMENT_GAP_S = 5.0
 _LARGEST_GAP_S = 2.0
+# Odometry that moves less than the first, while measured poses move more than the second, has
+# headings alone (m).
+_STANDS_M, _MOVES_M = 0.01, 1.0
 
 
 def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
@@ -222,7 +225,7 @@ def fuse(
     GroundTruthError
         If there is no measurement within the odometry's time, or no sample of odometry between the
         first measurement and the last; if a stream has no covariances, or one of them cannot be
-        repaired.
+        repaired; if odometry has no distances.
     """
     chosen = settings or FuseSettings()
     streams, raised = _with_jitter_covered(streams)
@@ -233,6 +236,12 @@ def fuse(
         raise GroundTruthError(
             f"no sample of odometry from the first measured pose ({first:.3f} s) to the last "
             f"({last:.3f} s): expected some, which are the times of the result"
+        )
+    moved_m = float(np.max(np.ptp(problem.measured.poses[:, :2], axis=0)))
+    if np.max(np.ptp(odometry.poses[:, :2], axis=0)) < _STANDS_M and moved_m > _MOVES_M:
+        raise GroundTruthError(
+            f"odometry stays at one place, while the measured poses move by {moved_m:.1f} m: "
+            "expected distances, too, not headings alone"
         )
     # Odometry's random errors, and its systematic errors as part of the state.
     noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)

@@ -35,6 +35,7 @@ from redetect.landmarks import wrap_angle
 # if a longer gap has to be bridged.
 _SPACING_S = 2.0
 _FEWEST = 10
+_LEAST_EXTENT_M = 0.01
 _LEAST_GAP_S = 20.0
 _MOST_TO_LEARN_FROM = 500
 # Prior mean and deviation of the logarithm of the correlation time, which a few visits hardly
@@ -70,6 +71,9 @@ def as_localisation(
     seconds. `path` is the one from movements, with covariances: it is kept where poses were
     measured, and the gaps in between are bridged again.
     """
+    # A gyroscope, whose headings come without positions, is no localisation.
+    if np.max(np.ptp(odometry.poses[:, :2], axis=0)) < _LEAST_EXTENT_M:
+        return None
     thin = problem.thinned(_SPACING_S)
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
@@ -35,6 +36,7 @@ _REJECT_COST = 15.0
 # Most consecutive frames that are skipped, and rounding errors of costs.
 _MOST_LEFT_OUT = 3
 _ROUNDING = 1e-6
+_CHANCE = 1e-3
 
 _Step = tuple[int, int, float]
 
@@ -80,15 +82,28 @@ class Track:
         return sum(pose.cost for _, pose in self.posed) / freedom if freedom else float("nan")
 
     def planar(self) -> PlanarPoses:
-        """The poses on the floor with their covariances."""
+        """The poses on the floor with their covariances, raised where residuals contradict them."""
         posed = self.posed
         poses = np.array([pose.world_from_robot for _, pose in posed]).reshape(-1, 4, 4)
-        covariances = np.array([pose.covariance for _, pose in posed]).reshape(-1, 6, 6)
+        covariances = np.array([excess_of(pose) * pose.covariance for _, pose in posed]).reshape(
+            -1, 6, 6
+        )
         return PlanarPoses(
             np.array([time_s for time_s, _ in posed], dtype=np.float64),
             np.column_stack([poses[:, 0, 3], poses[:, 1, 3], heading(poses)]),
             planar_covariance(poses, covariances),
         )
+
+
+def excess_of(pose: RefinedPose) -> float:
+    """Factor by which a pose's covariance is too small for its residuals.
+
+    It is 1 unless they are larger than chance makes one in a thousand.
+    """
+    freedom = pose.degrees_of_freedom
+    if freedom < 1 or pose.cost <= chdtri(freedom, _CHANCE):
+        return 1.0
+    return pose.cost / freedom
 
 
 def track_by_markers(

@@ -271,3 +271,55 @@ def test_the_command_writes_a_clock(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert clock.segments[0].status == "ok"
     assert main(command) == 1
     assert "give --force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("offset_s", [5.3, -29.1])
+def test_a_clock_that_is_many_seconds_off_is_found_without_flags(offset_s: float) -> None:
+    odometry, truth = simulate(Clocks(drift=4e-5), seed=31)
+    # Minutes of odometry around the segment, so that many offsets are possible.
+    rng = np.random.default_rng(31)
+    before, after = odometry.times_s[0], odometry.times_s[-1]
+    around = [
+        np.arange(before - 60.0, before - 0.01, 0.02),
+        np.arange(after + 0.02, after + 60, 0.02),
+    ]
+    wander = [np.cumsum(rng.normal(0, 0.004, len(times)).cumsum() / 30.0) for times in around]
+    ends = np.unwrap(odometry.poses[:, 2])[[0, -1]]
+    longer = joined([
+        headings_only(around[0], wander[0] - wander[0][-1] + ends[0]), odometry,
+        headings_only(around[1], wander[1] + ends[1]),
+    ])  # fmt: skip
+    longer = PlanarPoses(longer.times_s + offset_s, longer.poses)
+    (found,) = synchronise(longer, truth)
+    assert found.status == "ok"
+    error = found.offset_s - offset_s - 0.237 - 4e-5 * (found.reference_s - 30.0)
+    assert abs(error) < 4.0 * found.sigma_offset_s < 0.02
+
+
+def test_odometry_of_another_drive_is_not_synchronised() -> None:
+    odometry, _ = simulate(Clocks(), seed=32)
+    _, truth = simulate(Clocks(), seed=33)
+    (found,) = synchronise(odometry, truth)
+    assert found.status == "no turns"
+    assert math.isinf(found.sigma_offset_s)
+
+
+def test_a_robot_that_hardly_turns_is_synchronised_by_its_speed() -> None:
+    """Headings alone would give any offset within a second, and a small deviation."""
+    rng = np.random.default_rng(34)
+    times = np.arange(0.0, 70.0, 0.02)
+    speed = np.interp(times, np.arange(0.0, 71.0, 2.5), rng.choice([0.0, 0.3, 0.6], 29))
+    heading = 0.002 * np.cumsum(speed) * 0.02
+    way = np.cumsum(speed) * 0.02
+    exact = np.column_stack([way, 0.0 * way, 0.0 * way])
+    own = np.column_stack(
+        [1.01 * way, 0.0 * way, heading + np.cumsum(rng.normal(0, 3e-4, len(way)))]
+    )
+    odometry = PlanarPoses(times + 0.2, own)
+    seen = slice(250, 3250, 4)
+    noise = rng.normal(size=(len(times[seen]), 3)) * [0.002, 0.002, 0.0035]
+    covariances = np.tile(np.diag([4e-6, 4e-6, 1.2e-5]), (len(noise), 1, 1))
+    truth = PlanarPoses(times[seen], exact[seen] + noise, covariances)
+    for segment in synchronise(odometry, truth):
+        if segment.status != "no turns":
+            assert abs(segment.offset_s - 0.2) < 4.0 * segment.sigma_offset_s < 0.1

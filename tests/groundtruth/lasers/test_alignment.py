@@ -18,7 +18,14 @@ from redetect.groundtruth.lasers.alignment import (
     align_scanners,
     still_scan,
 )
-from redetect.groundtruth.lasers.scanners import Scanner, Scans, read_scanners
+from redetect.groundtruth.lasers.scanners import (
+    Scanner,
+    Scans,
+    noise_warnings,
+    read_joint_covariance,
+    read_scanners,
+    with_measured_noise,
+)
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import between
@@ -189,3 +196,62 @@ def test_the_command(tmp_path: Path) -> None:
     assert perform(Lasers(tmp_path, force=True)) == 0
     again = (tmp_path / "aligned.json").read_bytes(), (tmp_path / "aligned.png").read_bytes()
     assert first == again
+
+
+def test_a_drawing_that_is_centimetres_off_is_noticed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Single scanners would fit it to a millimetre, tens of millimetres off."""
+    scanners = four_scanners()
+    squared = []
+    for seed in range(4):
+        drawn = ROOM + np.random.default_rng(seed).normal(0.0, 0.02, ROOM.shape)
+        found = align_scanners(by_hand(scanners), furnished(scanners, 200 + seed, 40), drawn)
+        assert found.map_sigma_m > 0.004
+        error = np.stack([one.pose for one in found.scanners])
+        error -= np.stack([one.pose for one in scanners])
+        error[:, 2] = wrap_angle(error[:, 2])
+        squared += [
+            float(e @ np.linalg.solve(one.covariance, e) / 3.0)
+            for e, one in zip(error, found.scanners)
+        ]
+        # The shape of the body is that of their mutual alignment.
+        apart = error[:, :2] - error[:, :2].mean(axis=0)
+        assert np.abs(apart).max() < 0.05
+        # And their errors are common, which the joint covariance says.
+        joint = found.covariance
+        common = joint[0, 3] / np.sqrt(joint[0, 0] * joint[3, 3])
+        assert common > 0.3
+    assert float(np.mean(squared)) < 2.5
+
+    write_session(
+        tmp_path, by_hand(scanners), record(scanners, circle, (0.0, 0.05), FRONTED, 6), FRONTED
+    )
+    for one, empty in zip(scanners, empty_scans(scanners, 8)):
+        write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
+    write_building(tmp_path / "building.csv", drawn)
+    assert perform(Lasers(tmp_path)) == 0
+    assert "the walls are off the map by some" in capsys.readouterr().err
+    path = tmp_path / "aligned.json"
+    joint_read = read_joint_covariance(path, read_scanners(path))
+    assert joint_read is not None
+    assert joint_read.shape == (12, 12)
+    assert joint_read[0, 3] != 0.0
+
+
+def test_an_exact_drawing_stays_exact() -> None:
+    scanners = four_scanners()
+    found = align_scanners(by_hand(scanners), furnished(scanners, 3), ROOM)
+    assert found.map_sigma_m == 0.0
+
+
+def test_noise_is_measured_where_it_is_far_larger_than_stated() -> None:
+    true, stated = four_scanners(0.01), four_scanners(0.002)
+    empties = empty_scans(true, 5)
+    found = with_measured_noise(stated, empties)
+    for one in found:
+        assert one.sigma_m == pytest.approx(0.0104, rel=0.1)
+    assert with_measured_noise(true, empties) == true
+    lines = noise_warnings(stated, found, Path("scanners.json"))
+    assert len(lines) == 4
+    assert "not by 2.0 mm as in scanners.json" in lines[0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.commands.laser import perform
+from redetect.groundtruth.commands.laser import perform, seen_through
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
@@ -33,6 +33,7 @@ from redetect.groundtruth.lasers.tracking import (
     combined_poses,
     track_by_lasers,
     track_without_suspects,
+    usual_sets_per_pose,
 )
 from redetect.groundtruth.lasers.tracking_kernels import (
     FixedScanners,
@@ -428,3 +429,21 @@ def test_settings_are_checked() -> None:
     with pytest.raises(GroundTruthError, match="no scanners"):
         fixed_scanners([], [])
     assert invert(np.zeros(3)) == pytest.approx(np.zeros(3))
+
+
+def test_sets_are_averaged_over_a_time_not_over_a_number(
+    recorded: ScanSets, tables: FixedScanners
+) -> None:
+    """The mean of poses over a quarter of a second is off while the robot speeds up."""
+    track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
+    for slower, expected in ((1.0, 6), (1.875, 3), (3.0, 2), (7.5, 1)):
+        assert usual_sets_per_pose(replace(track, times_s=slower * track.times_s)) == expected
+
+
+def test_an_outline_that_is_too_large_is_seen_through(
+    scanners: tuple[Scanner, ...], recorded: ScanSets, tables: FixedScanners
+) -> None:
+    exact = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
+    large = track_by_lasers(recorded, tables, Robot(1.1 * FRONTED, 1.0, 1.0))
+    assert seen_through(exact) < 0.05
+    assert seen_through(large) > 0.08

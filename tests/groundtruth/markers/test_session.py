@@ -20,11 +20,18 @@ from redetect.groundtruth.markers.session import (
     read_marker_frames,
     rig_views,
 )
-from redetect.groundtruth.markers.track import report_entry, track_by_markers
+from redetect.groundtruth.markers.track import excess_of, report_entry, track_by_markers
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.transforms import inverse, log_se3
 from redetect.landmarks import MarkerCorner
-from tests.groundtruth.markers.scene import box_rig, frames_of, hall_cameras, lens
+from tests.groundtruth.markers.scene import (
+    box_rig,
+    frames_of,
+    hall_cameras,
+    lens,
+    network_of,
+    robot_pose,
+)
 from tools.simulator.driving import planar_transform
 
 NETWORK = Network(
@@ -160,3 +167,24 @@ def test_runs_are_found_in_a_session(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name / "detected.markers").touch()
     assert find_runs(tmp_path) == [tmp_path / "a", tmp_path / "b"]
+
+
+def test_poses_from_markers_printed_too_large_say_that_they_are_off() -> None:
+    """Widths 3 % wrong: the residuals contradict the covariances, which are raised."""
+    rig, cameras = box_rig(), hall_cameras(2)
+    rng = np.random.default_rng(8)
+    poses = np.stack([robot_pose(rng, 0.5) for _ in range(12)])
+    times = np.arange(12.0)
+    groups = group_by_time(frames_of(times, poses, cameras=2, rig=rig), 0.005)
+    network = network_of(cameras)
+    for width, few, many in ((1.0, 0, 1), (1.03, 10, 12)):
+        wrong = replace(rig, widths_m=width * rig.widths_m)
+        track = track_by_markers(groups, wrong, network, PoseSettings())
+        raised = [excess_of(pose) for _, pose in track.posed]
+        assert few <= sum(one > 1.0 for one in raised) <= many
+        found = track.planar()
+        truth = np.column_stack([poses[:, 0, 3], poses[:, 1, 3]])[found.times_s.astype(int)]
+        error = found.poses[:, :2] - truth
+        assert found.covariances is not None
+        own = np.linalg.inv(found.covariances[:, :2, :2])
+        assert np.mean(np.einsum("ni,nij,nj->n", error, own, error)) / 2.0 < 1.8

@@ -1,0 +1,82 @@
+"""Odometry that contradicts the measured poses: the path follows these, and says how well."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion.fuse import Fusion, fuse
+from redetect.groundtruth.settings import FuseSettings
+from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
+from redetect.plane import between
+from tests.groundtruth.fusion.drives import chain, drive, measure, normalised_error
+
+FloatArray = NDArray[np.float64]
+
+WHEELS = FuseSettings(distance_sigma=0.006, lateral_sigma=0.001, turn_sigma=0.008)
+FINE = np.diag([4e-6, 4e-6, 1e-5])
+
+
+def slipping(own: PlanarPoses, from_s: float, to_s: float, extra_m: float) -> PlanarPoses:
+    """Odometry whose wheels spin: it measures a way that nobody drove."""
+    steps = between(own.poses[:-1], own.poses[1:])
+    during = (own.times_s[1:] > from_s) & (own.times_s[1:] <= to_s)
+    steps[during, 0] += extra_m / np.count_nonzero(during)
+    return PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), own.poses[0]))
+
+
+def errors_m(fusion: Fusion, truth: PlanarPoses) -> FloatArray:
+    exact, _ = interpolate_poses(truth, fusion.poses.times_s)
+    return np.asarray(np.linalg.norm((fusion.poses.poses - exact.poses)[:, :2], axis=1))
+
+
+@pytest.mark.parametrize("extra_m", [0.2, 1.0])
+def test_wheels_that_spin_do_not_carry_the_path_away(extra_m: float) -> None:
+    rng = np.random.default_rng(21)
+    truth, own = drive(rng, 60.0, WHEELS)
+    odometry = slipping(own, 20.0, 21.0, extra_m)
+    laser = measure(rng, truth, np.arange(0.0, 59.9, 0.08), FINE)
+    fusion = fuse(odometry, {"laser": laser})
+    assert errors_m(fusion, truth).max() < 0.05
+    assert 0.7 < float(np.mean(normalised_error(fusion.poses, truth))) / 3.0 < 1.5
+    assert len(fusion.rejected) < 0.01 * len(laser)
+    assert fusion.slips_s
+    assert all(19.8 < begin < end < 23.0 for begin, end in fusion.slips_s)
+
+
+def test_a_burst_of_wrong_poses_is_no_slip() -> None:
+    """A second of poses half a metre off, all by as much: the path stays where it was."""
+    rng = np.random.default_rng(22)
+    truth, odometry = drive(rng, 60.0, WHEELS)
+    laser = measure(rng, truth, np.arange(0.0, 59.9, 0.08), FINE)
+    wrong = laser.during(30.0, 31.0)
+    laser.poses[wrong, :2] += [0.3, 0.4]
+    fusion = fuse(odometry, {"laser": laser})
+    assert fusion.slips_s == ()
+    assert len(fusion.rejected) == np.count_nonzero(wrong)
+    assert errors_m(fusion, truth).max() < 0.02
+
+
+def test_odometry_that_was_reset_is_followed_at_once() -> None:
+    rng = np.random.default_rng(23)
+    truth, own = drive(rng, 60.0, WHEELS)
+    after = own.times_s >= 30.0
+    odometry = PlanarPoses(own.times_s, own.poses.copy())
+    odometry.poses[after] = between(own.poses[after][0], own.poses[after])
+    laser = measure(rng, truth, np.arange(0.0, 59.9, 0.08), FINE)
+    fusion = fuse(odometry, {"laser": laser})
+    off = errors_m(fusion, truth)
+    away = np.abs(fusion.poses.times_s - 30.0) > 0.2
+    assert off[away].max() < 0.02
+    assert len(fusion.rejected) < 5
+
+
+def test_headings_alone_are_no_odometry() -> None:
+    rng = np.random.default_rng(24)
+    truth, odometry = drive(rng, 20.0, WHEELS)
+    odometry.poses[:, :2] = 0.0
+    laser = measure(rng, truth, np.arange(0.0, 19.9, 0.08), FINE)
+    with pytest.raises(GroundTruthError, match="odometry stays at one place"):
+        fuse(odometry, {"laser": laser})
