@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 from redetect.groundtruth.commands.lasers import perform
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.alignment import (
-    STEPS,
-    align_scanners,
-    still_scan,
-)
+from redetect.groundtruth.lasers.alignment import STEPS, align_scanners
 from redetect.groundtruth.lasers.scanners import (
     Scanner,
     Scans,
@@ -26,6 +22,7 @@ from redetect.groundtruth.lasers.scanners import (
     read_scanners,
     with_measured_noise,
 )
+from redetect.groundtruth.lasers.walls import still_scan
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import between

@@ -444,6 +444,6 @@ def test_an_outline_that_is_too_large_is_seen_through(
     scanners: tuple[Scanner, ...], recorded: ScanSets, tables: FixedScanners
 ) -> None:
     exact = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
-    large = track_by_lasers(recorded, tables, Robot(1.1 * FRONTED, 1.0, 1.0))
+    large = track_by_lasers(recorded, tables, Robot(1.06 * FRONTED, 1.0, 1.0))
     assert seen_through(exact) < 0.05
     assert seen_through(large) > 0.08
