@@ -14,8 +14,8 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.common_errors import COMMON
-from redetect.groundtruth.lasers.acquisition import load_session
-from redetect.groundtruth.lasers.scanners import Scanner, noise_warnings, read_scanners
+from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
+from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking import (
     COASTING,
     LOST,
@@ -36,6 +36,8 @@ from redetect.storage.bounds import demand, whole
 
 #: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
 _DISTURBED = 3
+#: Half of the robot's movement during a scan above which a warning is printed (m).
+_LARGEST_SWEEP_M = 0.012
 #: Share of beams through the robot above which a warning is printed: edges cause some per cent.
 _MOST_SEEN_THROUGH = 0.08
 
@@ -59,6 +61,7 @@ def perform(options: Laser) -> int:
     scanners, robot, fixed, sets = load_session(options.session, calibration)
     for line in noise_warnings(read_scanners(calibration), scanners, calibration):
         print(line, file=sys.stderr)
+    print_sweeps(scanners, sets, robot)
     track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
     average = options.average or usual_sets_per_pose(track)
@@ -97,6 +100,21 @@ def perform(options: Laser) -> int:
                 file=sys.stderr,
             )
     return 0 if len(poses) else 1
+
+
+def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) -> None:
+    """Warn of scans that seem to be of one moment, although the robot moves during them."""
+    if any(scanner.sweep_s for scanner in scanners) or len(sets) < 2:
+        return
+    turn = max((s.readings - 1) * s.angle_step_rad for s in scanners) / (2.0 * np.pi)
+    sweep_s = turn * float(np.median(np.diff(sets.times_s)))
+    moved_m = 0.5 * sweep_s * robot.largest_speed_m_s
+    if moved_m > _LARGEST_SWEEP_M:
+        print(
+            f"warning: no sweep_s of any scanner: if a mirror turns once a scan, its beams take "
+            f"{1e3 * sweep_s:.0f} ms, in which the robot moves up to {2e3 * moved_m:.0f} mm",
+            file=sys.stderr,
+        )
 
 
 def seen_through(track: LaserTrack) -> float:

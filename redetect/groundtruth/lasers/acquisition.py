@@ -127,10 +127,11 @@ def fixed_scanners(
     backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
-    direction = np.zeros((len(scanners), width, 2))
+    direction, beam_times = np.zeros((len(scanners), width, 2)), np.zeros((len(scanners), width))
     for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
         reach_m = np.minimum(background.near_m, scanner.max_range_m)
         near[i, : scanner.readings] = 1e3 * reach_m
+        beam_times[i, : scanner.readings] = scanner.beam_times_s
         angle = scanner.pose[2] + scanner.angles_rad
         direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return FixedScanners(
@@ -140,6 +141,7 @@ def fixed_scanners(
         # Rounding adds an error that is uniform over a quantum.
         np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
         covariance,
+        beam_times,
     )
 
 

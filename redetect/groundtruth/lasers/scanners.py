@@ -71,6 +71,7 @@ class Scanner:
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
     max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)
+    sweep_s: NotNegative = 0.0  # From a scan's first beam to its last (s)
 
     def __post_init__(self) -> None:
         place = f"scanner {excerpt(self.name)}"
@@ -87,6 +88,12 @@ class Scanner:
     def angles_rad(self) -> FloatArray:
         """(readings,) directions of the beams in the scanner's frame."""
         return np.asarray(self.first_angle_rad + self.angle_step_rad * np.arange(self.readings))
+
+    @property
+    def beam_times_s(self) -> FloatArray:
+        """(readings,) times of the beams after the middle of the scan."""
+        share = np.arange(self.readings) / max(self.readings - 1, 1) - 0.5
+        return np.asarray(self.sweep_s * share)
 
     def has_return(self, ranges_mm: ArrayLike) -> BoolArray:
         """Which of (..., readings) readings in millimetres hit something within range."""
@@ -213,6 +220,8 @@ def read_robot(path: str | os.PathLike[str]) -> Robot:
 def scanner_entry(scanner: Scanner) -> dict[str, Any]:
     """A scanner as an entry of a file."""
     values = {field.name: getattr(scanner, field.name) for field in fields(scanner)}
+    if not scanner.sweep_s:
+        del values["sweep_s"]
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
@@ -233,8 +242,9 @@ def _scanner(entry: JsonObject) -> Scanner:
     first, step, most, sigma = (entry.number(key) for key in keys)
     name, readings = entry.text("name"), entry.whole("readings")
     pose, covariance = entry.numbers("pose", 3), entry.uncertainty(3, "pose_sigma")
+    sweep = entry.number("sweep_s") if "sweep_s" in entry else 0.0
     try:
-        return Scanner(name, pose, covariance, first, step, readings, most, sigma)
+        return Scanner(name, pose, covariance, first, step, readings, most, sigma, sweep)
     except GroundTruthError as error:
         raise GroundTruthError(f"{entry.place}: {error}") from None
 

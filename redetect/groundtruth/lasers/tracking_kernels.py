@@ -37,6 +37,7 @@ class FixedScanners(NamedTuple):
     origins: FloatArray  # (scanners, 2): in the world (m)
     sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
     covariance: FloatArray  # (3 scanners, 3 scanners): of the scanners' poses, jointly
+    beam_times_s: FloatArray  # (scanners, readings): of the beams, after their scan's time
 
 
 class Body(NamedTuple):
@@ -113,7 +114,7 @@ def new_points(
 
     `centre` (2,): points farther than `reach_m` from here are ignored. `motion` (5,) of the robot:
     velocity (m/s), turn rate (rad/s), and the point it turns about at the set's time. It is used to
-    propagate the points from their scan's time to the set's.
+    propagate the points from their beam's time to the set's.
     """
     ranges_mm, rows, ages_s = scans
     most = rows.size * ranges_mm.shape[1]
@@ -125,10 +126,6 @@ def new_points(
     for s in range(rows.size):
         if rows[s] < 0:
             continue
-        age = ages_s[s]
-        c, sn = math.cos(motion[2] * age), math.sin(motion[2] * age)
-        # Where the robot was at the scan's time.
-        then_x, then_y = motion[3] - motion[0] * age, motion[4] - motion[1] * age
         for i in range(ranges_mm.shape[1]):
             r = float(ranges_mm[rows[s], i])
             if r <= 0.0 or r >= fixed.near_mm[s, i]:
@@ -138,7 +135,10 @@ def new_points(
             dx, dy = x - centre[0], y - centre[1]
             if dx * dx + dy * dy > reach_m * reach_m:
                 continue
-            dx, dy = x - then_x, y - then_y
+            age = ages_s[s] - fixed.beam_times_s[s, i]
+            c, sn = math.cos(motion[2] * age), math.sin(motion[2] * age)
+            # From where the robot was at the beam's time.
+            dx, dy = x - (motion[3] - motion[0] * age), y - (motion[4] - motion[1] * age)
             points[n, 0] = motion[3] + c * dx - sn * dy
             points[n, 1] = motion[4] + sn * dx + c * dy
             bx, by = fixed.direction[s, i, 0], fixed.direction[s, i, 1]

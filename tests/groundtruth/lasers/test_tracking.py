@@ -104,10 +104,12 @@ def test_points_are_moved_on_with_the_robot() -> None:
     ray = place - origin
     length = np.hypot(*ray)
     ranges = np.array([[round(1e3 * length)]], dtype=np.uint16)
-    scan = ScanSet(ranges, np.zeros(1, dtype=np.int64), np.array([age]))
+    # Part of the age is that of the beam within its scan.
+    scan = ScanSet(ranges, np.zeros(1, dtype=np.int64), np.array([0.6 * age]))
     fixed = FixedScanners(
-        np.full((1, 1), 1e9), (ray / length)[None, None], origin[None], np.ones(1), np.eye(3)
-    )
+        np.full((1, 1), 1e9), (ray / length)[None, None], origin[None], np.ones(1), np.eye(3),
+        np.full((1, 1), -0.4 * age),
+    )  # fmt: skip
     about = np.array([*motion, *pose[:2]])
     points, _, _, range_m = new_points(scan, fixed, pose[:2], 1.0, about)
     c, s = np.cos(pose[2]), np.sin(pose[2])

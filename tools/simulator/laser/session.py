@@ -97,7 +97,7 @@ def sick(name: str, pose: FloatArray, settings: LaserSettings) -> Scanner:
     """A scanner of 181 beams over half a turn at an exact pose."""
     return Scanner(
         name, pose, np.zeros((3, 3)), -np.pi / 2, np.pi / 180, 181, settings.max_range_m,
-        settings.reading.sigma_m,
+        settings.reading.sigma_m, settings.reading.sweep_s,
     )  # fmt: skip
 
 
