@@ -51,6 +51,8 @@ _CALENDAR = (
 )
 _OFFSET = "offset from master"
 _PARTS_PER_BILLION = 1e-9
+# Least step of a clock between segments that is looked for in a gap of its times.
+_LEAST_STEP_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,11 @@ class ClockModel:
         return times + _extended(times, knots, offsets, drifts)
 
     def groundtruth_times(self, robot_times_s: ArrayLike) -> FloatArray:
-        """Convert robot times to the ground truth's clock, the inverse of `robot_times`."""
+        """Convert robot times to the ground truth's clock, the inverse of `robot_times`.
+
+        If the clock was set forward between two segments, and the robot times, in order, have a gap
+        of that length there, it was set in the gap.
+        """
         knots, offsets = knots_of(self.segments)
         robot = knots + offsets
         backward = np.flatnonzero(np.diff(robot) <= 0.0)
@@ -106,8 +112,27 @@ class ClockModel:
                 "its times are ambiguous there"
             )
         times = np.asarray(robot_times_s, dtype=np.float64)
+        knots, robot = _with_steps(knots, robot, times)
         slopes = (1.0 / self.segments[0].rate, 1.0 / self.segments[-1].rate)
         return _extended(times, robot, knots, slopes)
+
+
+def _with_steps(
+    knots: FloatArray, robot: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Knots on both clocks, with those beside gaps of robot times in which the clock was set."""
+    added: list[tuple[float, float]] = []
+    for i in range(1, len(knots) - 1, 2):
+        before, after = robot[i] - knots[i], robot[i + 1] - knots[i + 1]
+        own = times[(times > robot[i]) & (times < robot[i + 1])]
+        if after - before < _LEAST_STEP_S or len(own) < 2:
+            continue
+        at = int(np.argmax(np.diff(own)))
+        if own[at + 1] - own[at] > after - before:
+            added += [(own[at] - before, own[at]), (own[at + 1] - after, own[at + 1])]
+    both = np.concatenate([np.column_stack([knots, robot]), np.reshape(added, (-1, 2))])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    return both[:, 0], both[:, 1]
 
 
 def knots_of(segments: Sequence[ClockSegment]) -> tuple[FloatArray, FloatArray]:

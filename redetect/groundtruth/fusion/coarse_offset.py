@@ -27,6 +27,8 @@ _LONGEST_GAP_S, _INTERVALS = 1.0, 3.0
 # Errors of odometry's turns and ways, as a share of what is usual in the ground truth.
 _SHARE = 0.1
 _LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
+# Least duration of the parts before and after the clock was set, and least step (s).
+_LEAST_PART_S, _LEAST_JUMP_S = 5.0, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
 _COVERED = 0.5
 # Largest ratio of the squared errors at an offset that is taken to those near the expected one, of
@@ -107,6 +109,24 @@ class OffsetSearch:
             return around_s
         return float(_STEP_S * steps[best])
 
+    def set_at_s(self, part: PlanarPoses) -> float | None:
+        """Time at which the clock was set by more than a refinement finds, within a part."""
+        compared = self._compared([part])
+        if compared is None or compared.unrelated < _MUCH_MOVEMENT:
+            return None
+        steps = np.arange(-self._largest, self._largest + 1)
+        own = np.minimum(compared.single_errors(steps), compared.unrelated)
+        before = np.cumsum(own, axis=1)
+        after = before[:, -1:] - before
+        parted = before.min(axis=0) + after.min(axis=0)
+        times = _STEP_S * (compared.at + self._own.first)
+        parted[np.minimum(times - times[0], times[-1] - times) < _LEAST_PART_S] = np.inf
+        at = int(np.argmin(parted))
+        jump = abs(int(np.argmin(before[:, at])) - int(np.argmin(after[:, at])))
+        if parted[at] < _MUCH_BETTER * before[:, -1].min() and jump * _STEP_S > _LEAST_JUMP_S:
+            return float(times[at])
+        return None
+
     def nearest_s(self, part: PlanarPoses, around_s: float) -> float:
         """The best offset near the expected one."""
         compared = self._compared([part])
@@ -156,6 +176,15 @@ class _Compared:
         own = self.own.values[self.own.known]
         apart = np.var(self.values, axis=0) + np.var(own, axis=0)
         return float((apart + (self.values.mean(axis=0) - own.mean(axis=0)) ** 2) @ self.weights)
+
+    def single_errors(self, steps: IntArray) -> FloatArray:
+        """(K, M) squared normalised errors of all movements, infinite where odometry is unknown."""
+        at = self.at + steps[:, None]
+        inside = (at >= 0) & (at < len(self.own.known))
+        at = np.where(inside, at, 0)
+        apart = self.values - self.own.values[at]
+        known = inside & self.own.known[at]
+        return np.asarray(np.where(known, np.square(apart) @ self.weights, np.inf))
 
     def errors(self, steps: IntArray) -> FloatArray:
         """(K,) mean squared normalised errors at offsets of so many steps (K,); infinite where

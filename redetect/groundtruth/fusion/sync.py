@@ -122,13 +122,20 @@ def synchronise(
     common_s = search.offset_s(parts, 0.0)
     near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))
     found: list[ClockSegment] = []
+    parts, set_at_s = _parted_where_set(parts, search)
     for part in parts:
         around_s = search.offset_s([part], common_s)
         own = PlanarPoses(odometry.times_s - around_s, odometry.poses)
         start_s = search.nearest_s(part, around_s) - around_s
         for clock in _segment(own, part, near, start_s, _MOST_JUMPS):
             clock = replace(clock, offset_s=clock.offset_s + around_s)
-            found.append(_if_matching(clock, part, search, bounds))
+            clock = _if_matching(clock, part, search, bounds)
+            beside = [at for at in set_at_s if at in (clock.from_s, clock.to_s)]
+            if beside and clock.status == "ok":
+                clock = replace(
+                    clock, status="jump", note=f"the clock was set near {beside[0]:.2f} s"
+                )
+            found.append(clock)
     if all(segment.note == _NO_ODOMETRY for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
@@ -136,6 +143,21 @@ def synchronise(
             f"overlap within {bounds.largest_offset_s:g} s"
         )
     return tuple(_interpolated(on_one_line(found)))
+
+
+def _parted_where_set(
+    parts: list[PlanarPoses], search: OffsetSearch
+) -> tuple[list[PlanarPoses], list[float]]:
+    """The parts of the ground truth, split where the clock was set by far, and the times beside."""
+    found, times_s = [], []
+    for part in parts:
+        at_s = search.set_at_s(part)
+        which = [part.times_s < at_s, part.times_s >= at_s] if at_s is not None else [slice(None)]
+        halves = [part.only(one) for one in which]
+        if len(halves) == 2:
+            times_s += [float(halves[0].times_s[-1]), float(halves[1].times_s[0])]
+        found += halves
+    return found, times_s
 
 
 def _if_matching(
@@ -401,10 +423,11 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
         covariances[:, 2, 2] = roughness(np.unwrap(measured.poses[:, 2])) ** 2
     else:
         covariances += measured.covariances
-    jitter = [
-        roughness(values) for values in (*odometry.poses[:, :2].T, np.unwrap(odometry.poses[:, 2]))
-    ]
-    return PlanarPoses(measured.times_s, measured.poses, covariances + np.diag(np.square(jitter)))
+    columns = (*odometry.poses[:, :2].T, np.unwrap(odometry.poses[:, 2]))
+    jitter = np.array([roughness(values) for values in columns])
+    # Between two samples odometry's path is unknown by the sag of what it bends.
+    sag = np.array([np.sqrt(np.mean(np.square(np.diff(values, 2)))) / 8.0 for values in columns])
+    return PlanarPoses(measured.times_s, measured.poses, covariances + np.diag(jitter**2 + sag**2))
 
 
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:

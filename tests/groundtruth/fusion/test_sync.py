@@ -323,3 +323,43 @@ def test_a_robot_that_hardly_turns_is_synchronised_by_its_speed() -> None:
     for segment in synchronise(odometry, truth):
         if segment.status != "no turns":
             assert abs(segment.offset_s - 0.2) < 4.0 * segment.sigma_offset_s < 0.1
+
+
+def test_a_clock_set_between_segments_was_set_where_its_times_have_a_gap() -> None:
+    later = replace(SEGMENT, from_s=100.0, to_s=110.0, reference_s=105.0, offset_s=8.5, rate=1.0)
+    model = ClockModel((replace(SEGMENT, rate=1.0), later))
+    exact = np.arange(0.0, 120.0, 0.02)
+    robot = exact + np.where(exact < 60.0, 0.5, 8.5)
+    np.testing.assert_allclose(model.groundtruth_times(robot), exact, atol=1e-9)
+    # Without a gap, as if the clock had been slewed, the offset is interpolated.
+    slewed = np.arange(0.5, 118.5, 0.02)
+    between = model.groundtruth_times(slewed)
+    assert np.all(np.diff(between) > 0.0)
+    assert np.abs(np.diff(between) - 0.02).max() < 0.005
+
+
+def test_a_clock_set_by_seconds_within_a_segment_is_found() -> None:
+    clocks = Clocks(offset_s=-0.1, drift=0.0, jump_at_s=25.0, jump_s=5.0)
+    found = synchronise(*simulate(clocks, seed=5))
+    assert [segment.status for segment in found] == ["jump", "jump"]
+    assert abs(found[0].to_s - 25.0) < 1.5
+    assert abs(found[0].offset_s + 0.1) < 0.02
+    assert abs(found[1].offset_s - 4.9) < 0.02
+
+
+def test_slow_odometry_has_no_jumps() -> None:
+    """Two samples a second: between them its path is an arc, that of the robot is not."""
+    rng = np.random.default_rng(10)
+    exact = np.arange(0.0, 70.0, 0.01)
+    speed = np.interp(exact, np.arange(0.0, 71.0, 2.0), rng.uniform(0.0, 0.8, 36))
+    turning = np.interp(exact, np.arange(0.0, 71.0, 2.0), rng.uniform(-0.6, 0.6, 36))
+    theta = np.cumsum(turning) * 0.01
+    xy = np.cumsum(speed * np.exp(1j * theta)) * 0.01
+    path = np.column_stack([xy.real, xy.imag, theta])
+    odometry = PlanarPoses(exact[::50] + 0.2, path[::50])
+    noise = rng.normal(size=(len(exact[500:6500:8]), 3)) * [0.002, 0.002, 0.0035]
+    covariances = np.tile(np.diag([4e-6, 4e-6, 1.2e-5]), (len(noise), 1, 1))
+    truth = PlanarPoses(exact[500:6500:8], path[500:6500:8] + noise, covariances)
+    found = synchronise(odometry, truth)
+    assert [segment.status for segment in found] == ["ok"]
+    assert abs(found[0].offset_s - 0.2) < 0.02
