@@ -14,13 +14,13 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
-from redetect.groundtruth.fusion.common_errors import (
+from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
+from redetect.groundtruth.fusion.stream_errors import (
     COMMON,
     read_common_covariance,
     with_common,
     without_common,
 )
-from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,

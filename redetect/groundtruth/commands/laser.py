@@ -13,7 +13,7 @@ from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.fusion.common_errors import COMMON
+from redetect.groundtruth.fusion.stream_errors import COMMON
 from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking import (

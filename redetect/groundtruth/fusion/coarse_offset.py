@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.fusion.jitter import roughness
+from redetect.groundtruth.fusion.stream_errors import roughness
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 #: Offsets this near the expected one are left to the refinement of the clock.
@@ -141,8 +141,8 @@ class OffsetSearch:
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return True
-        errors = compared.errors(np.round(np.array([offset_s]) / _STEP_S).astype(np.int64))
-        return bool(not np.isfinite(errors[0]) or errors[0] < _UNRELATED * compared.unrelated)
+        error = compared.errors(np.array([round(offset_s / _STEP_S)]))[0]
+        return bool(not np.isfinite(error) or error < _UNRELATED * compared.unrelated)
 
     def _compared(self, parts: Sequence[PlanarPoses]) -> _Compared | None:
         moved = [Movements.of(part, *_steps(part)) for part in parts if len(part) > 1]
@@ -190,15 +190,9 @@ class _Compared:
         """(K,) mean squared normalised errors at offsets of so many steps (K,); infinite where
         too few movements are compared.
         """
-        count = len(self.own.known)
-        errors, compared = np.full(len(steps), np.inf), np.zeros(len(steps))
-        for k, step in enumerate(steps):
-            at = self.at + step
-            inside = (at >= 0) & (at < count)
-            inside[inside] = self.own.known[at[inside]]
-            compared[k] = np.count_nonzero(inside)
-            if compared[k] >= _FEWEST_SAMPLES:
-                apart = self.values[inside] - self.own.values[at[inside]]
-                errors[k] = np.mean(np.square(apart), axis=0) @ self.weights
-        errors[compared < _COVERED * compared.max(initial=0.0)] = np.inf
-        return errors
+        single = self.single_errors(steps)
+        known = np.isfinite(single)
+        compared = known.sum(axis=1)
+        errors = np.where(known, single, 0.0).sum(axis=1) / np.maximum(compared, 1)
+        enough = compared >= max(_FEWEST_SAMPLES, _COVERED * compared.max(initial=0))
+        return np.asarray(np.where(enough, errors, np.inf))

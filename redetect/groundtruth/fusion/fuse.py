@@ -20,11 +20,11 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas
-from redetect.groundtruth.fusion.jitter import with_jitter_covered
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.fusion.slips import slipped_intervals
+from redetect.groundtruth.fusion.stream_errors import with_jitter_covered
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,

@@ -33,8 +33,8 @@ from redetect.groundtruth.fusion.clock import (
 )
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
-from redetect.groundtruth.fusion.jitter import roughness, with_jitter_covered
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.fusion.stream_errors import roughness, with_jitter_covered
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,

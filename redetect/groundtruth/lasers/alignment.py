@@ -23,9 +23,14 @@ from redetect.groundtruth.lasers.icp import (
     fit_outline,
     scan_normals,
 )
-from redetect.groundtruth.lasers.map_errors import body_on_inexact_map
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import FLOOR_M, WallFit, fit_to_walls, still_scan
+from redetect.groundtruth.lasers.walls import (
+    FLOOR_M,
+    WallFit,
+    body_on_inexact_map,
+    fit_to_walls,
+    still_scan,
+)
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 

@@ -21,7 +21,7 @@ from redetect.groundtruth.fusion.clock import (
     read_clock,
     read_ptpd,
 )
-from redetect.groundtruth.fusion.jitter import roughness
+from redetect.groundtruth.fusion.stream_errors import roughness
 from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import SyncSettings
 from redetect.groundtruth.trajectories.streams import (

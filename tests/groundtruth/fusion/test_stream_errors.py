@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.groundtruth.fusion.common_errors import (
+from redetect.groundtruth.fusion.fuse import fuse
+from redetect.groundtruth.fusion.stream_errors import (
+    jitter_ratio,
     read_common_covariance,
     with_common,
+    with_jitter_covered,
     without_common,
 )
-from redetect.groundtruth.fusion.fuse import fuse
-from redetect.groundtruth.fusion.jitter import jitter_ratio, with_jitter_covered
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from tests.groundtruth.fusion.drives import drive, measure, normalised_error
