@@ -28,7 +28,7 @@ _LONGEST_GAP_S, _INTERVALS = 1.0, 3.0
 _SHARE = 0.1
 _LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
 # Least duration of the parts before and after the clock was set, and least step (s).
-_LEAST_PART_S, _LEAST_JUMP_S = 5.0, 0.5
+_LEAST_PART_S, _LEAST_JUMP_S = 10.0, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
 _COVERED = 0.5
 # Largest ratio of the squared errors at an offset that is taken to those near the expected one, of
