@@ -8,7 +8,8 @@ the measurements return to the path as predicted is one of gross errors of their
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -54,30 +55,46 @@ def slip_variances(
         if not runs:
             break
         clipped = np.minimum(found.squared, gate)
-        least = [_LEAST_GAIN * float(np.sum(clipped[begin:end])) for begin, end in runs]
-        chosen: list[FloatArray | None] = [None] * len(runs)
+        # Where the filter would give up, anything is better.
+        least = [
+            np.inf if found.accepted[end - 1] else _LEAST_GAIN * float(np.sum(clipped[begin:end]))
+            for begin, end in runs
+        ]
+        chosen: list[_Slip | None] = [None] * len(runs)
         for length in _TRIED_LENGTHS:
             for rate in _TRIED_RATES:
-                added = [
-                    _slip(
-                        problem,
-                        int(nodes[begin - 1]),
-                        int(nodes[min(begin + length, end) - 1]),
-                        rate,
-                    )
+                tried = [
+                    _Slip(int(nodes[begin - 1]), int(nodes[min(begin + length, end) - 1]), rate)
                     for begin, end in runs
                 ]
-                tried = problem.filtered_forward(variances + slips + sum(added))
-                clipped = np.minimum(tried.squared, gate)
+                with_them = variances + _added(slips, problem.times_s, tried)
+                clipped = np.minimum(problem.filtered_forward(with_them).squared, gate)
                 for i, (begin, end) in enumerate(runs):
                     cost = float(np.sum(clipped[begin:end])) + length * _COST_OF_LENGTH[rate]
                     if cost < least[i]:
-                        least[i], chosen[i] = cost, added[i]
+                        least[i], chosen[i] = cost, tried[i]
         hopeless.update(begin for (begin, _), one in zip(runs, chosen) if one is None)
-        if any(one is not None for one in chosen):
-            slips += sum(one for one in chosen if one is not None)
-            found = problem.filtered_forward(variances + slips)
+        slips = _added(slips, problem.times_s, [one for one in chosen if one is not None])
+        found = problem.filtered_forward(variances + slips)
     return slips
+
+
+class _Slip(NamedTuple):
+    """A slip after a node, until another, at a rate (m/s, rad/s)."""
+
+    first: int
+    last: int
+    rate: float
+
+
+def _added(slips: FloatArray, times_s: FloatArray, more: Sequence[_Slip]) -> FloatArray:
+    """Variances (N, 3) with those of more slips."""
+    total = slips.copy()
+    for first, last, rate in more:
+        passed = np.diff(times_s[first : last + 1])
+        usual = (times_s[last] - times_s[first]) / max(len(passed), 1)
+        total[first + 1 : last + 1] += (rate**2 * usual * passed)[:, None]
+    return total
 
 
 def slipped_intervals(times_s: FloatArray, slips: FloatArray) -> tuple[tuple[float, float], ...]:
@@ -117,12 +134,3 @@ def _is_slip(
         return end - begin >= _LEAST_LAST_RUN
     restarted = bool(found.accepted[end - 1])
     return restarted or bool(found.squared[end] > _NO_RETURN * gate)
-
-
-def _slip(problem: MovementProblem, first: int, last: int, rate: float) -> FloatArray:
-    """(N, 3) variances of a slip at a rate (m/s, rad/s) after node `first`, until `last`."""
-    added = np.zeros((len(problem.times_s), 3))
-    passed = np.diff(problem.times_s[first : last + 1])
-    usual = (problem.times_s[last] - problem.times_s[first]) / max(len(passed), 1)
-    added[first + 1 : last + 1] = (rate**2 * usual * passed)[:, None]
-    return added
