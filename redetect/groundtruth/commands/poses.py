@@ -46,6 +46,13 @@ def perform(command: Poses) -> int:
     )
     if track.unknown_markers:
         print(f"{track.unknown_markers} markers found are not on the rig: ignored")
+        sets = {marker.dictionary for frame in frames for marker in frame.markers}
+        if others := sorted(sets - {rig.dictionary}):
+            print(
+                f"warning: markers of {', '.join(others)} were found, those in {rig_path} are of "
+                f"{rig.dictionary}",
+                file=sys.stderr,
+            )
     left_out = sum(int((~t.estimate.views).sum()) for t in track.times if t.pose and t.estimate)
     if left_out:
         print(f"{left_out} markers disagree with the others at their time: ignored")
