@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 
@@ -17,11 +19,14 @@ from redetect.groundtruth.markers.session import (
     read_network_frames,
     read_rig,
 )
-from redetect.groundtruth.markers.track import excess_of, report_entry, track_by_markers
+from redetect.groundtruth.markers.track import Track, excess_of, report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
 
+#: Share of markers that disagree, or times that have no pose, above which a warning is printed; a
+#: marker is wrong if more than a share of its views disagree, and hardly any others do.
+_MANY_LEFT_OUT, _MOST_LEFT_OUT, _OF_THE_WRONG = 0.1, 0.5, 0.8
 #: Squared residuals per degree of freedom above which a warning is printed.
 _MUCH_TOO_LARGE = 9.0
 
@@ -53,9 +58,7 @@ def perform(command: Poses) -> int:
                 f"{rig.dictionary}",
                 file=sys.stderr,
             )
-    left_out = sum(int((~t.estimate.views).sum()) for t in track.times if t.pose and t.estimate)
-    if left_out:
-        print(f"{left_out} markers disagree with the others at their time: ignored")
+    print_left_out(track, rig_path, network_path)
     if command.report is not None:
         lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
         write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
@@ -90,3 +93,28 @@ def perform(command: Poses) -> int:
         write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0
+
+
+def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
+    """Say how many markers disagree with others, and what may be wrong if they are many."""
+    seen: Counter[int] = Counter()
+    left_out: Counter[int] = Counter()
+    for tracked in track.times:
+        if tracked.pose and tracked.estimate:
+            for view, good in zip(tracked.views, tracked.estimate.views):
+                seen[view.marker.id] += 1
+                left_out[view.marker.id] += not good
+    total, failed = left_out.total(), track.counts["failed"]
+    if total:
+        print(f"{total} markers disagree with the others at their time: ignored")
+    if total <= _MANY_LEFT_OUT * seen.total() and failed <= _MANY_LEFT_OUT * len(track.times):
+        return
+    wrong = [m for m, count in sorted(left_out.items()) if count > _MOST_LEFT_OUT * seen[m]]
+    named = wrong and sum(left_out[m] for m in wrong) > _OF_THE_WRONG * total
+    first = f"the pose of marker {', '.join(map(str, wrong))}, or else " if named else ""
+    print(
+        f"warning: {total} of {seen.total()} markers disagree with others, and {failed} times "
+        f"have no pose since they do: {first}poses or widths of markers, in {rig_path}, or poses "
+        f"of cameras, in {network_path}, may be wrong",
+        file=sys.stderr,
+    )

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from redetect.groundtruth.commands.poses import print_left_out
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.refinement import chain_points
 from redetect.groundtruth.markers.session import (
@@ -188,3 +189,29 @@ def test_poses_from_markers_printed_too_large_say_that_they_are_off() -> None:
         assert found.covariances is not None
         own = np.linalg.inv(found.covariances[:, :2, :2])
         assert np.mean(np.einsum("ni,nij,nj->n", error, own, error)) / 2.0 < 1.8
+
+
+def test_a_marker_in_another_place_than_the_rig_says_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = box_rig()
+    places = rig.robot_from_marker.copy()
+    places[2, 0, 3] += 0.05
+    wrong = replace(rig, robot_from_marker=places)
+    network = network_of(hall_cameras(4))
+    rng = np.random.default_rng(9)
+    poses = np.stack([robot_pose(rng, 0.5) for _ in range(15)])
+    groups = group_by_time(frames_of(np.arange(15.0), poses, rig=rig), 0.005)
+    for used, widths, expected in (
+        (rig, 1.0, ""),
+        (wrong, 1.0, f"they do: the pose of marker {rig.ids[2]}, or else "),
+        (rig, 1.05, "they do: poses or widths of markers, in rig.json"),
+    ):
+        used = replace(used, widths_m=widths * used.widths_m)
+        # Markers that are 5 % larger and as much farther apart: a rig of another scale.
+        places = used.robot_from_marker.copy()
+        places[:, :3, 3] *= widths
+        used = replace(used, robot_from_marker=places)
+        track = track_by_markers(groups, used, network, PoseSettings())
+        print_left_out(track, Path("rig.json"), Path("network.json"))
+        assert expected in capsys.readouterr().err
