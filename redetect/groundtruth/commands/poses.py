@@ -19,7 +19,7 @@ from redetect.groundtruth.markers.session import (
     read_network_frames,
     read_rig,
 )
-from redetect.groundtruth.markers.track import Track, excess_of, report_entry, track_by_markers
+from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_bytes
 from redetect.storage.command_line import EXIT_ERROR
@@ -66,8 +66,6 @@ def perform(command: Poses) -> int:
         print("error: no pose", file=sys.stderr)
         return EXIT_ERROR
     print(f"squared residuals per degree of freedom: {track.reduced_cost:.2f}")
-    if raised := sum(excess_of(pose) > 1.0 for _, pose in track.posed):
-        print(f"{raised} poses have residuals that contradict their covariances: these were raised")
     if track.reduced_cost > _MUCH_TOO_LARGE:
         print(
             f"warning: residuals are {track.reduced_cost**0.5:.0f} times as large as expected: the "

@@ -22,6 +22,7 @@ NEAR_S = 1.0
 _WINDOW_S, _STEP_S = 1.0, 0.1
 _MOST_SAMPLES = 3000
 _FEWEST_SAMPLES = 20
+_LONGEST_SESSION_S = 1e6
 # Movements are not interpolated over longer gaps, or this many of a stream's usual intervals.
 _LONGEST_GAP_S, _INTERVALS = 1.0, 3.0
 # Errors of odometry's turns and ways, as a share of what is usual in the ground truth.
@@ -72,18 +73,20 @@ def _steps(poses: PlanarPoses) -> tuple[int, int]:
 
 
 class OffsetSearch:
-    """The search of offsets of one odometry.
+    """The search of offsets of one odometry with distinct times, within a bound either way."""
 
-    Parameters
-    ----------
-    odometry : PlanarPoses
-        The robot's own poses on its own clock, with distinct times.
-    largest_s : float
-        Bound of the offset, either way.
-    """
-
-    def __init__(self, odometry: PlanarPoses, largest_s: float) -> None:
-        self._own = Movements.of(odometry, *_steps(odometry))
+    def __init__(
+        self, odometry: PlanarPoses, parts: Sequence[PlanarPoses], largest_s: float
+    ) -> None:
+        """`parts` of the ground truth, in order, for which offsets will be searched."""
+        long = [part.times_s for part in parts if len(part) >= _FEWEST_SAMPLES]
+        # Single times may be years off, as of a clock that was not set yet.
+        reach = largest_s + _WINDOW_S
+        near = odometry
+        if long:
+            near = odometry.only(odometry.during(long[0][0] - reach, long[-1][-1] + reach))
+        few = len(near) < _FEWEST_SAMPLES or np.ptp(near.times_s) > _LONGEST_SESSION_S
+        self._own = None if few else Movements.of(near, *_steps(near))
         self._largest = int(np.ceil(largest_s / _STEP_S))
 
     def offset_s(self, parts: Sequence[PlanarPoses], around_s: float) -> float:
@@ -119,7 +122,7 @@ class OffsetSearch:
         before = np.cumsum(own, axis=1)
         after = before[:, -1:] - before
         parted = before.min(axis=0) + after.min(axis=0)
-        times = _STEP_S * (compared.at + self._own.first)
+        times = _STEP_S * (compared.at + compared.own.first)
         parted[np.minimum(times - times[0], times[-1] - times) < _LEAST_PART_S] = np.inf
         at = int(np.argmin(parted))
         jump = abs(int(np.argmin(before[:, at])) - int(np.argmin(after[:, at])))
@@ -145,6 +148,8 @@ class OffsetSearch:
         return bool(not np.isfinite(error) or error < _UNRELATED * compared.unrelated)
 
     def _compared(self, parts: Sequence[PlanarPoses]) -> _Compared | None:
+        if self._own is None:
+            return None
         moved = [Movements.of(part, *_steps(part)) for part in parts if len(part) > 1]
         at = [one.first - self._own.first + np.flatnonzero(one.known) for one in moved]
         if sum(map(len, at)) < _FEWEST_SAMPLES or not np.any(self._own.known):

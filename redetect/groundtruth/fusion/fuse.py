@@ -228,7 +228,8 @@ def fuse(
         repaired; if odometry has no distances.
     """
     chosen = settings or FuseSettings()
-    streams, raised = _with_jitter_covered(streams)
+    covered = {name: with_jitter_covered(last_of_each_time(one)) for name, one in streams.items()}
+    streams = {name: stream for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, chosen)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
@@ -295,7 +296,7 @@ def fuse(
         ),
         localisation=localisation,
         repaired=problem.repaired,
-        raised=raised,
+        raised={name: factor for name, (_, factor) in covered.items()},
         slips_s=slipped_intervals(problem.times_s, slips),
         pauses_s=tuple(
             (begin, end)
@@ -303,18 +304,6 @@ def fuse(
             if end > first and begin < last
         ),
     )
-
-
-def _with_jitter_covered(
-    streams: Mapping[str, PlanarPoses],
-) -> tuple[dict[str, PlanarPoses], dict[str, float]]:
-    """Streams with covariances raised to their jitter, and the factors of the deviations."""
-    covered, raised = {}, {}
-    for name, stream in streams.items():
-        covered[name], raised[name] = stream, 1.0
-        if stream.covariances is not None:
-            covered[name], raised[name] = with_jitter_covered(last_of_each_time(stream))
-    return covered, raised
 
 
 def _systematic_deviations(spread: FloatArray) -> FloatArray:

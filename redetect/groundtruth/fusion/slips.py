@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.fusion.kernels import AFTER_REJECTIONS, Innovations
 
 if TYPE_CHECKING:
@@ -99,12 +99,16 @@ def _added(slips: FloatArray, times_s: FloatArray, more: Sequence[_Slip]) -> Flo
 
 def slipped_intervals(times_s: FloatArray, slips: FloatArray) -> tuple[tuple[float, float], ...]:
     """Begin and end (s) of the slips; `times_s` (N,) of the nodes, `slips` (N, 3)."""
-    slipped = np.concatenate([[False], slips[:, 0] > 0.0, [False]]).astype(np.int8)
-    edges = np.flatnonzero(np.diff(slipped))
     return tuple(
         (float(times_s[max(begin - 1, 0)]), float(times_s[end - 1]))
-        for begin, end in zip(edges[::2], edges[1::2])
+        for begin, end in _stretches(slips[:, 0] > 0.0)
     )
+
+
+def _stretches(mask: BoolArray) -> list[tuple[int, int]]:
+    """Begin and end of the stretches of a mask (N,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
 
 
 def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
@@ -113,12 +117,7 @@ def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
     The measurement at which the filter restarted belongs to the run.
     """
     rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], rejected, [False]]).astype(np.int8)))
-    return [
-        (int(begin), int(end))
-        for begin, end in zip(edges[::2], edges[1::2])
-        if begin > 0 and end - begin >= _LEAST_RUN
-    ]
+    return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]
 
 
 def _is_slip(

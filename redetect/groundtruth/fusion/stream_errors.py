@@ -47,13 +47,13 @@ def roughness(values: FloatArray) -> float:
 
 
 def jitter_ratio(poses: PlanarPoses) -> float:
-    """Jitter of poses with covariances, in their standard deviations: about 1 if they are right.
+    """Jitter of poses in their standard deviations: about 1 if these are right.
 
-    The largest of x, y and the heading; 0 if the poses are too few or too slow to tell.
+    The largest of x, y and the heading; 0 if there are no covariances, or the poses are too few or
+    too slow to tell.
     """
-    assert poses.covariances is not None
     count = len(poses) - _ORDER
-    if count < _FEWEST:
+    if poses.covariances is None or count < _FEWEST:
         return 0.0
     intervals = np.diff(poses.times_s)
     usual = float(np.median(intervals))

@@ -111,13 +111,12 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     odometry = _smoothed(odometry)
-    if groundtruth.covariances is not None:
-        groundtruth, _ = with_jitter_covered(groundtruth)
-    search = OffsetSearch(odometry, bounds.largest_offset_s)
+    groundtruth, _ = with_jitter_covered(groundtruth)
     parts = [
         groundtruth.only(part)
         for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
     ]
+    search = OffsetSearch(odometry, parts, bounds.largest_offset_s)
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
     near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))

@@ -49,7 +49,6 @@ _FARTHEST_M = 1e3
 # readings scatter by this factor more than it, or than what rounding to millimetres explains.
 _FEWEST_FOR_NOISE = 20
 _BELIEVED_NOISE = 1.5
-_LEAST_NOISE_M = 1e-3
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
@@ -139,31 +138,19 @@ def read_joint_covariance(
     return JsonObject(f"{content.place}: covariance", joint).covariance("matrix", 3 * len(names))
 
 
-def measured_noise_m(ranges_mm: NDArray[np.uint16], max_range_m: float) -> float:
-    """Standard deviation of readings (m) from scans (N, readings) of an empty area, rounding
-    included.
-
-    That of a usual beam, which neither jumps along an edge nor is crossed; 0 if there are too few.
-    """
-    metres = ranges_mm * _MILLIMETRE
-    hit = (ranges_mm > 0) & (metres < max_range_m)
-    beams = hit.sum(axis=0) >= max(_FEWEST_FOR_NOISE, 0.5 * len(ranges_mm))
-    if not np.any(beams):
-        return 0.0
-    masked = np.where(hit[:, beams], metres[:, beams], np.nan)
-    return float(np.median(np.nanstd(masked, axis=0)))
-
-
 def with_measured_noise(
     scanners: Sequence[Scanner], empties: Sequence[Scans]
 ) -> tuple[Scanner, ...]:
     """The scanners; those whose readings of the empty area scatter far more than stated get that
-    noise.
+    noise: of a usual beam, which neither jumps along an edge nor is crossed.
     """
     found = []
     for scanner, empty in zip(scanners, empties):
-        measured = measured_noise_m(empty.ranges_mm, scanner.max_range_m)
-        if measured > _BELIEVED_NOISE * max(scanner.sigma_m, _LEAST_NOISE_M):
+        hit = scanner.has_return(empty.ranges_mm)
+        beams = hit.sum(axis=0) >= max(_FEWEST_FOR_NOISE, 0.5 * len(hit))
+        readings = np.where(hit[:, beams], empty.ranges_mm[:, beams] * _MILLIMETRE, np.nan)
+        measured = float(np.median(np.nanstd(readings, axis=0))) if np.any(beams) else 0.0
+        if measured > _BELIEVED_NOISE * max(scanner.sigma_m, _MILLIMETRE):
             scanner = replace(scanner, sigma_m=measured)
         found.append(scanner)
     return tuple(found)

@@ -227,16 +227,9 @@ def body_on_inexact_map(
 ) -> BodyOnMap | None:
     """The scanners' poses as one body, if the walls are off the map; None if the map is exact.
 
-    Parameters
-    ----------
-    scans : sequence of StillScan
-        One of each scanner.
-    alone : sequence of WallFit
-        Each scanner fitted to the map by itself; None if that failed.
-    whole : (scanners, 3) float64
-        Poses of their mutual alignment, after an alignment with the map as one body.
-    walls, narrowing_m, gate_m, weak_sigma_m
-        As for `fit_to_walls`.
+    `alone`: each scanner fitted to the map by itself; None if that failed. `whole` (scanners, 3):
+    poses of their mutual alignment, after an alignment with the map as one body. The others as for
+    `fit_to_walls`.
     """
     offsets = wall_offsets(scans, whole, walls)
     sigma = offsets.rms_m

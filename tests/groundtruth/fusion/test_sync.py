@@ -363,3 +363,12 @@ def test_slow_odometry_has_no_jumps() -> None:
     found = synchronise(odometry, truth)
     assert [segment.status for segment in found] == ["ok"]
     assert abs(found[0].offset_s - 0.2) < 0.02
+
+
+def test_a_first_row_from_before_the_clock_was_set_costs_nothing() -> None:
+    """A grid from 1970 on would fill the memory."""
+    odometry, truth = simulate(Clocks(start_s=1.2e9), seed=5)
+    early = PlanarPoses(np.zeros(1), np.zeros((1, 3)))
+    (found,) = synchronise(joined([early, odometry]), truth)
+    assert found.status == "ok"
+    assert abs(found.offset_s - 0.237) < 0.01
