@@ -242,6 +242,31 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     )
 
 
+def with_terms(
+    fit: Adjusted, points: Points, span: FloatArray, terms: FloatArray, sigmas: FloatArray
+) -> FloatArray:
+    """(14, 14) expected squared error of a fit's intrinsics if further terms are not exactly 0.
+
+    The terms have a normal prior about 0. One step of Gauss and Newton from the fit, of `span` and
+    terms together, gives their posterior; it is C + d d^T about the fit, where C is its covariance
+    and d its step.
+
+    Takes `span` (14, K), `terms` (14, m), and their priors' standard deviations (m,).
+    """
+    both = np.hstack([span, terms])
+    linear = _Problem(points, both, fit.sigma_px, Loss()).linear(fit.estimate)
+    # As in `_summary`: psi / mean psi'.
+    influence = linear.residual.copy()
+    counted = max(float(np.mean(fit.weights == 1.0)), 0.05)
+    influence[: fit.weights.size] *= fit.weights.ravel() / counted
+    equations = normal_equations(linear._replace(residual=influence))
+    prior = np.diag(np.concatenate([np.zeros(span.shape[1]), sigmas**-2.0]))
+    equations = replace(equations, corner=equations.corner + prior)
+    _, covariance = diagonal_blocks(equations, [])
+    step = both @ equations.step(0.0)[1]
+    return np.asarray(both @ covariance @ both.T + np.outer(step, step))
+
+
 def fit_points(
     start: Estimate, points: Points, settings: CalibrationSettings, lens: FreeLens, radius_m: float
 ) -> tuple[Adjusted, Points]:

@@ -25,6 +25,7 @@ from camera.calibration.consensus import (
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
+from camera.calibration.unfitted import with_unfitted_terms
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
@@ -183,6 +184,7 @@ def calibrate(
     names = tuple(names[v] for v in used)
     adjusted, points = tried[lens].adjusted, tried[lens].points
     demand_different_views(adjusted)
+    adjusted = with_unfitted_terms(adjusted, points, lens, settings)
     warnings = warnings_of(adjusted, points, normals_spread_deg(adjusted.estimate.rotations))
     if wrong:
         warnings.insert(0, f"{wrong} points excluded: they are far from their expected positions")
