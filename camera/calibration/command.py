@@ -211,9 +211,10 @@ def camera_of(calibration: Calibration) -> Camera:
 def describe(calibration: Calibration, camera: Camera) -> str:
     """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
+    free = np.any(calibration.lens.span(None) != 0.0, axis=1)
     lines = [
-        f"  {name:8s} {value:12.6g}" + (f" +- {s:.2g}" if s > 0.0 else "  (fixed)")
-        for name, value, s in zip(INTRINSICS, calibration.intrinsics, sigma)
+        f"  {name:8s} {value:12.6g}{_plus_minus(s, is_free=is_free)}"
+        for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free)
     ]
     views = len(calibration.names)
     lines.insert(0, f"intrinsics from {len(calibration.points.board)} points in {views} pictures:")
@@ -240,3 +241,10 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
+
+
+def _plus_minus(sigma: float, *, is_free: bool) -> str:
+    """How uncertain a parameter is."""
+    if sigma == 0.0:
+        return "  (fixed)"
+    return f" +- {sigma:.2g}" + ("" if is_free else "  (not fitted)")

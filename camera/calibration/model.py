@@ -136,19 +136,27 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
         return False
     coef, brown = lens_of(intrinsics)
     r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
-    factor = radial_factor(np.array(r_max), coef)
     border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
-    reach = r_max * factor
-    if any(brown):  # else it is the same in all directions
-        edge = r_max * _DIRECTIONS
-        edge = edge * factor + brown_shift(edge, brown)
-        reach = np.interp(
-            np.arctan2(border[:, 1], border[:, 0]),
-            np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
-            np.hypot(edge[:, 0], edge[:, 1]),
-            period=2.0 * np.pi,
-        )
-    return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + _FOLD_MARGIN) < reach))
+    # Short of the limit, too: a pole there maps all of the image beyond it to nearly one radius.
+    return all(
+        np.all(np.hypot(border[:, 0], border[:, 1]) * times < _reach(r, coef, brown, border))
+        for r, times in ((r_max, 1.0 + _FOLD_MARGIN), (r_max * (1.0 - _FOLD_MARGIN), 1.0))
+    )
+
+
+def _reach(r: float, coef: Coef, brown: Brown, towards: FloatArray) -> FloatArray:
+    """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
+    factor = radial_factor(np.array(r), coef)
+    if not any(brown):  # the same in all directions
+        return np.asarray(r * factor)
+    edge = r * _DIRECTIONS
+    edge = edge * factor + brown_shift(edge, brown)
+    return np.interp(
+        np.arctan2(towards[:, 1], towards[:, 0]),
+        np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
+        np.hypot(edge[:, 0], edge[:, 1]),
+        period=2.0 * np.pi,
+    )
 
 
 def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:

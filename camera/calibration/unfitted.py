@@ -26,7 +26,7 @@ from redetect.array_types import FloatArray
 
 # Standard deviation of what a term that is not free does in the farthest corner: a share of the
 # fitted distortion, and a part of the radius. Terms that do more are seen in most pictures.
-_SHARE = 0.1
+_SHARE = 0.15
 _LEAST = 0.003
 # Standard deviation of p1 and p2: lenses are decentred by this much unnoticed.
 _TANGENTIAL_SIGMA = 5e-4

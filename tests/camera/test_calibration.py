@@ -313,6 +313,12 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
         decentred = plain.copy()
         decentred[9:11] = (0.6 * p, -0.8 * p)
         assert is_possible(decentred, 768, 288) == possible
+    # A pole, almost cancelled, at r = 0.89: all pixels beyond would be there.
+    coef = [0.0085, -0.0096, -2.545, 2.365, -0.861]
+    pole = np.array([268.0, 268.0, 239.0, 319.0, *coef, *[0.0] * 5])
+    assert not is_possible(pole, 480, 640)
+    pole[2:4] = 99.0
+    assert is_possible(pole, 200, 200)
     fold = Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
     assert fold.seen_share < 1.0
 
