@@ -8,7 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, fit_points
+from camera.calibration.adjustment import (
+    Adjusted,
+    Estimate,
+    Points,
+    adjust,
+    circle_shifts,
+    fit_points,
+    project_estimate,
+)
 from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
 from redetect.array_types import IntArray
 from redetect.least_squares.solver import StartError
@@ -19,6 +27,9 @@ _FOLDS = 8
 _HOLDOUT_TOLERANCE = 1e-6
 # An additional coefficient must lower the sum of squared hold-out errors by this many variances.
 _WORTH = 4.0
+# With fewer coefficients than the lens has, a fold can bar the way to a fit of more: those are also
+# fitted from the fullest fit, if their residuals are this many times as large as its.
+_STUCK, _CAN_BE_STUCK = 3.0, 2
 # The two tangential terms must lower it by `_TANGENTIAL_WORTH` variances and differ from 0 by
 # `_TANGENTIAL_SIGNIFICANCE` variances: small systematic errors of a board's points can look like
 # decentering.
@@ -47,14 +58,14 @@ def choose_lens(
 ) -> tuple[FreeLens, Candidates]:
     """Fit with an increasing number of free coefficients, and choose.
 
-    The choice is the fewest radial coefficients whose hold-out error is not worse than the best.
+    `start` is a fit with all of them. The choice is the fewest radial coefficients whose hold-out error is not worse than the best.
     Tangential terms are added if they lower that error by more than they would by chance and are
     significant; then the radial coefficients are chosen again. The polynomial replaces the rational
     function if, with the same tangential terms, it needs fewer coefficients for an error that is
     not worse, or lowers the error by more than it would by chance. Whether it needs tangential
     terms is then tested as well.
     """
-    fitted = partial(_fitted, points, settings, radius_m)
+    fitted = partial(_fitted, points, settings, radius_m, start)
     chosen, tried = _chosen_of_a_kind(fitted, start, settings)
     if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
@@ -104,16 +115,30 @@ def _fitted(
     points: Points,
     settings: CalibrationSettings,
     radius_m: float,
+    full: Estimate,
     estimate: Estimate,
     lenses: Iterable[FreeLens],
 ) -> Candidates:
-    """Each lens fitted from where the last ended."""
+    """Each lens fitted from where the last ended, or from the fullest fit if that got stuck."""
     tried: Candidates = {}
+    much = _STUCK * _rms_px(full, points, radius_m)
     for lens in lenses:
         adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
+        if lens.coefficients >= _CAN_BE_STUCK and adjusted.rms_px > much:
+            again, seen_again = fit_points(full, points, settings, lens, radius_m)
+            fixed = again.estimate.intrinsics[np.all(lens.span(settings.aspect) == 0.0, axis=1)]
+            if again.rms_px < adjusted.rms_px and not fixed.any():
+                adjusted, seen = again, seen_again
         estimate = adjusted.estimate
         tried[lens] = Candidate(adjusted, seen, holdout_error(estimate, seen, settings, lens))
     return tried
+
+
+def _rms_px(estimate: Estimate, points: Points, radius_m: float) -> float:
+    residuals = points.pixels - project_estimate(estimate, points)[0]
+    if radius_m > 0.0:
+        residuals = residuals - circle_shifts(estimate, points, radius_m)
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _fewest_needed(tried: Candidates) -> FreeLens:

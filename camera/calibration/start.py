@@ -16,13 +16,17 @@ from redetect.least_squares.solver import StartError
 
 # Focal lengths that are tried, in widths of the image: from 130 to 6 degrees across.
 _FOCAL_WIDTHS = (0.25, 0.4, 0.6, 0.9, 1.4, 2.2, 4.0, 8.0)
+_FISHEYE_WIDTHS = (0.25, 0.4, 0.6)
+# The coefficients of nearly r f(r) = arctan(r): from a pinhole, or one coefficient, which folds
+# where such a lens still sees, no descent leads to a fisheye lens.
+_FISHEYE = (0.0, -1.0 / 3.0, 0.0, 0.6, 0.0)
 # Number of views used to compare starts.
 _FEW_VIEWS = 10
 _LOOSE = 1e-4
 
 
 def first_estimate(points: Points, aspect: float | None) -> Estimate:
-    """The best of some focal lengths, with at most one coefficient.
+    """The best of some focal lengths, with at most one coefficient, or those of a fisheye lens.
 
     `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with). Views that contradict the
     others may be left with a pose from which their points are not seen.
@@ -31,12 +35,13 @@ def first_estimate(points: Points, aspect: float | None) -> Estimate:
     few = points.of(chosen)
     ratio = 1.0 if aspect is None else aspect
     best, lowest = None, (np.inf, 0)
-    for widths in _FOCAL_WIDTHS:
+    starts = [(widths, (0.0,) * 5, FreeLens(1)) for widths in _FOCAL_WIDTHS]
+    starts += [(widths, _FISHEYE, FreeLens(0)) for widths in _FISHEYE_WIDTHS]
+    for widths, coef, lens in starts:
         focal = widths * points.width
-        intrinsics = np.array(
-            [focal, ratio * focal, 0.5 * (points.width - 1), 0.5 * (points.height - 1), *[0.0] * 10]
-        )
-        found = _fitted_where_seen(board_poses(intrinsics, few)[0], few, FreeLens(1).span(ratio))
+        middle = 0.5 * (points.width - 1), 0.5 * (points.height - 1)
+        intrinsics = np.array([focal, ratio * focal, *middle, *coef, *[0.0] * 5])
+        found = _fitted_where_seen(board_poses(intrinsics, few)[0], few, lens.span(ratio))
         if found is None:
             continue
         fit, seen = found
