@@ -58,12 +58,12 @@ def choose_lens(
 ) -> tuple[FreeLens, Candidates]:
     """Fit with an increasing number of free coefficients, and choose.
 
-    `start` is a fit with all of them. The choice is the fewest radial coefficients whose hold-out error is not worse than the best.
-    Tangential terms are added if they lower that error by more than they would by chance and are
-    significant; then the radial coefficients are chosen again. The polynomial replaces the rational
-    function if, with the same tangential terms, it needs fewer coefficients for an error that is
-    not worse, or lowers the error by more than it would by chance. Whether it needs tangential
-    terms is then tested as well.
+    `start` is a fit with all of them. The choice is the fewest radial coefficients whose hold-out
+    error is not worse than the best. Tangential terms are added if they lower that error by more
+    than they would by chance and are significant; then the radial coefficients are chosen again.
+    The polynomial replaces the rational function if, with the same tangential terms, it needs fewer
+    coefficients for an error that is not worse, or lowers the error by more than it would by
+    chance. Whether it needs tangential terms is then tested as well.
     """
     fitted = partial(_fitted, points, settings, radius_m, start)
     chosen, tried = _chosen_of_a_kind(fitted, start, settings)
