@@ -170,8 +170,8 @@ def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
     if len(indices) < _FEWEST_POINTS:
         raise CalibrationError(
             f"{len(indices)} corners of a {board} in the image: expected at least "
-            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers sharp "
-            "and large enough to be read?"
+            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
+            "sharp and large enough to be read?"
         )
     return indices, pixels
 

@@ -69,6 +69,7 @@ def test_the_fewest_coefficients_that_explain_what_was_held_out(
         points: Points,
         settings: CalibrationSettings,
         radius_m: float,
+        full: Estimate,
         start: Estimate,
         lenses: Iterable[FreeLens],
     ) -> Candidates:
