@@ -29,6 +29,9 @@ _RADIUS_IMAGES = 12
 #: Runs of at least `_FEWEST_FRAMES` frames get a warning if hardly any discs are found, and if the
 #: logarithms of the likely and the given radius differ by `_OTHER_RADIUS`.
 _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
+#: Number of images in which the discs' size is compared with their radius, and the difference of
+#: logarithms that is reported: correct calibrations show up to 0.045.
+_COMPARED_IMAGES, _OTHER_HEIGHT = 4, 0.07
 
 
 def perform(command: DetectorFlags) -> int:
@@ -140,12 +143,12 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     return replace(settings, radius_m=round(found.radius_m, 4))
 
 
-def _some_images(run: Run) -> Iterator[ByteArray]:
+def _some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
     """Images spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--find-radius: expected recorded images, which can be read twice")
-    step = max(1, run.frames.expected // _RADIUS_IMAGES)
-    for frame in SomeFrames(run.frames, step * _RADIUS_IMAGES, step):
+    step = max(1, run.frames.expected // count)
+    for frame in SomeFrames(run.frames, step * count, step):
         with suppress(FrameError):
             yield read_image(frame, run.camera)
 
@@ -252,8 +255,27 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
     seen = summary.frames - summary.failed
     hardly_any = seen >= _FEWEST_FRAMES and 3 * found["discs"] < seen
     none = not found["discs"] and seen > 0
-    if plan.circles is not None and plan.circles.refine and (hardly_any or none):
+    if plan.circles is None or not plan.circles.refine:
+        return
+    if hardly_any or none:
         yield from _hints_on_discs(job, plan.circles, summary)
+    elif found["discs"] >= seen >= _FEWEST_FRAMES:
+        yield from _hint_on_height(job, plan.circles)
+
+
+def _hint_on_height(job: Job, settings: CircleSettings) -> Iterator[str]:
+    if not isinstance(job.run, Run) or job.run.frames.expected is None:
+        return
+    from detect.discs.radius import ratio_of_radii
+
+    ratio = ratio_of_radii(list(_some_images(job.run, _COMPARED_IMAGES)), job.run.camera, settings)
+    if abs(math.log(ratio)) > _OTHER_HEIGHT:
+        size, height = ("larger", "lower") if ratio > 1.0 else ("smaller", "higher")
+        yield (
+            f"the discs look {100.0 * abs(ratio - 1.0):.0f} % {size} than their radius of "
+            f"{settings.radius_m:g} m. If that is right, the camera is about as much {height} than "
+            "calibrated, and all positions are wrong by as much: measure discs and height"
+        )
 
 
 def _hints_on_discs(job: Job, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
