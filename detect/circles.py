@@ -136,11 +136,7 @@ def _by_rims(
 ) -> CircleDetections:
     """The default detector: finds discs by their rims and locates them by fits."""
     noise = estimate_noise(image, _NOISE_ROWS)
-    candidates = candidates_of(image, table, settings, noise)
-    judgement = judged(image, camera, settings, candidates, noise)
-    log_odds = adjusted_log_odds(judgement, settings)
-    best = best_discs(judgement, log_odds, settings)
-    discs, log_odds = judgement.where(best), log_odds[best]
+    discs, log_odds = judged_discs(image, camera, table, settings, noise)
     scene = scene_of(image, camera, table, settings, noise)
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     seen_at = np.rint(project_floor_points(_numbers(camera), floor_xy))
@@ -158,6 +154,17 @@ def _by_rims(
         quality=discs.quality[order],
         evidence=log_odds[order],
     )
+
+
+def judged_discs(
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
+) -> tuple[Judgement, FloatArray]:
+    """The candidates that are discs, and their log-odds; parameters as for `candidates_of`."""
+    candidates = candidates_of(image, table, settings, noise)
+    judgement = judged(image, camera, settings, candidates, noise)
+    log_odds = adjusted_log_odds(judgement, settings)
+    best = best_discs(judgement, log_odds, settings)
+    return judgement.where(best), log_odds[best]
 
 
 def candidates_of(

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from detect.circles import detect_circles, vote_shape
+from detect.circles import detect_circles, judged_discs, vote_shape
+from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from redetect.array_types import GreyImage
@@ -48,7 +49,12 @@ def find_radius(
     evidence, discs = np.zeros(len(radii)), np.zeros(len(radii), np.int64)
 
     def try_radius(k: int) -> None:
-        evidence[k], discs[k] = _evidence(images, camera, settings, float(radii[k]))
+        tried = replace(settings, radius_m=float(radii[k]), refine=True)
+        table = build_vote_table(camera, vote_shape(tried))
+        for image in images:
+            found = detect_circles(image, camera, table, tried)
+            evidence[k] += found.evidence.sum()
+            discs[k] += len(found)
 
     def best_radius() -> int:
         return int(np.argmax(np.where(discs >= LEAST_DISCS, evidence, -np.inf)))
@@ -61,30 +67,24 @@ def find_radius(
     for k in {max(coarse - 1, 0), min(coarse + 1, count)} - {coarse}:
         try_radius(k)
     best = best_radius()
-    shift = _peak(*evidence[best - 1 : best + 2]) if 0 < best < count else 0.0
+    shift = 0.0
+    if 0 < best < count:
+        before, here, after = evidence[best - 1 : best + 2]
+        shift = 0.5 * (after - before) / (2.0 * here - before - after)
     radius_m = float(radii[best] * FACTOR**shift)
     # If the camera's tilt is not as calibrated, discs look some percent larger or smaller.
     sigma_m = 0.5 * radius_m * math.log(FACTOR)
     return RadiusEstimate(radius_m, sigma_m, int(discs[best]))
 
 
-def ratio_of_radii(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> float:
-    """How large discs look, as a share of the radius in the settings: 0.87 to 1.15."""
-    radii = settings.radius_m * FACTOR ** np.arange(-1.0, 2.0)
-    evidence = [_evidence(images, camera, settings, float(radius))[0] for radius in radii]
-    return float(FACTOR ** np.clip(_peak(*evidence), -1.5, 1.5))
+def ratio_of_radii(
+    images: Sequence[GreyImage], camera: Camera, settings: CircleSettings
+) -> float | None:
+    """How large discs look: the median radius of their rims, as a share of that in the settings.
 
-
-def _evidence(
-    images: Sequence[GreyImage], camera: Camera, settings: CircleSettings, radius_m: float
-) -> tuple[float, int]:
-    """Total evidence of the discs of a radius, and their number."""
-    tried = replace(settings, radius_m=radius_m, refine=True)
-    table = build_vote_table(camera, vote_shape(tried))
-    found = [detect_circles(image, camera, table, tried) for image in images]
-    return float(sum(each.evidence.sum() for each in found)), sum(map(len, found))
-
-
-def _peak(before: float, here: float, after: float) -> float:
-    """Where a parabola over -1, 0 and 1 is highest."""
-    return 0.5 * (after - before) / max(2.0 * here - before - after, 1e-9)
+    None for fewer than `LEAST_DISCS` discs.
+    """
+    table = build_vote_table(camera, vote_shape(settings))
+    seen = [judged_discs(each, camera, table, settings, estimate_noise(each)) for each in images]
+    radii = np.concatenate([discs.radius for discs, _ in seen])
+    return float(np.median(radii)) / settings.radius_m if len(radii) >= LEAST_DISCS else None
