@@ -86,5 +86,5 @@ def ratio_of_radii(
     """
     table = build_vote_table(camera, vote_shape(settings))
     seen = [judged_discs(each, camera, table, settings, estimate_noise(each)) for each in images]
-    radii = np.concatenate([discs.radius for discs, _ in seen])
+    radii = np.concatenate([np.empty(0), *(discs.radius for discs, _ in seen)])
     return float(np.median(radii)) / settings.radius_m if len(radii) >= LEAST_DISCS else None
