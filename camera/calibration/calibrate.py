@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -26,13 +27,16 @@ from camera.calibration.consensus import (
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
 from camera.calibration.unfitted import with_unfitted_terms
-from camera.errors import CalibrationError
+from camera.errors import CalibrationError, CameraError
+from camera.uncertainty import UNPOSED, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
 _LARGEST_RMS_PX = 1.0
 _LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+# Calibrations are warned about if the usual standard deviation of the projection is above this.
+_LARGEST_SIGMA_PX = 0.5
 # Residual, in standard deviations, beyond which a point is an outlier.
 _WRONG_POINT = 8.0
 # Outliers are not excluded if fewer points of a picture remain.
@@ -76,7 +80,23 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
             "45 deg in different directions"
         )
     warnings += coverage_warnings(fit.estimate.intrinsics, points)
+    with suppress(CameraError):  # an impossible camera is an error elsewhere
+        warnings += uncertainty_warnings(fit, points)
     return warnings
+
+
+def uncertainty_warnings(fit: Adjusted, points: Points) -> list[str]:
+    """A warning if the projection is uncertain in most of the image."""
+    size = {"width": points.width, "height": points.height}
+    camera = with_intrinsics(UNPOSED, fit.estimate.intrinsics, **size)
+    usual = float(np.median(projection_sigma(camera, fit.covariance)))
+    if usual <= _LARGEST_SIGMA_PX:
+        return []
+    return [
+        f"the projection is uncertain by {usual:.1f} px (median over the image): take more "
+        "pictures, with tilted boards, out to the corners; a lens that sees more than 85 deg off "
+        "its axis there is not described well"
+    ]
 
 
 def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:

@@ -382,6 +382,18 @@ def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> No
         assert any("do not fit" in text for text in warnings_of(worse, points, 40.0)) == told
 
 
+def test_an_uncertain_projection_is_told(published_camera: Camera) -> None:
+    R, t = board_poses(published_camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
+    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
+    points = points_of(seen_views(published_camera, 1, 0.1, seed=8), BOARD, (768, 288))
+    fit = adjust(truth, points, np.zeros((COUNT, 0)))
+    for sigma, told in ((0.001, False), (0.1, True)):
+        covariance = np.zeros((COUNT, COUNT))
+        covariance[11, 11] = sigma**2
+        worse = replace(fit, covariance=covariance)
+        assert any("is uncertain by" in text for text in warnings_of(worse, points, 40.0)) == told
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
