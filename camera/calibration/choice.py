@@ -17,7 +17,14 @@ from camera.calibration.adjustment import (
     fit_points,
     project_estimate,
 )
-from camera.calibration.model import COUNT, INTRINSICS, TANGENTIAL, CalibrationSettings, FreeLens
+from camera.calibration.model import (
+    COUNT,
+    INTRINSICS,
+    TANGENTIAL,
+    CalibrationSettings,
+    FreeLens,
+    has_pole,
+)
 from redetect.array_types import IntArray
 from redetect.least_squares.solver import StartError
 
@@ -130,7 +137,13 @@ def _fitted(
             if again.rms_px < adjusted.rms_px and not fixed.any():
                 adjusted, seen = again, seen_again
         estimate = adjusted.estimate
-        tried[lens] = Candidate(adjusted, seen, holdout_error(estimate, seen, settings, lens))
+        # A lens with a pole is good for the next start, but useless where there are no points.
+        error = (
+            float("inf")
+            if has_pole(estimate.intrinsics, points.width, points.height)
+            else holdout_error(estimate, seen, settings, lens)
+        )
+        tried[lens] = Candidate(adjusted, seen, error)
     return tried
 
 

@@ -227,7 +227,8 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     )
     for lens, error in calibration.holdout_px.items():
         mark = " <- chosen" if lens == calibration.lens else ""
-        lines.append(f"RMS in pictures held out, coefficients {lens}: {error:.3f} px{mark}")
+        rms = f"{error:.3f} px" if np.isfinite(error) else "not usable: a fold or pole in the image"
+        lines.append(f"RMS in pictures held out, coefficients {lens}: {rms}{mark}")
     spread = projection_sigma(camera, calibration.adjusted.covariance)
     lines.append(
         f"standard deviation of the projection: {np.median(spread):.3f} px (median over the "

@@ -57,6 +57,8 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's border must be seen at radii that stay below the fold by this share.
 _FOLD_MARGIN = 0.01
+# A pole must be farther than the image by this share; before a fold that is 1.5 % in the image.
+_POLE_MARGIN = 0.1
 # Directions in which a lens's limit is computed, and number of places on each side of the image.
 _ANGLES = np.linspace(-np.pi, np.pi, 128)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -134,14 +136,26 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
     """Whether scales are positive, and the image lies within what the lens sees up to its fold."""
     if not np.all(np.isfinite(intrinsics)) or min(intrinsics[:2]) <= 0.0:
         return False
+    return _is_within(intrinsics, width, height, share=1.0, margin=_FOLD_MARGIN)
+
+
+def has_pole(intrinsics: FloatArray, width: int, height: int) -> bool:
+    """Whether a possible lens has a pole in the image, or near it.
+
+    All of the image beyond a pole would be seen at nearly one radius.
+    """
+    return not _is_within(intrinsics, width, height, share=1.0 - _POLE_MARGIN, margin=0.0)
+
+
+def _is_within(
+    intrinsics: FloatArray, width: int, height: int, *, share: float, margin: float
+) -> bool:
+    """Whether the image, enlarged by a margin, is within a share of the largest radius."""
     coef, brown = lens_of(intrinsics)
-    r_max = min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
+    r = share * min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
     border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
-    # Short of the limit, too: a pole there maps all of the image beyond it to nearly one radius.
-    return all(
-        np.all(np.hypot(border[:, 0], border[:, 1]) * times < _reach(r, coef, brown, border))
-        for r, times in ((r_max, 1.0 + _FOLD_MARGIN), (r_max * (1.0 - _FOLD_MARGIN), 1.0))
-    )
+    reach = _reach(r, coef, brown, border)
+    return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + margin) < reach))
 
 
 def _reach(r: float, coef: Coef, brown: Brown, towards: FloatArray) -> FloatArray:

@@ -28,6 +28,7 @@ from camera.calibration.model import (
     COUNT,
     CalibrationSettings,
     FreeLens,
+    has_pole,
     is_possible,
     pixels_of_points,
     project_points,
@@ -316,9 +317,11 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
     # A pole, almost cancelled, at r = 0.89: all pixels beyond would be there.
     coef = [0.0085, -0.0096, -2.545, 2.365, -0.861]
     pole = np.array([268.0, 268.0, 239.0, 319.0, *coef, *[0.0] * 5])
-    assert not is_possible(pole, 480, 640)
+    assert is_possible(pole, 480, 640)
+    assert has_pole(pole, 480, 640)
     pole[2:4] = 99.0
-    assert is_possible(pole, 200, 200)
+    assert not has_pole(pole, 200, 200)
+    assert not has_pole(plain, 768, 288)
     fold = Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
     assert fold.seen_share < 1.0
 
