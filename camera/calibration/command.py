@@ -227,8 +227,8 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     )
     for lens, error in calibration.holdout_px.items():
         mark = " <- chosen" if lens == calibration.lens else ""
-        rms = f"{error:.3f} px" if np.isfinite(error) else "not usable: a fold or pole in the image"
-        lines.append(f"RMS in pictures held out, coefficients {lens}: {rms}{mark}")
+        held = f"{error:.3f} px" if np.isfinite(error) else "none: a fold or pole in the image"
+        lines.append(f"RMS in pictures held out, coefficients {lens}: {held}{mark}")
     spread = projection_sigma(camera, calibration.adjusted.covariance)
     lines.append(
         f"standard deviation of the projection: {np.median(spread):.3f} px (median over the "
