@@ -26,6 +26,7 @@ from camera.calibration.calibrate import (
 )
 from camera.calibration.model import (
     COUNT,
+    INTRINSICS,
     CalibrationSettings,
     FreeLens,
     has_pole,
@@ -323,6 +324,19 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
     assert not has_pole(plain, 768, 288)
     fold = Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
     assert fold.seen_share < 1.0
+
+
+def test_a_lens_with_a_pole_is_not_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = Camera(640, 480, 480.0, 480.0, 322.0, 238.0, (0.0, -0.2, 0.0, 0.3, 0.0), IDENTITY)
+    views = seen_views(truth, 5, 0.1, seed=3)
+    settings = CalibrationSettings(tangential=False, polynomial=False)
+    assert calibrate(views, BOARD, (640, 480), settings).lens == FreeLens(2)
+    # As if these had one.
+    b2 = INTRINSICS.index("b2")
+    monkeypatch.setattr("camera.calibration.choice.has_pole", lambda lens, *_: lens[b2] != 0.0)
+    found = calibrate(views, BOARD, (640, 480), settings)
+    assert found.lens == FreeLens(1)
+    assert found.holdout_px[FreeLens(2)] == np.inf
 
 
 def test_free_span_ties_the_scales() -> None:
