@@ -227,7 +227,7 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     )
     for lens, error in calibration.holdout_px.items():
         mark = " <- chosen" if lens == calibration.lens else ""
-        held = f"{error:.3f} px" if np.isfinite(error) else "none: a fold or pole in the image"
+        held = f"{error:.3f} px" if np.isfinite(error) else "none: a pole or fold in the image"
         lines.append(f"RMS in pictures held out, coefficients {lens}: {held}{mark}")
     spread = projection_sigma(camera, calibration.adjusted.covariance)
     lines.append(

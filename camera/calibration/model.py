@@ -57,7 +57,7 @@ FREE_COEFFICIENTS: tuple[tuple[str, ...], ...] = (
 
 # The image's border must be seen at radii that stay below the fold by this share.
 _FOLD_MARGIN = 0.01
-# A pole must be farther than the image by this share; before a fold that is 1.5 % in the image.
+# A pole must be farther than the image by this share.
 _POLE_MARGIN = 0.1
 # Directions in which a lens's limit is computed, and number of places on each side of the image.
 _ANGLES = np.linspace(-np.pi, np.pi, 128)
@@ -144,7 +144,11 @@ def has_pole(intrinsics: FloatArray, width: int, height: int) -> bool:
 
     All of the image beyond a pole would be seen at nearly one radius.
     """
-    return not _is_within(intrinsics, width, height, share=1.0 - _POLE_MARGIN, margin=0.0)
+    size = width, height
+    # Before a pole the image grows far beyond its border, before a fold by 1.5 %.
+    return not _is_within(intrinsics, *size, share=1.0 - _POLE_MARGIN, margin=0.0) and _is_within(
+        intrinsics, *size, share=1.0, margin=_POLE_MARGIN
+    )
 
 
 def _is_within(

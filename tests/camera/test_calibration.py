@@ -321,7 +321,11 @@ def test_a_fold_inside_the_image_is_not_possible() -> None:
     assert has_pole(pole, 480, 640)
     pole[2:4] = 99.0
     assert not has_pole(pole, 200, 200)
-    assert not has_pole(plain, 768, 288)
+    # A fold barely outside the image is none.
+    folding = plain.copy()
+    folding[5] = -0.133
+    assert is_possible(folding, 768, 288)
+    assert not has_pole(folding, 768, 288)
     fold = Camera(768, 288, 460.0, 230.0, 384.0, 144.0, (0.0, -0.4, 0.0, 0.0, 0.0), IDENTITY)
     assert fold.seen_share < 1.0
 
