@@ -19,9 +19,9 @@ import numpy as np
 
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
+from redetect.messages import excerpt
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_text
-from redetect.storage.messages import excerpt
 
 CLASS_NAME = "SmRadialDistortedCamera"
 #: More than any calibration has.

@@ -6,7 +6,7 @@ Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupt
 from __future__ import annotations
 
 from camera.options import Board, Calibrate, Convert, Floor, Level
-from redetect.storage.command_line import Program
+from redetect.command_line import Program
 
 PROGRAM = Program(
     "camera",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from redetect.storage.bounds import MaybePath
+from redetect.bounds import MaybePath
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 Format = Literal["cam", "opencv", "ros", "kalibr", "colmap"]

@@ -12,7 +12,7 @@ def main() -> int:
     try:
         from detect.cli import main as command_line
     except KeyboardInterrupt:
-        from redetect.storage.command_line import say_interrupted
+        from redetect.command_line import say_interrupted
 
         return say_interrupted()
     return command_line()

@@ -44,8 +44,8 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
 from detect.terminal import show_announcements
-from redetect.storage.command_line import EXIT_INTERRUPTED, Program, all_but
-from redetect.storage.messages import is_quiet
+from redetect.command_line import EXIT_INTERRUPTED, Program, all_but
+from redetect.messages import is_quiet
 
 #: Flags that only `--help-all` shows.
 EXPERT: dict[type, frozenset[str]] = {

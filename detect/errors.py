@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from redetect.storage.messages import OneLineError
+from redetect.messages import OneLineError
 
 #: Exit code if some frames could not be processed; the others were.
 EXIT_FRAMES_FAILED = 3

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal, NamedTuple, get_type_hints
 
 from detect.errors import DetectError
-from redetect.storage.bounds import (
+from redetect.bounds import (
     Bounds,
     LimitOr0,
     NotNegative,

@@ -14,7 +14,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from detect.errors import CompareError, DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
-from redetect.storage.bounds import (
+from redetect.bounds import (
     ABOVE_0,
     NOT_NEGATIVE,
     SHARE,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from detect.errors import DetectError
-from redetect.storage.bounds import (
+from redetect.bounds import (
     FINITE,
     PROBABILITY,
     Bounds,

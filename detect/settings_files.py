@@ -17,8 +17,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
-from redetect.storage.bounds import MaybeFloat
-from redetect.storage.messages import excerpt
+from redetect.bounds import MaybeFloat
+from redetect.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
 Settings = TypeVar("Settings", CircleSettings, LineSettings, MarkerSettings)

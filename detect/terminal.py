@@ -15,7 +15,7 @@ from functools import cache
 
 from detect.errors import EXIT_FRAMES_FAILED
 from redetect.interrupts import raise_if_interrupted
-from redetect.storage.messages import is_quiet
+from redetect.messages import is_quiet
 
 _log = logging.getLogger("redetect")
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from detect import __version__
 from detect.comparison.compare import compare_frames, rows_beside
 from detect.comparison.result import DiscComparison
 from detect.errors import DetectError
@@ -34,6 +33,7 @@ from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
 from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
+from redetect import __version__
 from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file

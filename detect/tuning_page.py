@@ -35,9 +35,9 @@ from detect.sources.interface import Run, RunFrame, read_image
 from redetect.array_types import GreyImage
 from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
+from redetect.messages import OneLineError
 from redetect.plane import ellipses
 from redetect.storage import OutputExistsError, write_bytes
-from redetect.storage.messages import OneLineError
 
 SETTINGS_NAME, LABELS_NAME = "tuned.json", "labels.circles"
 #: Longest request: some hundred settings, and labels of every frame.

@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT))
-from redetect.storage import __version__  # noqa: E402
+from redetect import __version__  # noqa: E402
 
 project = "redetect"
 release = version = __version__

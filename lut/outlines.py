@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
+from redetect.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.compiled import kernel
-from redetect.storage.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
-from redetect.storage.messages import OneLineError
+from redetect.messages import OneLineError
 
 #: Least share of an outline's samples inside the image.
 MIN_SHARE_INSIDE = 0.5

@@ -16,7 +16,7 @@ import numpy as np
 from camera import Camera
 from lut.outlines import TableError, demand_above_floor, floor_positions, pixels_within, size_down
 from redetect.array_types import Float32Array, FloatArray, IntArray
-from redetect.storage.bounds import Limit, Positive, demand_fields, whole
+from redetect.bounds import Limit, Positive, demand_fields, whole
 
 #: Width of a cell, radii, and its least length ahead, pixels.
 _CELL_RADII, _CELL_PX = 0.25, 0.8

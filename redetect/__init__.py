@@ -14,7 +14,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from redetect.storage import __version__ as __version__
+#: The version of this project, defined only here.
+__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from camera import Camera
@@ -26,14 +27,14 @@ if TYPE_CHECKING:
     from redetect.interface.maps import map_landmarks as map
     from redetect.interface.recordings import Recording, compare
     from redetect.interface.recordings import open_recording as open
-    from redetect.storage.messages import OneLineError as Error
+    from redetect.messages import OneLineError as Error
 
 _PLACES = {
     "Camera": ("camera", "Camera"),
     "CircleSettings": ("detect.settings", "CircleSettings"),
     "CompareOptions": ("detect.options", "CompareOptions"),
     "Detection": ("redetect.interface.detection", "Detection"),
-    "Error": ("redetect.storage.messages", "OneLineError"),
+    "Error": ("redetect.messages", "OneLineError"),
     "Explanation": ("redetect.interface.detection", "Explanation"),
     "LineSettings": ("detect.line_settings", "LineSettings"),
     "Localization": ("redetect.interface.maps", "Localization"),

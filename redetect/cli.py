@@ -13,8 +13,8 @@ from importlib import import_module
 from operator import or_
 from typing import Annotated, Any
 
-from redetect.storage import __version__
-from redetect.storage.command_line import FOR_ALL, end_with, no_such
+from redetect import __version__
+from redetect.command_line import FOR_ALL, end_with, no_such
 
 PROGRAMS = {
     "camera": "camera.cli",

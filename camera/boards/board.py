@@ -27,8 +27,8 @@ from camera import options
 from camera.errors import CalibrationError
 from camera.options import BoardFlags, BoardKind
 from redetect.array_types import FloatArray
+from redetect.messages import excerpt
 from redetect.storage import demand_place, write_bytes
-from redetect.storage.messages import excerpt
 
 # Larger values are assumed to be millimetres.
 _LARGEST_SQUARE_M = 10.0

@@ -30,8 +30,9 @@ from camera.errors import CalibrationError, CameraError
 from camera.model import PARAMETERS, Camera
 from camera.options import Calibrate
 from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
+from redetect import __version__
 from redetect.array_types import GreyImage
-from redetect.storage import __version__, demand_place, write_bytes
+from redetect.storage import demand_place, write_bytes
 
 #: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.
 _COUNTED_PICTURES, _VOTES = 8, 2

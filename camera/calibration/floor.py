@@ -37,10 +37,10 @@ from camera.options import Floor
 from camera.rotations import cross_matrices
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
+from redetect.bounds import FINITE, demand
+from redetect.messages import excerpt
 from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import read_text
-from redetect.storage.bounds import FINITE, demand
-from redetect.storage.messages import excerpt
 
 #: Columns of a file of floor points: pixel, and position in the robot frame (m).
 FLOOR_COLUMNS = ("u", "v", "x", "y")

@@ -24,7 +24,7 @@ from camera.distortion import (
 from camera.errors import CalibrationError
 from camera.model_checks import border_pixels
 from redetect.array_types import FloatArray
-from redetect.storage.bounds import ABOVE_0, demand, whole
+from redetect.bounds import ABOVE_0, demand, whole
 
 #: Names of the intrinsics, in order.
 INTRINSICS = (

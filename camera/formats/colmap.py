@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import foreign, name_of_one
-from redetect.storage.messages import excerpt, one_line
+from redetect.messages import excerpt, one_line
 
 if TYPE_CHECKING:
     import pycolmap

@@ -28,7 +28,7 @@ from camera.distortion import NOT_TANGENTIAL, Tangential
 from camera.errors import ConversionError
 from camera.model import inverse_2x2
 from redetect.array_types import FloatArray
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 Model = Literal["radtan", "rational", "fisheye"]
 

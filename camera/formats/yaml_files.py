@@ -15,7 +15,7 @@ import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
-from redetect.storage.messages import excerpt, one_line
+from redetect.messages import excerpt, one_line
 
 _MOST_CAMERAS = 1000
 # Keys of OpenCV's files in use, and values that mean the fisheye model.

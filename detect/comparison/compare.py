@@ -50,7 +50,7 @@ from redetect.landmarks import (
     read_frames,
     wrap_angle,
 )
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
 _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)

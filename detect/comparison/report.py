@@ -18,9 +18,9 @@ from detect.errors import DetectError
 from detect.options import Compare
 from detect.row_files import read_head
 from detect.seen import Sight
+from redetect.command_line import EXIT_ERROR
+from redetect.messages import one_line
 from redetect.storage import write_bytes
-from redetect.storage.command_line import EXIT_ERROR
-from redetect.storage.messages import one_line
 
 
 def perform(command: Compare) -> int:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from detect import __version__
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison, number
@@ -21,6 +20,7 @@ from detect.seen import Sight
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
+from redetect import __version__
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from camera import Camera
-from detect import __version__
 from detect.errors import EXIT_FRAMES_FAILED
 from detect.runs.plan import FramePlan, Job, Lean, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
+from redetect import __version__
 from redetect.landmarks import format_head
 from redetect.landmarks.times import TIMES_HEAD
 

@@ -38,7 +38,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from detect import __version__
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
@@ -47,6 +46,7 @@ from detect.runs.workers import WorkerPool, Workers, local_workers
 from detect.settings import LEAST_FRAMES
 from detect.sources.interface import ImageRun, RunFrame
 from detect.sources.poses import SomeFrames
+from redetect import __version__
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 

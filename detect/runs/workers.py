@@ -38,7 +38,7 @@ from detect.terminal import (
     show_announcements,
 )
 from redetect.interrupts import interrupts_deferred, raise_if_interrupt_waits
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 if TYPE_CHECKING:
     from distributed import Client

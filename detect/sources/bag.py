@@ -29,7 +29,7 @@ from detect.errors import DetectError, FrameError, imported_for
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
-from redetect.storage.messages import OneLineError, excerpt, one_line
+from redetect.messages import OneLineError, excerpt, one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader

@@ -18,8 +18,8 @@ from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
 from redetect.landmarks.times import read_times
+from redetect.messages import excerpt
 from redetect.storage.bounded import leads_out, link_out
-from redetect.storage.messages import excerpt
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 

@@ -14,5 +14,3 @@ Frames: the *robot* has x forward, y left, z up; the *world* z up, and the robot
 its x axis' angle in the world, counter-clockwise; *cameras* and *markers* as in `camera` and
 `landmarks`. A transform `a_from_b` maps points of frame b to frame a. Metres, radians, seconds.
 """
-
-from redetect.storage import __version__ as __version__

@@ -5,8 +5,8 @@ Exit codes: 0 success; 1 the command failed, or gave no pose; 2 wrong command li
 
 from __future__ import annotations
 
+from redetect.command_line import Program
 from redetect.groundtruth.commands.options import COMMANDS
-from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "groundtruth",

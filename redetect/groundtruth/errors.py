@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from redetect.storage.messages import OneLineError
+from redetect.messages import OneLineError
 
 
 class GroundTruthError(OneLineError, ValueError):

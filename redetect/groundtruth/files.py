@@ -16,11 +16,11 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from redetect.array_types import FloatArray
+from redetect.bounds import FINITE, LARGEST_NUMBER, Bounds
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.messages import excerpt, one_line
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_content
-from redetect.storage.bounds import FINITE, LARGEST_NUMBER, Bounds
-from redetect.storage.messages import excerpt, one_line
 
 _LARGEST_FILE_BYTES = 1 << 26
 _ROUNDING = 1e-6

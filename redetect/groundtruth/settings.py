@@ -10,8 +10,7 @@ from importlib.util import find_spec
 from math import inf
 from typing import Annotated, ClassVar, Literal
 
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage.bounds import (
+from redetect.bounds import (
     PROBABILITY,
     Bounds,
     NotNegative,
@@ -21,6 +20,7 @@ from redetect.storage.bounds import (
     inside,
     whole,
 )
+from redetect.groundtruth.errors import GroundTruthError
 
 Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
 

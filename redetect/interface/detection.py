@@ -29,7 +29,7 @@ from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from redetect.bounds import demand_fields
 from redetect.interface.tables import Table, covariance_columns
 from redetect.landmarks.map_file import (
     LandmarkMap,
@@ -20,6 +21,7 @@ from redetect.landmarks.map_file import (
     write_map,
     write_path,
 )
+from redetect.messages import excerpt
 from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
 from redetect.slam.commands.filters import localized_run_of, path_distance
 from redetect.slam.commands.map import mapped_run_of
@@ -29,8 +31,6 @@ from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined
-from redetect.storage.bounds import demand_fields
-from redetect.storage.messages import excerpt
 
 PathLike = str | os.PathLike[str]
 Command = TypeVar("Command", Map, Localize)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from redetect.storage.messages import OneLineError
+from redetect.messages import OneLineError
 
 FrameLibrary = Literal["pandas", "polars"]
 

@@ -35,8 +35,8 @@ from redetect.landmarks.records import (
     numbers_of_line,
     numbers_of_step,
 )
+from redetect.messages import excerpt
 from redetect.storage import write_whole
-from redetect.storage.messages import excerpt
 
 _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20

@@ -16,10 +16,10 @@ from typing import TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.bounds import FINITE, LARGEST_NUMBER
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_bounded, read_plain_array
-from redetect.storage.bounds import FINITE, LARGEST_NUMBER
 
 FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)

@@ -13,8 +13,8 @@ import re
 from dataclasses import dataclass
 from operator import attrgetter
 
-from redetect.storage.bounds import FINITE, LARGEST_NUMBER
-from redetect.storage.messages import OneLineError, excerpt
+from redetect.bounds import FINITE, LARGEST_NUMBER
+from redetect.messages import OneLineError, excerpt
 
 STEP_NUMBERS = ("dx", "dy", "dphi", "cxx", "cxy", "cyy", "cxphi", "cyphi", "cphiphi")
 CIRCLE_NUMBERS = ("px", "py", "quality", "cxx", "cxy", "cyy")

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 
 @dataclass(frozen=True, slots=True)

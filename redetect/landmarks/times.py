@@ -7,7 +7,7 @@ from math import isfinite
 
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 #: The first line of written files.
 TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."

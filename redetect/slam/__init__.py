@@ -6,5 +6,3 @@ frame at the start of the run. A pose is (x, y, theta). Metres, radians.
 >>> from redetect.slam.recording import read_recording
 >>> recording = read_recording("images/e", circles=True, lines=True)    # doctest: +SKIP
 """
-
-from redetect.storage import __version__ as __version__

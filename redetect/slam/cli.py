@@ -5,8 +5,8 @@ Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupt
 
 from __future__ import annotations
 
+from redetect.command_line import Program
 from redetect.slam.options import Associate, Audit, Ekf, Export, Import, Localize, Map, Noise
-from redetect.storage.command_line import Program
 
 PROGRAM = Program(
     "slam",

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
+from redetect.bounds import NotNegative, Positive, demand_fields
 from redetect.plane import apply, between, rotation
 from redetect.slam.errors import SlamError
-from redetect.storage.bounds import NotNegative, Positive, demand_fields
 
 #: Typical height of the camera above the floor (m).
 CAMERA_HEIGHT_M = 1.5

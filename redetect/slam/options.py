@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from redetect.bounds import MaybePath, MaybeStr
 from redetect.slam.models import OdometryNoise
 from redetect.slam.settings import AddedNoise, AssociateSettings
-from redetect.storage.bounds import MaybePath, MaybeStr
 
 
 @dataclass(frozen=True, kw_only=True)

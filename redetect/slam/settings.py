@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from redetect.slam.errors import SlamError
-from redetect.storage.bounds import (
+from redetect.bounds import (
     PROBABILITY,
     NotNegative,
     Positive,
@@ -15,6 +14,7 @@ from redetect.storage.bounds import (
     from_to,
     whole,
 )
+from redetect.slam.errors import SlamError
 
 #: Bounds of positions given by flags (m, rad) and of their standard deviations.
 PLACE, PLACE_SIGMA = from_to(-1e12, 1e12), from_to(0.0, 1e12)

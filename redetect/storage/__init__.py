@@ -10,6 +10,3 @@ from redetect.storage.parts import demand_writable as demand_writable
 from redetect.storage.parts import write_bytes as write_bytes
 from redetect.storage.parts import write_text as write_text
 from redetect.storage.parts import write_whole as write_whole
-
-#: The version of this project, defined only here.
-__version__ = "0.1.0"

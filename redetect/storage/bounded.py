@@ -25,7 +25,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from redetect.storage.messages import one_line
+from redetect.messages import one_line
 
 _LARGEST_TEXT_BYTES = 1 << 28
 

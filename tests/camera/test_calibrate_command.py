@@ -21,7 +21,7 @@ from camera.cli import main
 from camera.errors import CalibrationError
 from camera.rotations import rotation_of
 from camera.uncertainty import covariance_of
-from redetect.storage import __version__
+from redetect import __version__
 from tests.camera.conftest import BOARD, PICTURES
 from tools.evaluation.boards import Rays, projection_difference, render_board
 from tools.evaluation.calibration import BOARDS, calibrate_rendered

@@ -11,7 +11,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from redetect.storage import __version__
+from redetect import __version__
 
 
 def declared(root: Path, extras: tuple[str, ...]) -> dict[str, Requirement]:

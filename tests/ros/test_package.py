@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from redetect.storage import __version__
+from redetect import __version__
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ PROGRAM = """
 import sys
 from functools import cache
 from detect.terminal import on_compilation
-from redetect.storage.command_line import exit_code_of
+from redetect.command_line import exit_code_of
 from kernels import of
 
 on_compilation(cache(lambda: print("compiles")))

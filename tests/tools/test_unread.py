@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from redetect.storage.command_line import EXIT_UNREAD
+from redetect.command_line import EXIT_UNREAD
 
 
 def test_nobody_reads_on_what_a_tool_prints() -> None:

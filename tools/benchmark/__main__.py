@@ -18,10 +18,10 @@ import cv2
 import numba
 import numpy as np
 
-from detect import __version__
 from detect.cli import PROGRAM
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
+from redetect import __version__
 from redetect.array_types import ByteArray
 from tools.benchmark import functions as f
 from tools.benchmark.material import (

@@ -19,11 +19,12 @@ import tyro
 from jinja2 import Environment, StrictUndefined
 from tyro.conf import Positional
 
+from redetect import __version__
 from redetect.cli import PROGRAMS
+from redetect.command_line import exit_code_of
 from redetect.groundtruth.files import write_json
 from redetect.interface.tables import plain
-from redetect.storage import __version__, write_bytes
-from redetect.storage.command_line import exit_code_of
+from redetect.storage import write_bytes
 
 #: Figures by name, or further figures by theirs.
 Figures = Mapping[str, Any]

@@ -14,7 +14,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-from redetect.storage.command_line import exit_code_of
+from redetect.command_line import exit_code_of
 
 #: Files may be twice as long as the longest seed, and at least this long.
 _SHORT_BYTES = 2048

@@ -12,7 +12,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from camera import format_camera, read_camera
-from redetect.storage.command_line import exit_code_of
+from redetect.command_line import exit_code_of
 from tools.simulator import runs
 from tools.simulator.driving import DriveStyle
 from tools.simulator.laser import session_files as laser

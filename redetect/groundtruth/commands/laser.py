@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from redetect.array_types import FloatArray
+from redetect.bounds import demand, whole
 from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.errors import GroundTruthError
@@ -32,7 +33,6 @@ from redetect.groundtruth.lasers.tracking import (
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_bytes
-from redetect.storage.bounds import demand, whole
 
 #: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
 _DISTURBED = 3

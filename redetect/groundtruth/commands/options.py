@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from redetect.bounds import MaybeInt, MaybePath
 from redetect.groundtruth.settings import (
     AlignmentSettings,
     FuseSettings,
@@ -17,7 +18,6 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-from redetect.storage.bounds import MaybeInt, MaybePath
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from redetect.groundtruth import __version__
+from redetect import __version__
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.storage import demand_free
 

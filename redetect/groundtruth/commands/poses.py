@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from redetect.command_line import EXIT_ERROR
 from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
 from redetect.groundtruth.files import write_json
@@ -22,7 +23,6 @@ from redetect.groundtruth.markers.session import (
 from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_bytes
-from redetect.storage.command_line import EXIT_ERROR
 
 #: Share of markers that disagree, or times that have no pose, above which a warning is printed; a
 #: marker is wrong if more than a share of its views disagree, and hardly any others do.

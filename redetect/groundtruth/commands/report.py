@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from redetect.groundtruth import __version__
+from redetect import __version__
 from redetect.groundtruth.commands.options import Report
 from redetect.groundtruth.commands.outputs import check_outputs
 from redetect.groundtruth.report.inputs import gather

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from camera import camera_file_in, read_camera
+from redetect.bounds import ABOVE_0, demand
 from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.commands.outputs import (
     check_outputs,
@@ -30,7 +31,6 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.storage import write_bytes
-from redetect.storage.bounds import ABOVE_0, demand
 
 
 def perform(command: RigCommand) -> int:

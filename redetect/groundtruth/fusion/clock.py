@@ -26,10 +26,10 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
+from redetect.bounds import NOT_NEGATIVE, from_to, inside
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import NUMBER, JsonObject
 from redetect.storage.bounded import read_content
-from redetect.storage.bounds import NOT_NEGATIVE, from_to, inside
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
 #: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.

@@ -19,8 +19,8 @@ from ezdxf.filemanagement import readfile
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
+from redetect.messages import one_line
 from redetect.storage.bounded import read_content
-from redetect.storage.messages import one_line
 
 #: Curved walls are approximated by segments no farther from the curve than this (m).
 CURVE_TOLERANCE_M = 0.002

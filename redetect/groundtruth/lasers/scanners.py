@@ -26,10 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
-from redetect.storage.bounded import read_plain_array
-from redetect.storage.bounds import (
+from redetect.bounds import (
     ABOVE_0,
     FINITE,
     NotNegative,
@@ -37,7 +34,10 @@ from redetect.storage.bounds import (
     demand_fields,
     whole,
 )
-from redetect.storage.messages import excerpt, one_line
+from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
+from redetect.messages import excerpt, one_line
+from redetect.storage.bounded import read_plain_array
 
 MOST_READINGS = 4096
 

@@ -33,8 +33,8 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject
 from redetect.groundtruth.markers.session import parse_pose
+from redetect.messages import excerpt
 from redetect.storage.bounded import path_inside
-from redetect.storage.messages import excerpt
 
 #: Half the side of a corner's refinement window, as a fraction of a square: cameras are calibrated
 #: and far away here, so that blur and noise cause larger errors than the lens's distortion.

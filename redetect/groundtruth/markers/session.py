@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera, read_camera
 from redetect.array_types import FloatArray
+from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
 from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
-from redetect.storage.bounds import Bounds
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 _QUATERNION_TOLERANCE = 1e-3
 _WIDTH = Bounds("metres above 0", lambda x: x > 0.0)

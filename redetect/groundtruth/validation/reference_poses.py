@@ -26,11 +26,11 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from redetect.array_types import FloatArray
+from redetect.bounds import ABOVE_0
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, known_name, read_table
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, fitted, rotation
-from redetect.storage.bounds import ABOVE_0
 
 DISTANCES_HEAD = "pose,t,point,fiducial,distance_m"
 _ENDS = ("point", "fiducial")

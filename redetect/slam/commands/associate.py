@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from redetect import slam
+from redetect import __version__
 from redetect.array_types import IntArray
+from redetect.bounds import NOT_NEGATIVE, demand, whole
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.slam.association.run import RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
@@ -28,7 +29,6 @@ from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
 from redetect.slam.recording import UNKNOWN_ID, Recording, joined
 from redetect.storage import demand_free
-from redetect.storage.bounds import NOT_NEGATIVE, demand, whole
 
 #: Scores of each kind's rows, before and after the map level.
 Scores = dict[str, dict[str, AssociationScore]]
@@ -82,7 +82,7 @@ def perform(options: Associate) -> int:
         if 2 * np.count_nonzero(own < 0) > len(own):
             print(_doubt(run), file=sys.stderr)
     content = {
-        "version": slam.__version__,
+        "version": __version__,
         "run": str(options.run),
         "more": [str(run) for run in options.more],
         "settings": asdict(settings),

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from camera import Camera
-from redetect import slam
+from redetect import __version__
+from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import camera_of_run, recording_of
@@ -20,7 +21,6 @@ from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import Recording, landmark_files
 from redetect.storage import demand_free, write_bytes
-from redetect.storage.bounds import ABOVE_0, demand
 
 _COLUMNS = (
     *("frame", "prefix", "line", "id", "kind", "new_id", "x_m", "y_m"),
@@ -47,7 +47,7 @@ def perform(options: Options) -> int:
     )
     rows = list(read_rows(source))
     write_rows(target, audited_rows(rows, audit, options.apply), overwrite=options.force)
-    listed, head = _table(recording, audit, rows), f"slam audit {slam.__version__}: {source.name}"
+    listed, head = _table(recording, audit, rows), f"slam audit {__version__}: {source.name}"
     write_table(target.with_suffix(".csv"), _COLUMNS, listed, [head], overwrite=options.force)
     for line in _report(recording, audit):
         print(line)

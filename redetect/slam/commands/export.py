@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect import slam
+from redetect import __version__
+from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks import write_frames
 from redetect.landmarks.axes import MEANING
 from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path, write_table
@@ -21,7 +22,6 @@ from redetect.slam.formats.tum import read_tum, write_tum
 from redetect.slam.options import Export, Import
 from redetect.slam.recording import Recording, frames_of_discs
 from redetect.storage import demand_free
-from redetect.storage.bounds import ABOVE_0, demand
 
 _LANDMARKS = (".circles", ".lines", ".markers")
 
@@ -156,7 +156,7 @@ def _write_path(command: Import, path: Path2D, note: str = "") -> int:
 
 
 def _made_by(source: Path) -> str:
-    return f"Made by slam {slam.__version__} of {source.name}"
+    return f"Made by slam {__version__} of {source.name}"
 
 
 def _head(source: Path) -> list[str]:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect import slam
+from redetect import __version__
 from redetect.array_types import FloatArray
+from redetect.bounds import demand
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import (
     LandmarkMap,
@@ -43,7 +44,6 @@ from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording
 from redetect.slam.settings import PLACE, PLACE_SIGMA
 from redetect.storage import demand_free, write_bytes
-from redetect.storage.bounds import demand
 
 ERROR_PICTURE = "errors.png"
 # The pose is lost if this many frames with discs in succession match none of them.
@@ -82,10 +82,10 @@ def perform(command: Localize | Ekf) -> int:
         distance = path_distance(run.path, reference.poses, f"{command.reference}: ")
 
     output.mkdir(parents=True, exist_ok=True)
-    head = [f"slam {name} {slam.__version__}: {source}"]
+    head = [f"slam {name} {__version__}: {source}"]
     write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
     content: dict[str, Any] = {
-        "version": slam.__version__,
+        "version": __version__,
         "settings": flags_of(command),
         "figures": _figures(run, distance),
     }

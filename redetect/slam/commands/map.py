@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from camera import write_camera
-from redetect import slam
+from redetect import __version__
+from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks.map_file import (
     covariance_file,
     write_map,
@@ -45,7 +46,6 @@ from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.slam.settings import PLACE
 from redetect.storage import demand_free, write_bytes
-from redetect.storage.bounds import ABOVE_0, demand
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
@@ -79,7 +79,7 @@ def perform(command: Map) -> int:
 
     output.mkdir(parents=True, exist_ok=True)
     name = ", ".join(run.resolve().name for run in command.runs)
-    head = [f"slam map {slam.__version__}: {name}"]
+    head = [f"slam map {__version__}: {name}"]
     final, path = mapped.landmarks, mapped.path
     few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
     if few:
@@ -211,7 +211,7 @@ def _left_out_lines(left_out: LeftOut) -> list[str]:
 
 def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str, Any]:
     results: dict[str, Any] = {
-        "version": slam.__version__,
+        "version": __version__,
         "configuration": flags_of(command, ("output", "force", "interactive")),
         "table": as_json(mapped.table),
         "odometry": as_json(check),

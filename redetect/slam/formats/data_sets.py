@@ -24,13 +24,13 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.bounds import LARGEST_NUMBER
 from redetect.landmarks.axes import to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
-from redetect.storage.bounds import LARGEST_NUMBER
 
 #: Suffixes of the names of a robot's odometry and of the files beside it.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"

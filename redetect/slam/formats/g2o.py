@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.bounds import FINITE
 from redetect.landmarks import is_positive_definite
 from redetect.landmarks.axes import (
     covariance_from_dataset,
@@ -35,7 +36,6 @@ from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage import write_text
 from redetect.storage.bounded import read_text
-from redetect.storage.bounds import FINITE
 
 #: The largest number of a vertex: other tools store it in 31 bits.
 LARGEST_NUMBER = 2**31 - 1

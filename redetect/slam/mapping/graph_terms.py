@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.bounds import Positive, demand_fields
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.plane import between
@@ -21,7 +22,6 @@ from redetect.slam.models import (
     disc_jacobians,
 )
 from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
-from redetect.storage.bounds import Positive, demand_fields
 
 RowErrors = Literal["corrected", "recorded"]
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect import __version__
 from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
+from redetect import __version__
 from redetect.landmarks import read_frames, read_rows, read_steps
 from tests.detect.conftest import SMALL_RUN_DISCS
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from redetect.bounds import ABOVE_0, NOT_NEGATIVE, Bounds, demand
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.storage.bounds import ABOVE_0, NOT_NEGATIVE, Bounds, demand
 
 FIXED_SCANNERS = 4
 

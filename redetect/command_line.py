@@ -27,9 +27,9 @@ from typing import Annotated, Any, cast, get_type_hints
 import tyro
 from tyro.conf import Suppress, arg, subcommand
 
+from redetect import __version__
 from redetect.interrupts import interrupts_noted
-from redetect.storage import __version__
-from redetect.storage.messages import QUIET, OneLineError, excerpt, one_line
+from redetect.messages import QUIET, OneLineError, excerpt, one_line
 
 #: The command failed.
 EXIT_ERROR = 1

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from redetect.storage.command_line import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
-from redetect.storage.messages import OneLineError
+from redetect.command_line import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
+from redetect.messages import OneLineError
 
 
 class WrongFileError(OneLineError, ValueError):
@@ -69,7 +69,7 @@ def test_nobody_reads_on_what_is_printed(lines: int, unbuffered: str) -> None:
     """As with ``| head``: a quiet end, whether it shows while printing or at the last flush."""
     code = f"""if True:
         import sys
-        from redetect.storage.command_line import exit_code_of
+        from redetect.command_line import exit_code_of
         sys.stdin.read()
         sys.exit(exit_code_of(lambda: [print("row") for _ in range({lines})] and 0))
     """

@@ -17,7 +17,7 @@ from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, get_args, get_origin, get_type_hints
 
-from redetect.storage.messages import excerpt
+from redetect.messages import excerpt
 
 # Types of flags; for `X | None` tyro imports another library that takes a tenth of a second.
 MaybePath = Optional[Path]  # noqa: UP045
