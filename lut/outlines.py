@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
-from redetect.bounds import Limit, NotNegative, Positive, demand, demand_fields, whole
 from redetect.compiled import kernel
 from redetect.messages import OneLineError
 
@@ -36,33 +35,27 @@ class TableError(OneLineError, ValueError):
 
 @dataclass(frozen=True)
 class DiscShape:
-    """Samples around a centre, and the nearest and farthest centres."""
+    """Samples around a centre, and the nearest and farthest centres.
 
-    inner_radius_m: Positive = 0.06  #: Radius of the inner outline on the floor, metres.
-    outer_radius_m: Positive = 0.14  #: Radius of the outer one.
+    The bounds are those of the detector's settings (`detect.settings.CircleSettings`).
+    """
+
+    inner_radius_m: float = 0.06  #: Radius of the inner outline on the floor, metres.
+    outer_radius_m: float = 0.14  #: Radius of the outer one.
     #: Equally spaced samples on each outline; the first is in the robot's +X direction.
-    samples: Annotated[int, whole(3, 128)] = 16
-    border_px: Annotated[int, whole(0)] = 12  #: Least distance from the image's border.
+    samples: int = 16
+    border_px: int = 12  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
-    far_limit_m_per_px: Limit = 0.05
+    far_limit_m_per_px: float = 0.05
     #: Least number of sample pairs (an inner and an outer one) inside the image; 0: samples are
     #: counted singly.
-    least_pairs: Annotated[int, whole(0)] = 0
+    least_pairs: int = 0
     #: Samples of a pair on the same pixel are moved inwards and outwards by the length on the floor
     #: of this many image rows.
-    apart_px: NotNegative = 0.0
+    apart_px: float = 0.0
     #: Least distance of usable centres in a row, converted to pixels by the length of an image row
     #: on the floor and rounded up; 0: every pixel is a centre.
-    stride_m: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        demand_fields(self, TableError)
-        demand(self, TableError, least_pairs=whole(0, self.samples))
-        if not self.inner_radius_m < self.outer_radius_m:
-            raise TableError(
-                f"inner_radius_m is {self.inner_radius_m:g}: expected less than outer_radius_m "
-                f"({self.outer_radius_m:g})"
-            )
+    stride_m: float = 0.0
 
 
 class CentreGroups(NamedTuple):

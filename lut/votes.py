@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from camera import Camera
-from lut.outlines import TableError, demand_above_floor, floor_positions, pixels_within, size_down
+from lut.outlines import demand_above_floor, floor_positions, pixels_within, size_down
 from redetect.array_types import Float32Array, FloatArray, IntArray
-from redetect.bounds import Limit, Positive, demand_fields, whole
 
 #: Width of a cell, radii, and its least length ahead, pixels.
 _CELL_RADII, _CELL_PX = 0.25, 0.8
@@ -31,13 +30,10 @@ _WIDE_PX, _HIGH_PX = 9.0, 6.0
 class VoteShape:
     """Size of the discs, and the nearest and farthest centres."""
 
-    radius_m: Positive = 0.10  #: Radius of the discs, metres.
-    border_px: Annotated[int, whole(0)] = 6  #: Least distance from the image's border.
+    radius_m: float = 0.10  #: Radius of the discs, metres.
+    border_px: int = 6  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
-    far_limit_m_per_px: Limit = 0.12
-
-    def __post_init__(self) -> None:
-        demand_fields(self, TableError)
+    far_limit_m_per_px: float = 0.12
 
 
 class VoteTable(NamedTuple):

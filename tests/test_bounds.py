@@ -17,16 +17,14 @@ ROOMS = ("camera", "detect", "lut", "redetect")
 #: commands hand on to settings.
 NO_SETTINGS = frozenset(
     {
-        "FileHead", "FrameRows", "Known",
-        "RowCount", "RowFiles", "RunSummary", "SeenRows", "_Rows",
+        "DiscShape", "FileHead", "FrameRows", "Known",
+        "RowCount", "RowFiles", "RunSummary", "SeenRows", "VoteShape", "_Rows",
     }
 )  # fmt: skip
 
 #: Where infinity stands for "no limit".
 ENDLESS = {
     "CircleSettings": {"far_limit"},
-    "DiscShape": {"far_limit_m_per_px"},
-    "VoteShape": {"far_limit_m_per_px"},
     "LineSettings": {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
         "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",
@@ -84,7 +82,7 @@ NUMBERS = list(numbers())
 def test_there_are_settings_of_all_kinds() -> None:
     names = {parameter.values[0].__name__ for parameter in NUMBERS}
     assert {
-        "CircleSettings", "LineSettings", "MarkerSettings", "DiscShape", "PoseSettings",
+        "CircleSettings", "LineSettings", "MarkerSettings", "PoseSettings",
         "LaserSettings", "FuseSettings", "SyncSettings", "AssociateSettings",
     } <= names  # fmt: skip
     assert len(NUMBERS) > 100

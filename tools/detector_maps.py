@@ -21,7 +21,7 @@ def quality_of_centres(image: GreyImage, table: DiscTable) -> tuple[FloatArray, 
 
     The quality is the between-class variance of the grey values over the total variance, 0 where
     the table has no centre; the contrast is the mean grey value of the inner outline minus that of
-    the outer. Raises FrameError if the image does not belong to the table.
+    the outer.
     """
     centres = centres_of(image, table, Limits(quality=0.0))
     u, v = centres.pixels.T

@@ -30,7 +30,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.errors import FrameError
 from lut import GROUP_COLUMNS, GROUP_SAMPLES, CentreGroups, DiscTable
 from redetect.array_types import ByteArray, Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
@@ -166,21 +165,11 @@ def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
     Parameters
     ----------
     image : (H, W) uint8
+        Of the table's size.
     table : DiscTable
         The camera's.
     limits : Limits
-
-    Raises
-    ------
-    FrameError
-        If the image does not belong to the table.
     """
-    expected = table.floor_xy.shape[:2]
-    if image.shape != expected or image.dtype != np.uint8:
-        raise FrameError(
-            f"the image is {image.dtype} of shape {image.shape}: the table is for uint8 of shape "
-            f"{expected}"
-        )
     grey = image.ravel()
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from camera import Camera, parse_camera
 from detect.circles import detect_circles, disc_shape
 from detect.discs.quality import Limits, centres_of, least_part_quality
-from detect.errors import FrameError
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscShape, DiscTable, build_disc_table, ring
 from tests.camera.strategies import cameras
@@ -255,19 +254,3 @@ def test_an_empty_table_finds_nothing() -> None:
     assert pixels.dtype == np.int64
     assert contrast.dtype == np.float32
     assert not np.any(maps)
-
-
-@pytest.mark.parametrize(
-    ("image", "complaint"),
-    [
-        (np.zeros((36, 95), np.uint8), r"uint8 of shape \(36, 95\): the table is for uint8 of"),
-        (np.zeros((36, 96, 1), np.uint8), r"uint8 of shape \(36, 96, 1\): the table is for"),
-        (np.zeros((36, 96)), r"float64 of shape \(36, 96\): the table is for uint8 of shape"),
-    ],
-)
-def test_an_image_that_is_not_the_table_s_is_refused(image: Any, complaint: str) -> None:
-    table, _ = both(SMALL_CAMERA, SHAPE)
-    with pytest.raises(FrameError, match=complaint):
-        centres_of(image, table, Limits(0.5))
-    with pytest.raises(FrameError, match=complaint):
-        quality_of_centres(image, table)
