@@ -17,7 +17,6 @@ from redetect.bounds import (
     Positive,
     Share,
     ShareAbove0,
-    demand,
     demand_fields,
     from_to,
     whole,
@@ -179,15 +178,13 @@ class MarkerSettings:
     least_width_px: Annotated[float, _LEAST_WIDTH] = 9.0
     #: A candidate's area is within this factor of the expected width squared.
     area_factor: Annotated[float, _AREA_FACTOR] = 6.0
-    #: Least number of white patches enclosed in a candidate.
-    least_holes: Annotated[int, whole(0)] = 0
-    most_holes: Annotated[int, whole(0)] = 40  #: Largest number of them.
+    #: Largest number of white patches enclosed in a candidate.
+    most_holes: Annotated[int, whole(0)] = 40
     #: Least area of a candidate, with holes filled, over that of its convex hull.
     least_solidity: Share = 0.75
-    #: Least area of a candidate's holes over its whole area, relative to the dictionary's mean
-    #: white share (0.25 of 1/8 in the report).
-    least_white: NotNegative = 0.0
-    most_white: NotNegative = 3.0  #: Largest such area (3 of 1/8 in the report).
+    #: Largest area of a candidate's holes over its whole area, relative to the dictionary's mean
+    #: white share (3 of 1/8 in the report).
+    most_white: NotNegative = 3.0
     least_square: Share = 0.75  #: Least area of the rough quadrangle over that of the convex hull.
     #: Least contrast of each edge, in standard deviations of the image's noise.
     least_contrast: NotNegative = 1.4
@@ -208,7 +205,3 @@ class MarkerSettings:
         if not self.thresholds:
             raise DetectError("thresholds is (): expected at least one number")
         demand_fields(self, DetectError)
-        white = f"0 to most_white ({self.most_white})"
-        most_white = Bounds(white, lambda x: 0.0 <= x <= self.most_white)
-        most_holes = whole(0, self.most_holes)
-        demand(self, DetectError, least_holes=most_holes, least_white=most_white)

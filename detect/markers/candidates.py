@@ -161,7 +161,6 @@ def _marker_regions(
     `white` is the expected share of white area, `widest` the largest side of a region.
     """
     least_px, most_px = _area_limits(settings, scale)
-    least_white = settings.least_white * white
     most_white = min(settings.most_white * white, 0.9)
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     height, width = dark.shape
@@ -186,7 +185,7 @@ def _marker_regions(
         while child >= 0:
             holes.append(contours[child])
             child = hierarchy[0, child, 0]
-        if not settings.least_holes <= len(holes) <= settings.most_holes:
+        if len(holes) > settings.most_holes:
             yield HOLES
             continue
         hull = np.asarray(cv2.convexHull(outline)[:, 0], np.int32)
@@ -194,7 +193,7 @@ def _marker_regions(
             yield SOLIDITY
             continue
         bright = sum(cv2.contourArea(hole) - 0.5 * len(hole) + 1.0 for hole in holes)
-        if not least_white <= bright / area <= most_white:
+        if bright / area > most_white:
             yield WHITE_SHARE
             continue
         pixels = scale * hull + 0.5 * (scale - 1)

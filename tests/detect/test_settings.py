@@ -31,10 +31,8 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
         (LineSettings, {"blurred_widths": (2.0, 11.0)}, "blurred_widths is 11: expected a number"),
         (MarkerSettings, {"thresholds": ()}, "thresholds"),
         (MarkerSettings, {"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),
-        (MarkerSettings, {"least_holes": 5, "most_holes": 2}, "least_holes"),
         (MarkerSettings, {"least_explained": 2.0}, "least_explained"),
         (MarkerSettings, {"area_factor": 0.5}, "area_factor"),
-        (MarkerSettings, {"least_white": 4.0}, "least_white"),
     ],
 )
 def test_nonsense_is_refused_by_name(

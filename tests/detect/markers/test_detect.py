@@ -290,14 +290,13 @@ def test_a_ring_segment_is_not_solid() -> None:
 
 
 def test_the_filters_count_holes_and_their_share() -> None:
-    published = MarkerSettings(
-        dictionary="6x6_250", thresholds=(0.5,), least_holes=1, least_solidity=0.9, least_white=0.25
-    )
     grey = np.full((120, 120), 200.0)
     grey[40:80, 40:80] = 40.0
-    assert regions.HOLES in squares(painted(grey), published).rejected
-    grey[58:62, 58:62] = 200.0
-    assert regions.WHITE_SHARE in squares(painted(grey, blur=0.3), published).rejected
+    grey[50:70, 50:70] = 200.0
+    none = MarkerSettings(dictionary="6x6_250", thresholds=(0.5,), most_holes=0)
+    assert regions.HOLES in squares(painted(grey), none).rejected
+    little = MarkerSettings(dictionary="6x6_250", thresholds=(0.5,), most_white=0.1)
+    assert regions.WHITE_SHARE in squares(painted(grey, blur=0.3), little).rejected
 
 
 def test_cells_too_small_for_the_blur_are_not_guessed() -> None:
