@@ -236,8 +236,7 @@ def _closed_by_parts(
         )
     counts = np.cumsum([0, *(len(part.xy) for part in parts)])
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
-    own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
-    laid = [compose(motion, path) for motion, path in zip(motions, own)]
+    laid = [compose(motions[k], part.path[int(k > 0) :]) for k, part in enumerate(parts)]
     labels, _ = merge_labels(frames, together, pairs_by_votes(pairs), _most_together(recording))
     whole = _closed(recording, labels, settings, camera_xy, report, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
