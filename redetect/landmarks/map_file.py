@@ -90,17 +90,9 @@ def write_map(
 ) -> None:
     """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
 
-    Its joint covariance, if there is one, is written beside it (`covariance_file`).
-
-    Parameters
-    ----------
-    path : path
-    landmark_map : LandmarkMap
-    comments : sequence of str
-        Lines for the head.
-    overwrite : bool
-        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
-        raised.
+    Its joint covariance, if there is one, is written beside it (`covariance_file`). `comments` are
+    lines for the head. If a file exists and `overwrite` is false, raises
+    `redetect.storage.OutputExistsError`.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
@@ -188,11 +180,7 @@ def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> Landmark
 
 
 def write_path(
-    path: FilePath,
-    poses: Path2D,
-    comments: Sequence[str] = (),
-    *,
-    overwrite: bool = False,
+    path: FilePath, poses: Path2D, comments: Sequence[str] = (), *, overwrite: bool = False
 ) -> None:
     """Write a path with columns `PATH_COLUMNS`, the covariance row by row if there is one."""
     columns, table = SHORT_PATH_COLUMNS, poses.poses
@@ -240,8 +228,7 @@ def write_table(
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    content = text.getvalue().encode("utf-8", "surrogateescape")
-    write_bytes(path, content, overwrite=overwrite)
+    write_bytes(path, text.getvalue().encode("utf-8", "surrogateescape"), overwrite=overwrite)
 
 
 def _read(
