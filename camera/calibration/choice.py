@@ -111,9 +111,10 @@ def _with_tangential(
     beside = chosen._replace(tangential=True)
     tried = radial | fitted(radial[chosen].adjusted.estimate, [beside])
     # They have to explain the held-out points, and to be more than noise.
-    significance = tangential_significance(tried[beside].adjusted)
-    lower = _is_lower(tried[beside], tried[chosen], _TANGENTIAL_WORTH)
-    if not (lower and significance >= _TANGENTIAL_SIGNIFICANCE):
+    if not (
+        _is_lower(tried[beside], tried[chosen], _TANGENTIAL_WORTH)
+        and tangential_significance(tried[beside].adjusted) >= _TANGENTIAL_SIGNIFICANCE
+    ):
         return chosen, tried
     others = [lens._replace(tangential=True) for lens in radial if lens != chosen]
     more = {beside: tried[beside]} | fitted(start, others)

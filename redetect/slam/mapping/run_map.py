@@ -225,7 +225,7 @@ def map_run(
     graph = graph_of_recording(recording, camera)
     begin = _in_place(recording, graph, first_sight(graph, start), name)
     descend: Callable[[Graph, Estimate, Weighting], Minimum[Estimate]] = solve_gtsam
-    if solver == "separable":
+    if solver != "gtsam":
         # A robust loss converges slowly at the end, since reweighting is not Newton's method.
         descend = partial(solve, tolerance=1e-10 if wanted.loss == "none" else 1e-7)
     trail: list[Minimum[Estimate]] = []
