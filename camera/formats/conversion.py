@@ -122,6 +122,8 @@ def nearer(*found: Converted) -> Converted:
 def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> FloatArray:
     """Parameters with the least maximal distance, by increasing weights where it is large.
 
+    References
+    ----------
     Lawson, Contributions to the theory of linear least maximum approximation, 1961.
     """
     weights = np.ones(len(fit.pixels))

@@ -37,7 +37,12 @@ Command = TypeVar("Command", Map, Localize)
 
 
 class Poses(Table):
-    """The poses of a `path`, a `redetect.landmarks.map_file.Path2D`, as a table."""
+    """The poses of a path as a table.
+
+    Attributes
+    ----------
+    path : Path2D
+    """
 
     def __init__(self, path: Path2D) -> None:
         self.path = path
@@ -101,8 +106,12 @@ class RunMap(Table):
     def write(self, folder: PathLike, *, overwrite: bool = False) -> None:
         """Write map.csv with its joint covariance, and path.csv, as `slam map` does.
 
-        The folder is created if necessary. If a file exists and `overwrite` is false, raises
-        `redetect.storage.OutputExistsError`.
+        Parameters
+        ----------
+        folder : path
+            Created if necessary.
+        overwrite : bool
+            Whether existing files may be replaced; else `redetect.storage.OutputExistsError`.
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)

@@ -157,9 +157,14 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
 
 
 def associate_positions(first: ArrayLike, second: ArrayLike, *, gate_m: float) -> Association:
-    """Pair positions (N, 2) and (M, 2) in one frame (m), with least squared distances.
+    """Pair positions within `gate_m` of each other, with least squared distances.
 
-    The largest distance of a pair is `gate_m` (m), at least 0.
+    Parameters
+    ----------
+    first, second : (N, 2), (M, 2) array_like
+        Positions in one frame (m).
+    gate_m : float
+        Largest distance of a pair (m), at least 0.
     """
     one, other = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) for xy in (first, second))
     with np.errstate(over="ignore"):  # distances that overflow are beyond any gate
