@@ -96,8 +96,16 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     """Derivatives of pixels' positions on the floor by the camera's parameters.
 
-    Takes positions `floor_xy` (N, 2) (m); returns (N, 2, 20), of the position assigned to the same
-    pixel.
+    Parameters
+    ----------
+    camera : Camera
+    floor_xy : (N, 2) float64
+        Positions on the floor (m).
+
+    Returns
+    -------
+    (N, 2, 20) float64
+        Of the position assigned to the same pixel.
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     _, by_intrinsics, by_point = project_points(

@@ -90,9 +90,17 @@ def write_map(
 ) -> None:
     """Write a map with columns as `MAP_COLUMNS`, numbers in full precision.
 
-    Its joint covariance, if there is one, is written beside it (`covariance_file`). `comments` are
-    lines for the head. If a file exists and `overwrite` is false, raises
-    `redetect.storage.OutputExistsError`.
+    Its joint covariance, if there is one, is written beside it (`covariance_file`).
+
+    Parameters
+    ----------
+    path : path
+    landmark_map : LandmarkMap
+    comments : sequence of str
+        Lines for the head.
+    overwrite : bool
+        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
+        raised.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))

@@ -64,9 +64,21 @@ def tilt_as_written(tilt: FrameTilt) -> FrameTilt:
 
 
 def read_tilts(path: str | os.PathLike[str]) -> dict[str, FrameTilt]:
-    """Read a tilt file: the tilts by image prefix; frames without a tilt are omitted.
+    """Read a tilt file.
 
-    Raises LandmarkFileError if the file cannot be read or a row is malformed; names file and line.
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    dict
+        The tilts by image prefix; frames without a tilt are omitted.
+
+    Raises
+    ------
+    LandmarkFileError
+        If the file cannot be read or a row is malformed; names file and line.
     """
     return {tilt.prefix: tilt for _, tilt in numbered_tilts(path)}
 

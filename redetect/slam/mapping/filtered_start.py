@@ -23,9 +23,23 @@ _MOST_DISCS = 300
 def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
     """Poses by EKF-SLAM with the identifiers of discs, as estimated at the time.
 
-    After a lost step the filter begins again. Takes the first pose (3,) (m, m, rad); returns
-    (N + 1, 3), it and the pose after each step, theta not wrapped. Raises `SlamError` if an update
-    is not possible, because covariances contradict each other.
+    After a lost step the filter begins again.
+
+    Parameters
+    ----------
+    recording : Recording
+    start : (3,) array_like
+        The first pose (m, m, rad).
+
+    Returns
+    -------
+    (N + 1, 3) float64
+        The start and the pose after each step; theta is not wrapped.
+
+    Raises
+    ------
+    SlamError
+        If an update is not possible, because covariances contradict each other.
     """
     lost = set(recording.lost.tolist())
     poses = np.empty((len(recording) + 1, 3))
