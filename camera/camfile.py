@@ -179,8 +179,7 @@ def _split(text: str, name: str) -> _Entries:
             continue
         if token == "}" and not open_until:
             if position + 1 != len(tokens):
-                following = tokens[position + 1][1]
-                raise CameraError(f"{name}:{following}: text after the closing brace")
+                raise CameraError(f"{name}:{tokens[position + 1][1]}: text after the closing brace")
             return entries
         if (token == ":" and not open_until) or not key:
             raise CameraError(f"{name}:{line}: unexpected {excerpt(token)}: expected 'key: value'")
@@ -218,5 +217,4 @@ def _pose_lines(key: str, pose: Pose) -> list[str]:
 
 def _shortest(number: float) -> str:
     """The shortest text that reads back as the same float."""
-    text = repr(float(number))
-    return text.removesuffix(".0")
+    return repr(float(number)).removesuffix(".0")

@@ -140,10 +140,7 @@ def straightened_point(
 
 @kernel()
 def straighten_points(
-    lens: FloatArray,
-    seen: FloatArray,
-    start_radius: FloatArray,
-    straight: FloatArray,
+    lens: FloatArray, seen: FloatArray, start_radius: FloatArray, straight: FloatArray
 ) -> None:
     """`straightened_point` of many."""
     for k in range(len(seen)):

@@ -81,8 +81,7 @@ def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
 
 def with_covariance(camera: Camera, covariance: FloatArray) -> Camera:
     """The camera with the (20, 20) covariance of its parameters, rounded to seven digits."""
-    numbers = (float(f"{x:.7g}") for x in covariance[_LOWER])
-    return replace(camera, covariance=tuple(numbers))
+    return replace(camera, covariance=tuple(float(f"{x:.7g}") for x in covariance[_LOWER]))
 
 
 def covariance_of(camera: Camera) -> FloatArray | None:
@@ -128,8 +127,8 @@ def tilt_by_parameters(camera: Camera) -> FloatArray:
     bearing, elevation = np.meshgrid(_BEARINGS, _ELEVATIONS, indexing="ij")
     ray = np.stack([np.sin(bearing), -np.cos(bearing), np.tan(elevation)], axis=-1)
     pixel = camera.project(ray @ camera.camera_from_robot.T)
-    size = np.array([camera.width, camera.height])
-    seen = np.all((pixel > -0.5) & (pixel < size - 0.5), axis=-1)
+    end = np.array([camera.width, camera.height]) - 0.5
+    seen = np.all((pixel > -0.5) & (pixel < end), axis=-1)
     usable = seen.sum(axis=1) >= 2
     ray, seen = ray[usable], seen[usable]
     if len(ray) < 2:
@@ -152,8 +151,7 @@ def _ray_by_parameters(camera: Camera, ray: FloatArray) -> FloatArray:
     """(N, 3, 20) derivatives of the (N, 3) directions assigned to pixels, in the robot frame."""
     in_camera = ray @ camera.camera_from_robot.T
     depth = in_camera[:, 2:]
-    normalised = in_camera / depth
-    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), normalised)
+    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), in_camera / depth)
     by_parameters = np.zeros((len(ray), 3, PARAMETERS))
     moved = -np.linalg.solve(by_point[:, :, :2], by_intrinsics) * depth[..., None]
     by_parameters[:, :, :COUNT] = camera.rotation[:, :2] @ moved

@@ -23,10 +23,8 @@ def rotation(theta_rad: ArrayLike) -> FloatArray:
 def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
     """(..., 3) poses a_from_c; the heading is wrapped."""
     a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
-    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
+    theta = wrap_angle(a[..., 2:] + b[..., 2:])
+    return np.concatenate([apply(a, b[..., :2]), theta], axis=-1)
 
 
 def invert(a_from_b: ArrayLike) -> FloatArray:

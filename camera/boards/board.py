@@ -121,8 +121,7 @@ class Board:
         return self.kind == "circles"
 
     def __str__(self) -> str:
-        counted = _WHAT_IS_COUNTED[self.kind]
-        return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
+        return f"{self.kind} board of {self.columns} x {self.rows} {_WHAT_IS_COUNTED[self.kind]}"
 
 
 def board_of(flags: BoardFlags) -> Board:
@@ -185,8 +184,7 @@ def sheet_of_board(board: Board) -> Sheet:
         width, height = (high - low)[:2] + board.circle_m
         text = f"{board}: distance {millimetres:g} mm, diameter {1e3 * board.circle_m:g} mm"
         return Sheet(dots, float(width), float(height), text)
-    side = board.square_m
-    columns, rows = board.columns, board.rows
+    side, columns, rows = board.square_m, board.columns, board.rows
     if board.kind == "checkerboard":
         columns, rows = columns + 1, rows + 1
     left, top = -0.5 * columns * side, 0.5 * rows * side
@@ -253,8 +251,7 @@ def pdf_of(sheet: Sheet) -> bytes:
     FigureCanvasPdf(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
-    axes.set_xlim(-0.5 * width, 0.5 * width)
-    axes.set_ylim(-0.5 * height, 0.5 * height)
+    axes.set(xlim=(-0.5 * width, 0.5 * width), ylim=(-0.5 * height, 0.5 * height))
     for shape in sheet.shapes:
         axes.add_patch(shape)
     bottom = -0.5 * height + _MARGIN_M

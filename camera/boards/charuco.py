@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation
 
 from camera.boards.board import Board, charuco_of
 from camera.errors import CalibrationError
-from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.array_types import FloatArray, GreyImage, IntArray
 
 # Length of the strips along the edges, in squares; farther out, the lens bends the edges.
 _ALONG = 0.4
@@ -107,13 +107,15 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
         wanted = wanted & ~tried
         if not wanted.any() or present.sum() < _FEWEST_FOUND:
             return result
-        homography = _homography(known, present)
+        # (3, 3) from (column, row) to pixels, by all corners; None if they are on a line.
+        places = np.argwhere(present)[:, ::-1].astype(np.float64)
+        homography: FloatArray | None = cv2.findHomography(places, known[present])[0]  # type: ignore[assignment]
         if homography is None:
             return result
         found = result.copy()
         for row, column in np.argwhere(wanted):
             tried[row, column] = True
-            at, axes = _expected(homography, known, present, row, column)
+            at, axes = _expected(homography, places, known[present], np.array([column, row], float))
             if np.isfinite(known[row, column, 0]):
                 at = known[row, column]
             parity = int(row + column) % 2
@@ -121,27 +123,18 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
         result = found
 
 
-def _homography(grid: FloatArray, present: BoolArray) -> FloatArray | None:
-    """(3, 3) from (column, row) to pixels, by all corners; None if they are on a line."""
-    places = np.argwhere(present)[:, ::-1].astype(np.float64)
-    found: FloatArray | None = cv2.findHomography(places, grid[present])[0]  # type: ignore[assignment]
-    return found
-
-
 def _expected(
-    homography: FloatArray, grid: FloatArray, present: BoolArray, row: int, column: int
+    homography: FloatArray, places: FloatArray, pixels: FloatArray, here: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Where a corner is expected, (2,), and the pixels of a square to the right and down, (2, 2).
 
-    The homography of all corners, plus the deviation of the nearest ones, due to the lens.
+    The homography of all corners, plus the deviation of the nearest ones, due to the lens. Takes
+    the `places` (column, row) of known corners, their pixels, and the corner's place.
     """
-    places = np.argwhere(present)[:, ::-1].astype(np.float64)
-    here = np.array([column, row], dtype=np.float64)
     near = np.argsort(np.sum((places - here) ** 2, axis=1), kind="stable")[:_NEIGHBOURS]
     relative = places[near] - here
-    differs = grid[present][near] - _mapped(homography, places[near])
-    system = np.hstack([np.ones((len(near), 1)), relative])
-    bend = np.linalg.lstsq(system, differs, rcond=None)[0]
+    differs = pixels[near] - _mapped(homography, places[near])
+    bend = np.linalg.lstsq(np.insert(relative, 0, 1.0, axis=1), differs, rcond=None)[0]
     step = 0.5 * np.eye(2)
     slope = _mapped(homography, here + step) - _mapped(homography, here - step)
     at = _mapped(homography, here[None])[0] + bend[0]
@@ -200,8 +193,7 @@ def _measured(
             return nothing
         if np.abs(step).max() < _STILL_PX:
             break
-    inside = (at >= low) & (at <= high)
-    if not inside.all():
+    if not np.all((at >= low) & (at <= high)):
         return nothing
     square = (pixels - at) @ to_squares.T
     window = grey[low[1] : high[1] + 1, low[0] : high[0] + 1].ravel()

@@ -66,11 +66,10 @@ def _not_found(board: Board) -> CalibrationError:
 
 
 def _checkerboard(image: GreyImage, board: Board, window: float) -> FloatArray:
-    size = (board.columns, board.rows)
     for reduced in _reductions(image):
         per_pixel = np.array([image.shape[1] / reduced.shape[1], image.shape[0] / reduced.shape[0]])
         for searched, in_image in both_heights(reduced):
-            found, corners = cv2.findChessboardCorners(searched, size)
+            found, corners = cv2.findChessboardCorners(searched, (board.columns, board.rows))
             if not found:
                 continue
             flat = in_image(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
@@ -186,11 +185,7 @@ def _least_spacing(grid: NDArray[np.float32]) -> float:
 
 
 def _circles(image: GreyImage, board: Board) -> FloatArray:
-    flag = (
-        cv2.CALIB_CB_ASYMMETRIC_GRID
-        if board.kind == "asymmetric-circles"
-        else cv2.CALIB_CB_SYMMETRIC_GRID
-    )
+    flag = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     size = (board.columns, board.rows)
     pictures = image, 255 - image
     # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark

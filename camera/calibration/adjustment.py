@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -33,9 +33,7 @@ from redetect.least_squares.solver import (
     robust_cost,
     stack,
 )
-from redetect.least_squares.solver import (
-    robust as robustified,
-)
+from redetect.least_squares.solver import robust as robustified
 
 #: Huber's constant, in standard deviations: the influence of larger residuals is constant.
 HUBER = 2.0
@@ -200,7 +198,7 @@ def adjust(
     estimate = start
     loss = Loss("huber", HUBER) if robust else Loss()
     problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
-    for _ in range(_SCALE_ROUNDS if sigma_px is None else 1):
+    for _ in range(_SCALE_ROUNDS):
         estimate = minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
         if sigma_px is not None:
             break
@@ -273,10 +271,7 @@ def fit_points(
     """Adjust intrinsics and poses to points, or to the centroids of circles of a radius above 0."""
     span = lens.span(settings.aspect)
     start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
-
-    def adjusted(start: Estimate, points: Points) -> Adjusted:
-        return adjust(start, points, span, robust=settings.robust)
-
+    adjusted = partial(adjust, span=span, robust=settings.robust)
     return fit_to_centres(adjusted, start, points, radius_m)
 
 
@@ -306,8 +301,7 @@ def _within(
     intrinsics: FloatArray, points: Points, span: FloatArray, aspect: float | None
 ) -> FloatArray:
     """The start with fixed parameters at their values: no coefficient, the known aspect."""
-    free = np.any(span != 0.0, axis=1)
-    inside = np.where(free, intrinsics, 0.0)
+    inside = np.where(np.any(span != 0.0, axis=1), intrinsics, 0.0)
     if aspect is not None:
         inside[1] = aspect * inside[0]
     return inside if is_possible(inside, points.width, points.height) else intrinsics

@@ -81,22 +81,16 @@ def warnings_of(fit: Adjusted, points: Points, spread_deg: float) -> list[str]:
         )
     warnings += coverage_warnings(fit.estimate.intrinsics, points)
     with suppress(CameraError):  # an impossible camera is an error elsewhere
-        warnings += uncertainty_warnings(fit, points)
+        size = {"width": points.width, "height": points.height}
+        camera = with_intrinsics(UNPOSED, fit.estimate.intrinsics, **size)
+        usual = float(np.median(projection_sigma(camera, fit.covariance)))
+        if not usual <= _LARGEST_SIGMA_PX:
+            warnings.append(
+                f"the projection is uncertain by {usual:.1f} px (median over the image): take more "
+                "pictures, with tilted boards, out to the corners; a lens that sees more than 85 "
+                "deg off its axis there is not described well"
+            )
     return warnings
-
-
-def uncertainty_warnings(fit: Adjusted, points: Points) -> list[str]:
-    """A warning if the projection is uncertain in most of the image."""
-    size = {"width": points.width, "height": points.height}
-    camera = with_intrinsics(UNPOSED, fit.estimate.intrinsics, **size)
-    usual = float(np.median(projection_sigma(camera, fit.covariance)))
-    if usual <= _LARGEST_SIGMA_PX:
-        return []
-    return [
-        f"the projection is uncertain by {usual:.1f} px (median over the image): take more "
-        "pictures, with tilted boards, out to the corners; a lens that sees more than 85 deg off "
-        "its axis there is not described well"
-    ]
 
 
 def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
@@ -228,10 +222,7 @@ def aspect_of(calibration: Calibration) -> Aspect:
 
 
 def calibrate_freely(
-    views: Sequence[BoardView],
-    board: Board,
-    size: tuple[int, int],
-    settings: CalibrationSettings,
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
     """As `calibrate`, with scales independent of each other if the views determine their ratio.
 

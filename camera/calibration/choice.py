@@ -76,9 +76,8 @@ def choose_lens(
     chosen, tried = _chosen_of_a_kind(fitted, start, settings)
     if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
-    counts = (2, 3)  # one coefficient, a3, is k1
-    others = [FreeLens(0, chosen.tangential, count) for count in counts]
-    polynomials = fitted(start, others)
+    # Not one: a3 alone is k1.
+    polynomials = fitted(start, [FreeLens(0, chosen.tangential, count) for count in (2, 3)])
     other = _fewest_needed(polynomials)
     # Unnecessary coefficients make the projection uncertain where there are no points.
     worth = -_WORTH if other.polynomial < chosen.coefficients else _POLYNOMIAL_WORTH
@@ -111,7 +110,11 @@ def _with_tangential(
         return chosen, radial
     beside = chosen._replace(tangential=True)
     tried = radial | fitted(radial[chosen].adjusted.estimate, [beside])
-    if not _is_worth_it(tried[chosen], tried[beside]):
+    # They have to explain the held-out points, and to be more than noise.
+    if not (
+        _is_lower(tried[beside], tried[chosen], _TANGENTIAL_WORTH)
+        and tangential_significance(tried[beside].adjusted) >= _TANGENTIAL_SIGNIFICANCE
+    ):
         return chosen, tried
     others = [lens._replace(tangential=True) for lens in radial if lens != chosen]
     more = {beside: tried[beside]} | fitted(start, others)
@@ -156,15 +159,8 @@ def _rms_px(estimate: Estimate, points: Points, radius_m: float) -> float:
 
 def _fewest_needed(tried: Candidates) -> FreeLens:
     best = min(tried.values(), key=lambda candidate: candidate.holdout_px)
-    slack = _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
-    limit = best.holdout_px**2 + slack
+    limit = best.holdout_px**2 + _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
     return min(lens for lens, candidate in tried.items() if candidate.holdout_px**2 <= limit)
-
-
-def _is_worth_it(radial: Candidate, decentred: Candidate) -> bool:
-    """Whether tangential terms explain the held-out points and are more than noise."""
-    lower = _is_lower(decentred, radial, _TANGENTIAL_WORTH)
-    return lower and tangential_significance(decentred.adjusted) >= _TANGENTIAL_SIGNIFICANCE
 
 
 def _is_lower(candidate: Candidate, other: Candidate, variances: float) -> bool:
@@ -177,8 +173,7 @@ def tangential_significance(adjusted: Adjusted) -> float:
     """Squared distance of (p1, p2) from 0 in standard deviations; 2 on average where they are 0."""
     places = [INTRINSICS.index(name) for name in TANGENTIAL]
     found = adjusted.estimate.intrinsics[places]
-    covariance = adjusted.covariance[np.ix_(places, places)]
-    return float(found @ np.linalg.pinv(covariance) @ found)
+    return float(found @ np.linalg.pinv(adjusted.covariance[np.ix_(places, places)]) @ found)
 
 
 def holdout_error(

@@ -74,7 +74,6 @@ def perform(options: Calibrate) -> int:
     calibration = calibrated(views, board, size, settings)
     camera = camera_of(calibration)
     print(describe(calibration, camera))
-
     print(
         "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
         "board on the floor"
@@ -85,9 +84,8 @@ def perform(options: Calibrate) -> int:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
                 place = options.pictures / f"{file_name(name)}.corners.png"
                 write_picture(picture, place, force=options.force)
-    drawn = pictures(calibration, camera)
-    for name, path in names.items():
-        write_bytes(path, drawn[name], overwrite=options.force)
+    for name, drawn in pictures(calibration, camera).items():
+        write_bytes(names[name], drawn, overwrite=options.force)
     write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
     write_bytes(report, report_text(options, calibration).encode(), overwrite=options.force)
     print(f"written: {output}, {', '.join(p.name for p in (report, *names.values()))}")
@@ -217,8 +215,8 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         f"  {name:8s} {value:12.6g}{_plus_minus(s, is_free=is_free)}"
         for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free)
     ]
-    views = len(calibration.names)
-    lines.insert(0, f"intrinsics from {len(calibration.points.board)} points in {views} pictures:")
+    count, views = len(calibration.points.board), len(calibration.names)
+    lines.insert(0, f"intrinsics from {count} points in {views} pictures:")
     ratio = aspect_of(calibration)
     if ratio.sigma > 0.0:
         lines.append(f"scaleY / scaleX {ratio.value:.5f} +- {ratio.sigma:.5f}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -61,10 +62,7 @@ def find_consensus(
     StartError
         If none explains any.
     """
-
-    def fitted(estimate: Estimate, used: BoolArray, lens: FreeLens) -> Consensus:
-        return _fitted(estimate, used, points, settings, lens, radius_m)
-
+    fitted = partial(_fitted, points, settings, radius_m)
     estimate = first_estimate(points, settings.aspect)
     errors = view_errors(estimate, points)
     used = np.isfinite(errors)
@@ -73,8 +71,7 @@ def find_consensus(
     _demand_most(used, names)
     few = min(2, settings.most)
     for count in (1, few):
-        fit = fitted(estimate, used, settings.lens(count))
-        estimate = best_poses(fit.estimate, points)
+        estimate = best_poses(fitted(estimate, used, settings.lens(count)).estimate, points)
     for count in range(few, settings.most + 1):
         found = fitted(estimate, used, settings.lens(count))
         estimate = found.estimate
@@ -108,12 +105,12 @@ def listed(names: Sequence[str], chosen: BoolArray) -> str:
 
 
 def _fitted(
-    estimate: Estimate,
-    used: BoolArray,
     points: Points,
     settings: CalibrationSettings,
-    lens: FreeLens,
     radius_m: float,
+    estimate: Estimate,
+    used: BoolArray,
+    lens: FreeLens,
 ) -> Consensus:
     """Fit to the views that are used; for the others, fit only the poses."""
     views, others = np.flatnonzero(used), np.flatnonzero(~used)
@@ -126,8 +123,7 @@ def _fitted(
         posed = best_poses(found.of(others), rest)
         found = found.with_poses(others, posed)
         residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
-    typical = view_rms(residuals, points, _COUNTED_SHARE)
-    rms = view_rms(residuals, points)
+    typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))
     return Consensus(
         fit=fit,
         estimate=found,

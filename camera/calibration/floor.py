@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass, replace
+from functools import partial
 from math import degrees, radians
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from camera.boards.board import board_of
 from camera.boards.points import find_board
 from camera.calibration.adjustment import (
     Adjusted,
-    Estimate,
     Points,
     adjust,
     fit_to_centres,
@@ -105,15 +105,10 @@ def place_on_floor(
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor, (camera.width, camera.height))
-    one_view = np.zeros(len(floor), dtype=np.int64)
-    points = Points(floor, pixels, one_view, camera.width, camera.height)
-    intrinsics = intrinsics_of(camera)
-    start = board_poses(intrinsics, points)[0]
-
-    def adjusted(start: Estimate, points: Points) -> Adjusted:
-        # Not robust with few points: four, for example, leave too few residuals to find outliers.
-        return adjust(start, points, np.zeros((COUNT, 0)), robust=len(floor) > 8)
-
+    points = Points(floor, pixels, np.zeros(len(floor), np.int64), camera.width, camera.height)
+    start = board_poses(intrinsics_of(camera), points)[0]
+    # Not robust with few points: four, for example, leave too few residuals to find outliers.
+    adjusted = partial(adjust, span=np.zeros((COUNT, 0)), robust=len(floor) > 8)
     try:
         fit, _ = fit_to_centres(adjusted, best_poses(start, points), points, radius_m)
     except ValueError:
@@ -149,8 +144,7 @@ def place_on_floor(
             f"worst, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all points right, "
             "is the floor flat, and is it this camera's calibration?"
         )
-    robot_from_camera = np.column_stack([R, t])
-    return FloorPose(robot_from_camera, covariance, by_intrinsics, fit, tuple(warnings))
+    return FloorPose(np.column_stack([R, t]), covariance, by_intrinsics, fit, tuple(warnings))
 
 
 def placed_camera(
@@ -197,8 +191,8 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
     yaw = radians(options.floor_yaw)
-    places = on_floor(board.points[indices], options.floor_origin, yaw)[:, :2]
-    return pixels, places, 0.5 * board.circle_m
+    places = on_floor(board.points[indices], options.floor_origin, yaw)
+    return pixels, places[:, :2], 0.5 * board.circle_m
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:

@@ -45,12 +45,11 @@ def pictures(calibration: Calibration, camera: Camera) -> dict[str, bytes]:
 
 def _image_axes(figure: Figure, place: int, calibration: Calibration) -> Axes:
     axes = figure.add_subplot(1, 2, place)
-    axes.set_xlim(-0.5, calibration.points.width - 0.5)
-    axes.set_ylim(calibration.points.height - 0.5, -0.5)
+    width, height = calibration.points.width, calibration.points.height
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     # Half-height images are shown with the proportions of the scene.
     axes.set_aspect(float(calibration.intrinsics[0] / calibration.intrinsics[1]))
-    axes.set_xlabel("u (px)")
-    axes.set_ylabel("v (px)")
+    axes.set(xlabel="u (px)", ylabel="v (px)")
     return axes
 
 
@@ -87,8 +86,7 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
     extent = (-0.5, points.width - 0.5, points.height - 0.5, -0.5)
     aspect = axes.get_aspect()
     shown = axes.imshow(np.sqrt(counts), cmap="Greens", extent=extent, aspect=aspect)
-    bar = figure.colorbar(shown, ax=axes, shrink=0.8)
-    bar.set_label("root of the number of points")
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="root of the number of points")
     axes.plot(points.pixels[:, 0], points.pixels[:, 1], ".", ms=1.5, color="0.2")
     for row, column in np.argwhere(counts == 0):
         axes.text(
@@ -99,8 +97,7 @@ def _draw_coverage(camera: Camera, calibration: Calibration, figure: Figure) -> 
     axes = _image_axes(figure, 2, calibration)
     sigma = projection_sigma(camera, calibration.adjusted.covariance)
     shown = axes.imshow(sigma, cmap="magma_r", extent=extent, aspect=aspect, vmin=0.0)
-    bar = figure.colorbar(shown, ax=axes, shrink=0.8)
-    bar.set_label("px")
+    figure.colorbar(shown, ax=axes, shrink=0.8, label="px")
     axes.set_title("Standard deviation of the projection")
 
 
@@ -135,7 +132,10 @@ def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
         line = camera.project_floor(np.column_stack([np.full(_POINTS_PER_LINE, x), ahead]))
         _polyline(picture, line, scale, _GRID, 2 if x % 1.0 == 0.0 else 1)
     for y in range(1, int(_AHEAD_M) + 1):
-        _label(picture, camera.project_floor([0.0, -float(y)]), scale, f"{y} m", _GRID)
+        place = camera.project_floor([0.0, -float(y)])
+        if np.isfinite(place).all() and np.abs(place).max() < 1e4:
+            u, v = _place(place, scale)
+            cv2.putText(picture, f"{y} m", (u + 4, v - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _GRID, 1)
     bearing = np.linspace(-np.pi, np.pi, 4 * _POINTS_PER_LINE)
     level = np.column_stack([np.sin(bearing), -np.cos(bearing), np.zeros(4 * _POINTS_PER_LINE)])
     _polyline(picture, camera.project_robot(camera.centre + 1e6 * level), scale, _HORIZON, 2)
@@ -188,14 +188,6 @@ def _polyline(
         cv2.line(
             picture, _place(first, scale, 8), _place(last, scale, 8), colour, width, cv2.LINE_AA, 3
         )
-
-
-def _label(
-    picture: ByteArray, place: FloatArray, scale: float, text: str, colour: tuple[int, int, int]
-) -> None:
-    if np.isfinite(place).all() and np.abs(place).max() < 1e4:
-        u, v = _place(place, scale)
-        cv2.putText(picture, text, (u + 4, v - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1)
 
 
 def _captioned(picture: ByteArray, text: str) -> ByteArray:

@@ -83,20 +83,17 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estim
 
 def best_poses(estimate: Estimate, points: Points) -> Estimate:
     """Each pose refined, from its start and from both of `board_poses`."""
-    candidates = [estimate, *board_poses(estimate.intrinsics, points)]
-    fits = [_poses_alone(candidate, points) for candidate in candidates]
+    fits = []
+    for start in (estimate, *board_poses(estimate.intrinsics, points)):
+        # Poses from which not all points are seen stay as they are.
+        found = _fitted_where_seen(start, points, np.zeros((COUNT, 0)))
+        fits.append(start if found is None else start.with_poses(found[1], found[0].estimate))
     errors = np.stack([view_errors(fit, points) for fit in fits])
     best = fits[0]
     for k, fit in enumerate(fits[1:], start=1):
         better = np.flatnonzero(np.argmin(errors, axis=0) == k)
         best = best.with_poses(better, fit.of(better))
     return best
-
-
-def _poses_alone(estimate: Estimate, points: Points) -> Estimate:
-    """Refine the poses from which all points are seen; the others stay as they are."""
-    found = _fitted_where_seen(estimate, points, np.zeros((COUNT, 0)))
-    return estimate if found is None else estimate.with_poses(found[1], found[0].estimate)
 
 
 def _fitted_where_seen(

@@ -77,8 +77,7 @@ def perform(options: Convert) -> int:
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose is dropped: the format has none (--pose-from restores it)")
-    written = format_of(camera, to_format)
-    write_bytes(options.target, written.encode(), overwrite=options.force)
+    write_bytes(options.target, format_of(camera, to_format).encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

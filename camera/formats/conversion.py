@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -188,12 +189,6 @@ def convert_to_foreign(
     if model != "fisheye":
         start[4 + P1 : 4 + P1 + 2] = source.tangential
 
-    def project(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return projected(model, parameters, rays)[:2]
-
-    def possible(parameters: FloatArray) -> bool:
-        return bool(min(parameters[:2]) > 0.0)
-
     def measured(parameters: FloatArray) -> Converted:
         fx, fy, cx, cy, *distortion = parameters.tolist()
         camera = ForeignCamera(model, width, height, fx, fy, cx, cy, tuple(distortion))
@@ -202,7 +197,13 @@ def convert_to_foreign(
     # From few coefficients to all, so that a fit does not start near a wrong minimum.
     counts = sorted({min(count, number) for count in (1, 2, 4, 5, 6, 7, 8)})
     spans = [np.eye(len(start))[:, : 4 + count] for count in counts]
-    return _nearest(CameraFit(pixels, project, possible, measured), start, spans)
+    fit = CameraFit(
+        pixels,
+        project=lambda parameters: projected(model, parameters, rays)[:2],
+        possible=lambda parameters: bool(min(parameters[:2]) > 0.0),
+        measured=measured,
+    )
+    return _nearest(fit, start, spans)
 
 
 def convert_to_camera(
@@ -244,27 +245,25 @@ def convert_to_camera(
             return measured(np.array([*start[:11], k1, k2, k3]))
     pixels, rays = _grid(source, rows, _FIT_GRID)
     points = np.column_stack([rays, np.ones(len(rays))])
-
-    def project(intrinsics: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return project_points(intrinsics, points)[:2]
-
-    def possible(intrinsics: FloatArray) -> bool:
-        return is_possible(intrinsics, width, height)
-
-    if not possible(start):
+    if not is_possible(start, width, height):
         raise ConversionError("the source's focal lengths or principal point are not possible here")
     decentred = any(tangential)
     spans = [FreeLens(count).span(None) for count in range(6)]
     if decentred:
         # Finally, the copied terms may compensate for errors of the radial part.
         spans.append(FreeLens(5, tangential=True).span(None))
-    fit = CameraFit(pixels, project, possible, measured)
+    fit = CameraFit(
+        pixels,
+        project=lambda intrinsics: project_points(intrinsics, points)[:2],
+        possible=partial(is_possible, width=width, height=height),
+        measured=measured,
+    )
     best = _nearest(fit, start, spans)
     if best.deviation_px <= _NEAR_PX:
         return best
     assert isinstance(best.camera, Camera)
-    together = FreeLens(5, decentred, 3).span(None)
-    return nearer(best, _nearest(fit, intrinsics_of(best.camera), [together]))
+    together = [FreeLens(5, decentred, 3).span(None)]
+    return nearer(best, _nearest(fit, intrinsics_of(best.camera), together))
 
 
 def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:
@@ -272,11 +271,8 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if isinstance(source, Camera):
         if any(source.coef[:2]) or model == "fisheye" or any(source.brown[number:]):
             return None
-        fx, fy, cx, cy = source.pinhole
-        distortion = np.zeros(COEFFICIENTS[model])
-        distortion[: len(source.brown)] = source.brown
-        found = tuple(distortion.tolist())
-        return ForeignCamera(model, source.width, source.height, fx, fy, cx, cy, found)
+        distortion = (*source.brown, *(0.0,) * (COEFFICIENTS[model] - len(source.brown)))
+        return ForeignCamera(model, source.width, source.height, *source.pinhole, distortion)
     if (source.model == "fisheye") != (model == "fisheye"):
         return None
     count = COEFFICIENTS[model]

@@ -184,11 +184,10 @@ class Detection(Table):
 
     def to_json(self) -> str:
         """An object with `discs`, `verticals` (lists of records) and `tilt`."""
-        tilt = None if self.tilt is None else plain(vars(self.tilt))
         content = {
             "image": self.name,
             "axes": self.axes,
-            "tilt": tilt,
+            "tilt": None if self.tilt is None else plain(vars(self.tilt)),
             "discs": _records(self.discs),
             "verticals": _records(self.verticals),
         }
@@ -441,10 +440,9 @@ class Explanation(DiscExplanation, Table):
     def columns(self) -> dict[str, Any]:
         """One row per candidate, numbered as in the picture."""
         rows = self.candidates
-        fields = Candidate._fields
         return {
             "number": list(range(1, len(rows) + 1)),
-            **{name: [getattr(row, name) for row in rows] for name in fields},
+            **{name: [getattr(row, name) for row in rows] for name in Candidate._fields},
             "reason": [row.reason() for row in rows],
         }
 

@@ -236,8 +236,7 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
         more = paths["more"]
-        some = [more] if isinstance(more, str | os.PathLike) else more
-        paths["more"] = tuple(map(Path, some))
+        paths["more"] = tuple(map(Path, [more] if isinstance(more, PathLike) else more))
     return paths
 
 

@@ -74,8 +74,7 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
     options = SourceOptions(**source)
     if isinstance(camera, Camera):
         return Recording(open_source(Path(name), None, options).calibrated(camera))
-    path = None if camera is None else Path(camera)
-    return Recording(open_run(Path(name), path, options))
+    return Recording(open_run(Path(name), None if camera is None else Path(camera), options))
 
 
 def compare(

@@ -23,10 +23,7 @@ from redetect.array_types import FloatArray, IntArray
 Axes = Literal["robotics", "dataset"]
 
 #: Meaning of the axes.
-MEANING: dict[str, str] = {
-    "robotics": "X forward, Y left",
-    "dataset": "X left, Y backward",
-}
+MEANING: dict[str, str] = {"robotics": "X forward, Y left", "dataset": "X left, Y backward"}
 
 # Indices and signs of the old coordinates that become the new first, second and third; for the
 # conversion back, the signs of the first two differ.

@@ -188,11 +188,7 @@ def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> Landmark
 
 
 def write_path(
-    path: FilePath,
-    poses: Path2D,
-    comments: Sequence[str] = (),
-    *,
-    overwrite: bool = False,
+    path: FilePath, poses: Path2D, comments: Sequence[str] = (), *, overwrite: bool = False
 ) -> None:
     """Write a path with columns `PATH_COLUMNS`, the covariance row by row if there is one."""
     columns, table = SHORT_PATH_COLUMNS, poses.poses
@@ -240,8 +236,7 @@ def write_table(
     text = io.StringIO()
     text.writelines(f"# {comment}\n" for comment in comments)
     csv.writer(text, lineterminator="\n").writerows([columns, *rows])
-    content = text.getvalue().encode("utf-8", "surrogateescape")
-    write_bytes(path, content, overwrite=overwrite)
+    write_bytes(path, text.getvalue().encode("utf-8", "surrogateescape"), overwrite=overwrite)
 
 
 def _read(

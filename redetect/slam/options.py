@@ -212,6 +212,3 @@ class Import:
     range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
     bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).
     force: bool = False  # Replace an existing file.
-
-
-Command = Map | Audit | Localize | Ekf | Associate | Noise | Export | Import

@@ -114,10 +114,7 @@ def draw_map(
     """
     panels = [("", landmark_map, path)]
     if before is not None:
-        panels = [
-            ("before closing loops", *before),
-            ("after closing loops", landmark_map, path),
-        ]
+        panels = [("before closing loops", *before), ("after closing loops", landmark_map, path)]
     low, high = _extent([(m, p) for _, m, p in panels], reference)
     width, height = (8.0 * (high - low) / np.max(high - low)).tolist()
     rows, columns = (len(panels), 1) if width > 1.5 * height else (1, len(panels))
@@ -126,12 +123,9 @@ def draw_map(
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
             _draw_panel(axes, some, poses, reference, low, high)
-            axes.set_xlim(low[0], high[0])
-            axes.set_ylim(low[1], high[1])
-            axes.set_aspect("equal")
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+            axes.set(xlabel="x / m", ylabel="y / m")
             axes.set_title(name, fontsize=11)
-            axes.set_xlabel("x / m")
-            axes.set_ylabel("y / m")
             axes.label_outer()
             axes.grid(alpha=0.25, lw=0.6)
         handles, labels = all_axes[-1].get_legend_handles_labels()
@@ -170,8 +164,7 @@ def draw_errors(
             axes.grid(alpha=0.25, lw=0.6)
         all_axes[0].legend(loc="upper left", fontsize=8, ncols=2)
         _draw_nees(all_axes[3], step, nees)
-        all_axes[-1].set_xlabel("step")
-        all_axes[-1].set_xlim(0, max(len(step) - 1, 1))
+        all_axes[-1].set(xlabel="step", xlim=(0, max(len(step) - 1, 1)))
         figure.align_ylabels(list(all_axes))
         if title:
             figure.suptitle(title, fontsize=12)
@@ -193,10 +186,8 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
         )
         # Space above for the legend.
         highest = max(100.0, 5.0 * float(np.max(nees[known])))
-        lowest = min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5))
-        axes.set_ylim(lowest, highest)
-    axes.set_yscale("log")
-    axes.set_ylabel("error², normalised")
+        axes.set_ylim(min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5)), highest)
+    axes.set(yscale="log", ylabel="error², normalised")
     axes.grid(alpha=0.25, lw=0.6)
     axes.legend(loc="upper left", fontsize=8, ncols=3)
 
@@ -320,7 +311,6 @@ def draw_crops(crops: Sequence[Crop], title: str) -> bytes:
             u, v = crop.pixel
             some.imshow(imread(crop.file), cmap="gray", aspect="auto")
             some.plot([u - 14, u + 14], [v, v], "+", color=_DISC, markersize=5)
-            some.set_xlim(u - _CROP_PX, u + _CROP_PX)
-            some.set_ylim(v + _CROP_PX / 2, v - _CROP_PX / 2)
+            some.set(xlim=(u - _CROP_PX, u + _CROP_PX), ylim=(v + _CROP_PX / 2, v - _CROP_PX / 2))
             some.set_title(crop.name, fontsize=8)
     return content.getvalue()

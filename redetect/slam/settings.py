@@ -6,14 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from redetect.bounds import (
-    PROBABILITY,
-    NotNegative,
-    Positive,
-    demand_fields,
-    from_to,
-    whole,
-)
+from redetect.bounds import PROBABILITY, NotNegative, Positive, demand_fields, from_to, whole
 from redetect.slam.errors import SlamError
 
 #: Bounds of positions given by flags (m, rad) and of their standard deviations.

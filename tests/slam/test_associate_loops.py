@@ -221,7 +221,7 @@ def test_a_path_bent_by_far_is_closed_by_matches() -> None:
         matches.append(
             Match(frame, frame + 120, np.zeros((0, 2), dtype=np.int64), np.append(shift, turn), -9)
         )
-    closed = closed_path(bent, matches)
+    closed = closed_path(bent, matches, np.zeros(0, np.int64))
     off = [np.linalg.norm(p[121:, :2] - p[1:121, :2], axis=1).max() for p in (bent, closed)]
     assert off[0] > 2.0
     assert off[1] < 0.3  # a start for least squares: matches and steps each give way a little

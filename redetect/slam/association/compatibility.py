@@ -23,8 +23,6 @@ from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.slam.errors import SlamError
 
 DEFAULT_GATE_PROBABILITY = 0.999
-#: Bound of the joint search.
-MOST_NODES = 30_000
 
 
 def compatible(
@@ -34,7 +32,7 @@ def compatible(
     noise: FloatArray,
     gate_probability: float = DEFAULT_GATE_PROBABILITY,
     *,
-    most_nodes: int = MOST_NODES,
+    most_nodes: int = 30_000,
 ) -> IntArray:
     """Associate rows with landmarks.
 

@@ -64,8 +64,7 @@ def associate_locally(
             found = _labels(ekf, rows.lines, len(lines_seen), settings)
             line_labels += found
             lines_seen.update(dict.fromkeys(found, frame))
-            ids = tuple((number,) for number in found)
-            ekf.measure(none._replace(lines=replace(rows.lines, ids=ids)))
+            ekf.measure(none._replace(lines=replace(rows.lines, ids=tuple((k,) for k in found))))
         if progress:
             progress(frame + 1)
     return np.array(disc_labels, dtype=np.int64), np.array(line_labels, dtype=np.int64)

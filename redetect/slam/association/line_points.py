@@ -272,8 +272,7 @@ def lines_by_points(
             path = solution.path
             places = solution.line_xy[np.where(used, labels, 0)]
             bearing = bearing_of_vertical(path[recording.lines.frame + 1], places, camera_xy)
-            off = wrap_angle(bearing - recording.lines.bearing_rad)
-            used &= np.abs(off) < 4.0 * sigma
+            used &= np.abs(wrap_angle(bearing - recording.lines.bearing_rad)) < 4.0 * sigma
         return path
 
     for _ in range(_FIRST_ROUNDS):
@@ -284,11 +283,10 @@ def lines_by_points(
         label_of = np.where(known, np.cumsum(known) - 1, -1)
         path = corrected(path, label_of[line_labels], places[known])
     labels = np.full(len(line_labels), -1, dtype=np.int64)
-    last = len(_HEADING_SIGMA_DEG) - 1
     for number, sigma_deg in enumerate(_HEADING_SIGMA_DEG):
         rays = rays_of(recording, path, camera_xy, _SIGMA_SCALE, np.radians(sigma_deg))
         labels, points = find_points(rays)
-        if number < last and len(points):
+        if number < len(_HEADING_SIGMA_DEG) - 1 and len(points):
             path = corrected(path, labels, points)
     rest = labels < 0
     _, own = np.unique(line_labels[rest], return_inverse=True)

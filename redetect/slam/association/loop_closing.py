@@ -46,7 +46,6 @@ _MOST_SQUARED = float(chdtri(3, 1e-6))
 _SYSTEMATIC_SIGMAS = 2.0
 # Weight of a lost step: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
-NO_STEPS = np.zeros(0, dtype=np.int64)
 # Labels farther apart than this are not compared.
 _FARTHEST_M = 0.35
 
@@ -61,11 +60,7 @@ class LabelledMap(NamedTuple):
 
 
 def intersect_bearings(
-    recording: Recording,
-    path: FloatArray,
-    labels: IntArray,
-    *,
-    camera_xy: ArrayLike = (0.0, 0.0),
+    recording: Recording, path: FloatArray, labels: IntArray, *, camera_xy: ArrayLike = (0.0, 0.0)
 ) -> FloatArray:
     """Positions of lines from the bearings of all their rows, given the path.
 
@@ -109,8 +104,7 @@ def solve_path(
         lines=replace(lines, ids=tuple((int(k),) for k in line_labels)),
     )
     graph = with_lines(graph_of_recording(labelled), labelled.lines, np.flatnonzero(known))
-    camera = np.asarray(camera_xy, dtype=np.float64)
-    graph = replace(graph, camera_xy=camera, line_prior=places[known])
+    graph = replace(graph, camera_xy=np.asarray(camera_xy, np.float64), line_prior=places[known])
     seen = apply(poses[graph.disc_pose], graph.disc_xy)
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
@@ -122,10 +116,7 @@ def solve_path(
 
 
 def merge_labels(
-    frames: IntArray,
-    labels: IntArray,
-    pairs: Iterable[tuple[int, int]],
-    most_together: float = 0.0,
+    frames: IntArray, labels: IntArray, pairs: Iterable[tuple[int, int]], most_together: float = 0.0
 ) -> tuple[IntArray, int]:
     """Merge labels that are the same landmark.
 
@@ -185,9 +176,7 @@ def pairs_by_position(
     seen = csr_array(sightings(stretches), dtype=np.bool_)
     linked = csr_array(shared_landmarks(stretches) >= SHARED_BY_ONE_PLACE)
     one_place = np.asarray((linked @ seen[:, first]).multiply(seen[:, second]).sum(axis=0)) > 0
-    apart = xy[first] - xy[second]
-    both = covariance[first] + covariance[second]
-    squared = squared_mahalanobis(apart, both)
+    squared = squared_mahalanobis(xy[first] - xy[second], covariance[first] + covariance[second])
     usable = np.flatnonzero(one_place & (squared <= chdtri(2, 1.0 - gate_probability)))
     ordered = usable[np.lexsort((second[usable], first[usable], squared[usable]))]
     return [(int(first[k]), int(second[k])) for k in ordered]
@@ -243,9 +232,7 @@ def consistent_matches(
     return [match for match, right in zip(matches, taken[len(closed) :]) if right]
 
 
-def closed_path(
-    path: FloatArray, matches: Sequence[Match], lost: IntArray = NO_STEPS
-) -> FloatArray:
+def closed_path(path: FloatArray, matches: Sequence[Match], lost: IntArray) -> FloatArray:
     """A path that satisfies the matches, as a start for least squares over everything.
 
     Headings first, then positions: each of the two problems is linear (L. Carlone, R. Aragues,
@@ -264,10 +251,8 @@ def closed_path(
     after = np.concatenate([np.arange(1, count + 1), second])
     seen = between(np.concatenate([path[:-1], path[first]]), np.concatenate([path[1:], moved]))
     turns = np.concatenate([np.diff(path[:, 2]), moved[:, 2] - path[first, 2]])
-    is_match = np.arange(len(before)) >= count
-    weights = [1.0 / np.where(is_match, _MATCH_SIGMA[a], _STEP_SIGMA[a]) for a in (0, 1)]
-    for weight in weights:
-        weight[lost] = _LOST_WEIGHT
+    weights = 1.0 / np.repeat([_STEP_SIGMA, _MATCH_SIGMA], [count, len(matches)], axis=0).T
+    weights[:, lost] = _LOST_WEIGHT
     theta = path[0, 2] + _chained(before, after, turns[:, None], weights[0], count)[:, 0]
     offsets = np.einsum("nij,nj->ni", rotation(theta[before]), seen[:, :2])
     xy = path[0, :2] + _chained(before, after, offsets, weights[1], count)

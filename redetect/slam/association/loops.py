@@ -257,17 +257,15 @@ def stretches_of(
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:
-            middle = min(start + length // 2, count - 1)
-            found.append(Stretch(middle, seen, xy[seen]))
+            found.append(Stretch(min(start + length // 2, count - 1), seen, xy[seen]))
     return found
 
 
 def sightings(stretches: Sequence[Stretch]) -> csr_array:
     """(S, M) sparse int64, 1 where a stretch shows a label."""
-    sizes = np.array([len(s.labels) for s in stretches], dtype=np.int64)
     labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    shape = (len(sizes), int(labels.max(initial=-1)) + 1)
+    starts = np.cumsum([0, *(len(s.labels) for s in stretches)])
+    shape = (len(stretches), int(labels.max(initial=-1)) + 1)
     return csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
 
 
@@ -392,8 +390,8 @@ def _refined(
     if found is None:
         return None
     pose, pairs = found
-    after = apply(pose, later.xy)
-    nearest = np.linalg.norm(after[:, None] - earlier.xy[None], axis=2).min(axis=1)
+    off = apply(pose, later.xy)[:, None] - earlier.xy
+    nearest = np.linalg.norm(off, axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
     return Match(
         earlier.middle_frame,
@@ -408,7 +406,6 @@ def covered_area(xy: FloatArray) -> float:
     """Area within the cover distance of any point (m^2), on a grid."""
     low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
     xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
-    squared = (xs[None, :, None] - xy[:, 0, None, None]) ** 2 + (
-        ys[None, None, :] - xy[:, 1, None, None]
-    ) ** 2
+    x, y = xy.T[:, :, None, None]
+    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
     return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)

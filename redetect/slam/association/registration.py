@@ -61,8 +61,6 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
 
     Identifiers are not used. Takes the map's discs (M, 2) (m).
     """
-    if len(recording) == 0:
-        return None
     most = min(len(recording), _MOST_FRAMES)
     poses = chain_steps(recording.steps[:most])
     rows = recording.circles.only(recording.circles.frame < most)
@@ -118,8 +116,7 @@ def located(
         return None
     pose, pairs = found
     chance = chance_of_agreeing(disc_xy)
-    alarms = log10_false_alarms(len(pairs), len(discs), chance, motion.tried)
-    if alarms > math.log10(false_alarms):
+    if log10_false_alarms(len(pairs), len(discs), chance, motion.tried) > math.log10(false_alarms):
         return None
     # Also one on the same discs: pairs in a corridor look alike from both ends, and a period on.
     rival = motion_onto(discs, disc_xy, ANYWHERE, besides=pose)

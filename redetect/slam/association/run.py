@@ -236,8 +236,7 @@ def _closed_by_parts(
         )
     counts = np.cumsum([0, *(len(part.xy) for part in parts)])
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
-    own = [part.path[int(k > 0) :] for k, part in enumerate(parts)]
-    laid = [compose(motion, path) for motion, path in zip(motions, own)]
+    laid = [compose(motions[k], part.path[int(k > 0) :]) for k, part in enumerate(parts)]
     labels, _ = merge_labels(frames, together, pairs_by_votes(pairs), _most_together(recording))
     whole = _closed(recording, labels, settings, camera_xy, report, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
@@ -301,19 +300,14 @@ def _closed(
             matches += found
             if len(at.xy) == before and search.most_shift_m == math.inf:
                 break
-            search = _everywhere(length)
+            search = _EVERYWHERE._replace(
+                stretch_frames=length,
+                attached_frames=_EVERYWHERE.attached_frames * length // STRETCH_FRAMES,
+            )
         if not by_discs or length == _LONGEST or not _sparse(frames, at, len(recording), length):
             return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
         length = min(2 * length, _LONGEST)
         search = Search(stretch_frames=length)
-
-
-def _everywhere(length: int) -> Search:
-    """The search for stretches of a length everywhere in the map."""
-    return _EVERYWHERE._replace(
-        stretch_frames=length,
-        attached_frames=_EVERYWHERE.attached_frames * length // STRETCH_FRAMES,
-    )
 
 
 def _sparse(frames: IntArray, at: _Solved, count: int, length: int) -> bool:
@@ -336,23 +330,20 @@ def _with_matches(
     In a regular pattern of discs, odometry cannot exclude every wrong match. These bend the path,
     so that errors of all rows along it increase the cost far more than those of a right match.
     """
-    frames, lost = _frames_of_labels(recording), recording.lost
-    if not len(recording.circles) and not matches:
-        # The lines intersect elsewhere along the solved path.
-        return solved(before.labels, before.path), []
+    by_discs, frames = len(recording.circles) > 0, _frames_of_labels(recording)
+    if not matches:
+        # Lines intersect elsewhere along the solved path.
+        return (before if by_discs else solved(before.labels, before.path)), []
     at, closed = before, list[Match]()
     waiting = [sorted(matches, key=lambda match: (match.later_frame, match.earlier_frame))]
     fewest = math.ceil(len(matches) / _MOST_PARTS)
     while waiting:
         some = waiting.pop()
-        if not some:
-            continue
         together = [*closed, *some]
         pairs = pairs_by_votes(match.pairs for match in together)
         labels, _ = merge_labels(frames, before.labels, pairs, _most_together(recording))
-        trial = solved(labels, closed_path(before.path, together, lost))
-        allowed = _MOST_COST * (len(at.xy) - len(trial.xy))
-        if not len(recording.circles) or trial.cost - at.cost <= allowed:
+        trial = solved(labels, closed_path(before.path, together, recording.lost))
+        if not by_discs or trial.cost - at.cost <= _MOST_COST * (len(at.xy) - len(trial.xy)):
             at, closed = trial, together
         elif len(some) > fewest:
             half = len(some) // 2

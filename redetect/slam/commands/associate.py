@@ -139,8 +139,7 @@ def identified_rows(
         numbers[kind] = iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
     for row in rows:
         if isinstance(row.record, CircleLandmark | LineLandmark):
-            number = next(numbers[type(row.record)])
-            yield row.with_record(replace(row.record, ids=(number,)))
+            yield row.with_record(replace(row.record, ids=(next(numbers[type(row.record)]),)))
         else:
             yield row
 

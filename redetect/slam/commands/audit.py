@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
-from redetect.landmarks import CircleLandmark, Frame, Row, read_frames, read_rows, write_rows
+from redetect.landmarks import CircleLandmark, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import camera_of_run, recording_of
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.audit import Audit, Group, audit_run
+from redetect.slam.mapping.audit import Audit, audit_run
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import Recording, landmark_files
@@ -53,8 +53,7 @@ def perform(options: Options) -> int:
         print(line)
     print(f"{target}, {target.with_suffix('.csv').name}")
     if options.pictures is not None and camera is not None:
-        images = options.images or source.parent
-        _draw(options, images, camera, audit, list(read_frames(source)))
+        _draw(options, camera, audit, source)
     return 0
 
 
@@ -86,11 +85,6 @@ def _table(recording: Recording, audit: Audit, rows: Iterable[Row]) -> list[list
     return table
 
 
-def _frames_of(recording: Recording, group: Group) -> str:
-    first, last = recording.circles.frame[group.rows[[0, -1]]]
-    return f"{first}" if first == last else f"{first}-{last}"
-
-
 def _report(recording: Recording, audit: Audit) -> list[str]:
     head = f"{'frames':<12}{'rows':>5}{'ID':>7}  {'at (m)':<18}{'off by':>8}{'chi-squared':>13}"
     lines = [f"{head}  shows"]
@@ -101,8 +95,10 @@ def _report(recording: Recording, audit: Audit) -> list[str]:
             "drop": "no landmark",
         }[group.kind]
         x, y = np.median(group.xy, axis=0)
+        first, last = recording.circles.frame[group.rows[[0, -1]]]
+        frames = f"{first}" if first == last else f"{first}-{last}"
         lines.append(
-            f"{_frames_of(recording, group):<12}{len(group.rows):>5}{group.id:>7}  "
+            f"{frames:<12}{len(group.rows):>5}{group.id:>7}  "
             f"{f'{x:.2f}, {y:.2f}':<18}{group.own_m:>6.2f} m{group.chi_squared:>13,.1f}  {shows}"
         )
     lines.append(f"{'':<12}{'rows':>8}{'discs':>8}{'chi-squared':>14}{'expected':>10}{'factor':>8}")
@@ -115,11 +111,10 @@ def _report(recording: Recording, audit: Audit) -> list[str]:
     return lines
 
 
-def _draw(
-    options: Options, images: Path, camera: Camera, audit: Audit, frames: list[Frame]
-) -> None:
+def _draw(options: Options, camera: Camera, audit: Audit, source: Path) -> None:
     """Crops of the images at the rows of each group."""
     assert options.pictures is not None
+    images, frames = options.images or source.parent, list(read_frames(source))
     seen = [(k, disc) for k, frame in enumerate(frames) for disc in frame.circles]
     drawn = 0
     for group in audit.groups:

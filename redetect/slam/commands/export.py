@@ -23,18 +23,17 @@ from redetect.slam.options import Export, Import
 from redetect.slam.recording import Recording, frames_of_discs
 from redetect.storage import demand_free
 
-_LANDMARKS = (".circles", ".lines", ".markers")
-
 
 def perform(command: Export | Import) -> int:
     """Execute the command; returns the exit code."""
     if isinstance(command, Import):
-        return _import(command)
-    export = {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to]
-    return export(command)
+        _import(command)
+    else:
+        {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to](command)
+    return 0
 
 
-def _export_g2o(command: Export) -> int:
+def _export_g2o(command: Export) -> None:
     recording = recording_of(command)
     if len(recording.lines):
         raise SlamError("bearings of verticals have no edge in g2o: expected discs, or --to csv")
@@ -46,10 +45,9 @@ def _export_g2o(command: Export) -> int:
         f"{len(recording)} steps, {len(rows)} measurements of discs"
         f"{_left_out(len(recording.circles) - len(rows))}"
     )
-    return 0
 
 
-def _export_tum(command: Export) -> int:
+def _export_tum(command: Export) -> None:
     if command.run.suffix == ".csv":
         path = read_path(command.run)
     else:
@@ -60,7 +58,6 @@ def _export_tum(command: Export) -> int:
     write_tum(command.output, path, times=times, comments=head, overwrite=command.force)
     count = len(path.poses) if times is None else len(path.poses) - 1
     print(f"{command.output}: {count} poses")
-    return 0
 
 
 def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
@@ -79,7 +76,7 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
     return None
 
 
-def _export_tables(command: Export) -> int:
+def _export_tables(command: Export) -> None:
     recording, folder = recording_of(command), command.output
     tables = {"odometry.csv": odometry_table(recording), "discs.csv": disc_table(recording)}
     if len(recording.lines):
@@ -88,71 +85,64 @@ def _export_tables(command: Export) -> int:
     demand_free([folder / name for name in tables], overwrite=command.force)
     folder.mkdir(parents=True, exist_ok=True)
     for name, table in tables.items():
-        head = _head(command.run)
-        write_table(folder / name, table.columns, table.rows, head, overwrite=command.force)
+        write_table(folder / name, *table, _head(command.run), overwrite=command.force)
     discs, lines = recording.circles.identified, recording.lines.identified
     parts = [f"{len(recording)} steps"]
     parts.append(f"{discs.sum()} measurements of discs{_left_out(int(np.sum(~discs)))}")
     if len(lines):
         parts.append(f"{lines.sum()} bearings{_left_out(int(np.sum(~lines)))}")
     print(f"{folder}: {', '.join(parts)}")
-    return 0
 
 
-def _import(command: Import) -> int:
-    if command.file.suffix in _LANDMARKS:
+def _import(command: Import) -> None:
+    if command.file.suffix in (".circles", ".lines", ".markers"):
         raise SlamError(
             f"{command.file}: is a landmark file: expected a .g2o graph or a trajectory; "
             "`slam export` writes them"
         )
     if command.file.suffix in (".dat", ".mat"):
-        return _import_data_set(command)
-    if command.file.suffix != ".g2o":
-        return _write_path(command, read_tum(command.file))
-    graph = read_g2o(command.file)
-    run = graph.recording
-    if command.output.suffix == ".csv":
-        return _write_path(command, Path2D(("start", *run.prefixes), graph.poses))
-    return _write_run(command, run, "measurements of discs")
+        _import_data_set(command)
+    elif command.file.suffix != ".g2o":
+        _write_path(command, read_tum(command.file))
+    elif command.output.suffix != ".csv":
+        _write_run(command, read_g2o(command.file).recording, "measurements of discs")
+    else:
+        graph = read_g2o(command.file)
+        _write_path(command, Path2D(("start", *graph.recording.prefixes), graph.poses))
 
 
-def _import_data_set(command: Import) -> int:
+def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
-    file = command.file
+    file, sigmas = command.file, (command.range_sigma, command.bearing_sigma)
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
         write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
-        return 0
-    if file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
+    elif file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
         path, repeated = data_sets.read_truth(file)
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
-        return _write_path(command, path, note)
-    sigmas = command.range_sigma, command.bearing_sigma
-    if file.name.endswith(data_sets.ODOMETRY):
-        run = data_sets.read_robot(file, *sigmas)
+        _write_path(command, path, note)
+    elif file.name.endswith(data_sets.ODOMETRY):
+        _write_run(command, data_sets.read_robot(file, *sigmas), "measurements")
     elif file.name == data_sets.DRIVE:
-        run = data_sets.read_drive(file, *sigmas)
+        _write_run(command, data_sets.read_drive(file, *sigmas), "measurements")
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "
             f"data set, or the {data_sets.DRIVE} of Victoria Park"
         )
-    return _write_run(command, run, "measurements")
 
 
-def _write_run(command: Import, run: Recording, what: str) -> int:
+def _write_run(command: Import, run: Recording, what: str) -> None:
     head, frames = _made_by(command.file), frames_of_discs(run)
     write_frames(command.output, frames, head=head, overwrite=command.force)
     print(f"{command.output}: {len(run)} steps, {len(run.circles)} {what}")
-    return 0
 
 
-def _write_path(command: Import, path: Path2D, note: str = "") -> int:
+def _write_path(command: Import, path: Path2D, note: str = "") -> None:
     write_path(command.output, path, [_made_by(command.file)], overwrite=command.force)
     print(f"{command.output}: {len(path.poses)} poses{note}")
-    return 0
 
 
 def _made_by(source: Path) -> str:

@@ -90,8 +90,7 @@ def perform(command: Localize | Ekf) -> int:
         "figures": _figures(run, distance),
     }
     if isinstance(command, Ekf):
-        counts = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
-        content["landmarks"] = counts
+        content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
         if command.reference_map:
             off = map_distance(landmark_map, read_map(command.reference_map))
             content["distance_from_reference_map"] = off

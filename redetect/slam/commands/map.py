@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,7 @@ import numpy as np
 from camera import write_camera
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
-from redetect.landmarks.map_file import (
-    covariance_file,
-    write_map,
-    write_path,
-)
+from redetect.landmarks.map_file import covariance_file, write_map, write_path
 from redetect.slam.commands.files import (
     MAP_NAME,
     MAP_PICTURE,
@@ -33,7 +30,6 @@ from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck
 from redetect.slam.mapping.run_map import (
-    LeftOut,
     MappedRun,
     Mounting,
     as_json,
@@ -88,8 +84,7 @@ def perform(command: Map) -> int:
     if not few:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
-    ends = first_poses(runs)
-    for first, end, own in zip(ends, ends[1:], paths):
+    for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = mapped.odometry_check()
     write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
@@ -102,8 +97,7 @@ def perform(command: Map) -> int:
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
     write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
-    if mapped.mounting is not None and mapped.graph.camera is not None:
-        found = mapped.mounting
+    if (found := mapped.mounting) is not None and mapped.graph.camera is not None:
         mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
     print(f"{output}: {', '.join(names)}")
@@ -142,7 +136,14 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
         lines.append(f"{'minimised, under the loss':<28}{mapped.cost:>12,.2f}")
     if mapped.mounting is not None:
         lines += _mounting_lines(mapped.mounting)
-    lines += _left_out_lines(mapped.left_out)
+    left_out = mapped.left_out
+    said = [
+        (left_out.rows_without_id, "rows without an identifier, not used"),
+        (left_out.discs_seen_once, "discs seen once"),
+        (left_out.lines_without_parallax, "lines with too little parallax, not used"),
+        (left_out.line_rows, "rows of these lines, not used"),
+    ]
+    lines += [f"{what}: {count}" for count, what in said if count]
     lines += doubts_of(check, mapped.table.root, mapped.prefixes)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
@@ -190,23 +191,12 @@ def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[s
 def _mounting_lines(mounting: Mounting) -> list[str]:
     sigma = np.sqrt(np.diag(mounting.covariance))
     names = [f"rotation about {axis}" for axis in "xyz"] + ["place x", "place y", "height"]
-    units = ["rad"] * 3 + ["m"] * 3
     lines = [
         f"{name:<28}{value:>12.4f} +- {spread:.4f} {unit}"
-        for name, value, spread, unit in zip(names, mounting.change, sigma, units)
+        for name, value, spread, unit in zip(names, mounting.change, sigma, ["rad"] * 3 + ["m"] * 3)
         if spread > 0.0
     ]
     return [*lines, f"{'gained by the mounting':<28}{mounting.gain:>12,.2f}"]
-
-
-def _left_out_lines(left_out: LeftOut) -> list[str]:
-    said = [
-        (left_out.rows_without_id, "rows without an identifier, not used"),
-        (left_out.discs_seen_once, "discs seen once"),
-        (left_out.lines_without_parallax, "lines with too little parallax, not used"),
-        (left_out.line_rows, "rows of these lines, not used"),
-    ]
-    return [f"{what}: {count}" for count, what in said if count]
 
 
 def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str, Any]:
@@ -219,13 +209,13 @@ def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str,
         "steps": mapped.steps,
         "left_out": asdict(mapped.left_out),
     }
-    if mapped.mounting is not None:
+    if (found := mapped.mounting) is not None:
         results["mounting"] = {
-            "rotation_rad": mapped.mounting.change[:3].tolist(),
-            "place_m": mapped.mounting.change[3:5].tolist(),
-            "height_m": float(mapped.mounting.change[5]),
-            "covariance": mapped.mounting.covariance.tolist(),
-            "robot_from_camera": mapped.mounting.robot_from_camera.tolist(),
-            "chi_squared_gained": mapped.mounting.gain,
+            "rotation_rad": found.change[:3].tolist(),
+            "place_m": found.change[3:5].tolist(),
+            "height_m": float(found.change[5]),
+            "covariance": found.covariance.tolist(),
+            "robot_from_camera": found.robot_from_camera.tolist(),
+            "chi_squared_gained": found.gain,
         }
     return results

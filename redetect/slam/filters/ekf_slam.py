@@ -117,9 +117,9 @@ class EkfSlam(Filter):
         """The landmarks with known positions, with their covariances."""
         of_discs = numbers_from([*self.disc_slots.values()], 2)
         of_lines = numbers_from([*self.line_slots.values()], self.line_size)
-        inverse = self._state[of_lines[:, 3]]
-        variance = self._covariance[of_lines[:, 3], of_lines[:, 3]]
-        placed = np.sqrt(variance) < LARGEST_RANGE_SIGMA * inverse
+        inverse = of_lines[:, 3]
+        sigma = np.sqrt(self._covariance[inverse, inverse])
+        placed = sigma < LARGEST_RANGE_SIGMA * self._state[inverse]
         of_lines = of_lines[placed]
         points, by_numbers = self.line_points(of_lines)
         line_xy = points[:, :2] / points[:, 2:]

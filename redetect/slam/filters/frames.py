@@ -320,12 +320,7 @@ class Filter(ABC):
         self._covariance = covariance
 
     def _put(
-        self,
-        slot: int,
-        index: IntArray,
-        jacobian: FloatArray,
-        noise: FloatArray,
-        value: FloatArray,
+        self, slot: int, index: IntArray, jacobian: FloatArray, noise: FloatArray, value: FloatArray
     ) -> None:
         """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
 
@@ -387,15 +382,12 @@ class Associator:
         names = names[away < FARTHEST_LINE_M]
         if not len(names) or not len(rows):
             return ((),) * len(rows)
-        compared = estimate.compared(rows, names)
-        landmark = compatible(self.method, *compared, self.gate_probability)
+        landmark = compatible(self.method, *estimate.compared(rows, names), self.gate_probability)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
 
 def run_filter(
-    recording: Recording,
-    estimate: Filter,
-    associator: Associator | None = None,
+    recording: Recording, estimate: Filter, associator: Associator | None = None
 ) -> FilterRun:
     """Run a filter, which is at the start, over a run.
 

@@ -25,11 +25,7 @@ import numpy as np
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import FINITE
 from redetect.landmarks import is_positive_definite
-from redetect.landmarks.axes import (
-    covariance_from_dataset,
-    from_dataset,
-    to_dataset,
-)
+from redetect.landmarks.axes import covariance_from_dataset, from_dataset, to_dataset
 from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
@@ -66,8 +62,8 @@ def graph_of_run(recording: Recording) -> RunGraph:
     graph = graph_of_recording(recording)
     estimate = first_sight(graph)
     rows = recording.circles.only(recording.circles.identified)
-    identified = replace(recording, circles=rows)
-    return RunGraph(identified, estimate.poses, graph.disc_ids, estimate.disc_xy)
+    run = replace(recording, circles=rows)
+    return RunGraph(run, estimate.poses, graph.disc_ids, estimate.disc_xy)
 
 
 def first_disc_vertex(last_pose_vertex: int) -> int:

@@ -142,9 +142,8 @@ def _fit(
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
     estimate = solve(graph, first, weighting, tolerance=1e-7).at
-    equations = equations_at(graph, estimate, weighting)
-    table = chi_squared(graph, estimate, weighting)
-    return _Fit(graph, estimate, weighting, factor(equations.matrix), table)
+    information = factor(equations_at(graph, estimate, weighting).matrix)
+    return _Fit(graph, estimate, weighting, information, chi_squared(graph, estimate, weighting))
 
 
 def _misfit(
@@ -217,14 +216,13 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
         mended = _misfit(recording, fit, rows, new_id, place)
         if len(rows) == 1 or mended > chdtri(2 * len(rows) - 2, _LEAST_PROBABILITY):
             kind, new_id, mended = "drop", UNKNOWN_ID, np.nan
-    own = int(np.searchsorted(graph.disc_ids, number))
     return Group(
         rows=rows,
         id=number,
         kind=kind,
         new_id=new_id,
         xy=xy,
-        own_m=float(away[own]),
+        own_m=float(away[np.searchsorted(graph.disc_ids, number)]),
         row_chi_squared=score,
         chi_squared=_misfit(recording, fit, rows, number),
         mended_chi_squared=float(mended),

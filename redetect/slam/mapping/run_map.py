@@ -17,17 +17,11 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from redetect.least_squares.solver import LossKind, Minimum
+from redetect.least_squares.solver import Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.filtered_start import filtered_poses
-from redetect.slam.mapping.graph import (
-    Estimate,
-    Graph,
-    first_sight,
-    graph_of_recording,
-    with_lines,
-)
+from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
@@ -230,8 +224,10 @@ def map_run(
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
     begin = _in_place(recording, graph, first_sight(graph, start), name)
-    plain = Weighting()
-    descend = _descent(solver, wanted.loss)
+    descend: Callable[[Graph, Estimate, Weighting], Minimum[Estimate]] = solve_gtsam
+    if solver != "gtsam":
+        # A robust loss converges slowly at the end, since reweighting is not Newton's method.
+        descend = partial(solve, tolerance=1e-10 if wanted.loss == "none" else 1e-7)
     trail: list[Minimum[Estimate]] = []
 
     def keep(solution: Minimum[Estimate]) -> Estimate:
@@ -239,7 +235,7 @@ def map_run(
         return solution.at
 
     more = len(recording.lines) > 0
-    only_start = more or wanted != plain or solver != "separable"
+    only_start = more or wanted != Weighting() or solver != "separable"
     estimate = keep(_plain(recording, graph, begin, _COARSE if only_start else 1e-10, name))
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     if more:
@@ -357,13 +353,12 @@ def _with_lines(
 ) -> tuple[Graph, Estimate]:
     """The problem with the lines whose positions stay determined when everything is fitted."""
     ids, xy = placed.ids, placed.xy
-    robust = Weighting(loss="huber")
     while True:
         graph = with_lines(graph, recording.lines, ids)
         estimate = replace(estimate, line_xy=xy)
         if len(ids) == 0:
             return graph, estimate
-        estimate = keep(solve(graph, estimate, robust, tolerance=_COARSE))
+        estimate = keep(solve(graph, estimate, Weighting(loss="huber"), tolerance=_COARSE))
         good = well_placed(graph, estimate)
         if np.all(good):
             return graph, estimate
@@ -383,32 +378,20 @@ def _on_the_way(wanted: Weighting) -> list[Weighting]:
     return [Weighting(), *wider]
 
 
-def _descent(
-    solver: Solver, loss: LossKind
-) -> Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]:
-    if solver == "gtsam":
-        return solve_gtsam
-    # A robust loss converges slowly at the end, since reweighting is not Newton's method.
-    return partial(solve, tolerance=1e-10 if loss == "none" else 1e-7)
-
-
 def _check_usable(
     recording: Recording, camera: Camera | None, weighting: Weighting, name: str
 ) -> None:
-    known = bool(np.any(recording.circles.ids >= 0)) or any(recording.lines.ids)
     if not len(recording.circles) and not len(recording.lines):
         raise SlamError(
             f"{name}: no landmark in it: expected rows of discs or, with --lines, of verticals, as "
             "`detect circles` and `detect lines` write them"
         )
-    if not known:
+    if not np.any(recording.circles.ids >= 0) and not any(recording.lines.ids):
         raise SlamError(
             f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
         )
-    needs = "lines" if len(recording.lines) else ""
-    if weighting.calibrate:
-        needs = "the camera's mounting"
-    if needs and camera is None:
+    if camera is None and (weighting.calibrate or len(recording.lines)):
+        needs = "the camera's mounting" if weighting.calibrate else "lines"
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
     if weighting.calibrate and camera is not None:
         if len(recording.lines):
@@ -420,12 +403,12 @@ def _check_usable(
 
 def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:
     lines = recording.lines
+    identified = sum(map(bool, lines.ids))
     return LeftOut(
-        rows_without_id=int(np.sum(recording.circles.ids < 0))
-        + sum(not some for some in lines.ids),
+        rows_without_id=int(np.sum(recording.circles.ids < 0)) + len(lines) - identified,
         discs_seen_once=int(np.sum(graph.disc_row_counts == 1)),
         lines_without_parallax=len(placed.unplaced) + len(placed.ids) - len(graph.line_ids),
-        line_rows=sum(bool(some) for some in lines.ids) - len(graph.line_pose),
+        line_rows=identified - len(graph.line_pose),
     )
 
 

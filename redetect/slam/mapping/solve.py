@@ -88,11 +88,7 @@ class _MapProblem:
 
 
 def solve(
-    graph: Graph,
-    start: Estimate,
-    weighting: Weighting,
-    *,
-    tolerance: float = 1e-10,
+    graph: Graph, start: Estimate, weighting: Weighting, *, tolerance: float = 1e-10
 ) -> Minimum[Estimate]:
     """Minimise the sum of squared (or robust) whitened errors.
 
@@ -100,13 +96,18 @@ def solve(
     relative decrease of the cost below `tolerance`. Raises `SlamError` if the start is not finite,
     the number of steps is exceeded, or the measurements do not determine the unknowns.
     """
-    estimate = _with_unknowns(graph, start, weighting)
+    if not weighting.calibrate:
+        start = replace(start, mounting=None)
+    elif graph.camera is None:
+        raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
+    elif start.mounting is None:
+        start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
     problem = _MapProblem(graph, weighting)
     try:
         with _determined("least squares"):
             found = minimise(
                 problem,
-                estimate,
+                start,
                 tolerance=tolerance,
                 most_steps=_MOST_STEPS,
                 refined=problem.with_best_positions,
@@ -184,17 +185,5 @@ def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatA
     if estimate.mounting is not None:
         turn = Rotation.from_rotvec(mounting[:3]).as_matrix()
         place = estimate.mounting[:, 3] + mounting[3:]
-        changed = np.column_stack([turn @ estimate.mounting[:, :3], place])
-        after = replace(after, mounting=changed)
+        after = replace(after, mounting=np.column_stack([turn @ estimate.mounting[:, :3], place]))
     return after
-
-
-def _with_unknowns(graph: Graph, start: Estimate, weighting: Weighting) -> Estimate:
-    """A start with all unknowns, including the mounting as calibrated."""
-    if not weighting.calibrate:
-        return replace(start, mounting=None)
-    if graph.camera is None:
-        raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
-    if start.mounting is None:
-        start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
-    return start

@@ -45,14 +45,12 @@ def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[
     try:
         found = optimizer.optimize()
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[0]
-        raise SlamError(f"GTSAM: no least squares: {reason}") from None
+        raise SlamError(f"GTSAM: no least squares: {str(error).strip().splitlines()[0]}") from None
     if optimizer.iterations() >= _MOST_STEPS:
         raise SlamError(f"GTSAM: no minimum within {_MOST_STEPS} steps")
     estimate = estimate_of_values(graph, found, start)
-    lowest = cost(graph, estimate, weighting)
-    begun = cost(graph, start, weighting)
-    return Minimum(estimate, (begun, *[lowest] * int(optimizer.iterations())), True)
+    lowest = [cost(graph, estimate, weighting)] * int(optimizer.iterations())
+    return Minimum(estimate, (cost(graph, start, weighting), *lowest), True)
 
 
 def load_gtsam() -> Any:
@@ -79,8 +77,7 @@ def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
     for j, xy in enumerate(start.disc_xy):
         values.insert(first_disc + j, np.append(xy, 0.0))
 
-    fixed = noise.Constrained.All(3)
-    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start.poses[0]), fixed))
+    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start.poses[0]), noise.Constrained.All(3)))
     turned = np.zeros((len(graph.steps), 3, 3))
     turned[:, :2, :2] = rotation(graph.steps[:, 2])
     turned[:, 2, 2] = 1.0
@@ -105,8 +102,7 @@ def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
 def estimate_of_values(graph: Graph, values: Any, start: Estimate) -> Estimate:
     """GTSAM's values (see `gtsam_problem`) as an estimate; headings near those of the start."""
     first_disc = len(start.poses)
-    poses = [values.atPose2(k) for k in range(first_disc)]
-    found = np.array([(p.x(), p.y(), p.theta()) for p in poses])
+    found = np.array([(p.x(), p.y(), p.theta()) for p in map(values.atPose2, range(first_disc))])
     # GTSAM wraps headings to (-pi, pi]: restore the full turns of odometry.
     found[:, 2] = start.poses[:, 2] + wrap_angle(found[:, 2] - start.poses[:, 2])
     placed = [values.atPoint3(first_disc + j)[:2] for j in range(len(graph.disc_ids))]
