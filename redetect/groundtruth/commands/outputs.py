@@ -34,6 +34,11 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
         places.add(path.resolve())
 
 
+def warn(text: str) -> None:
+    """Print a warning."""
+    print(f"warning: {text}", file=sys.stderr)
+
+
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     """Metadata of a result: version, settings, and the files on which it depends."""
     return {

@@ -14,7 +14,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Validate
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
@@ -74,10 +74,7 @@ def perform(options: Validate) -> int:
         beside = session / "clock.json"
         clock_path = options.clock or (beside if beside.is_file() else None)
         if onboard and clock_path is None:
-            print(
-                "warning: no clock.json: the times of the on-board scans are not corrected",
-                file=sys.stderr,
-            )
+            warn("no clock.json: the times of the on-board scans are not corrected")
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     solved = poses_from_distances(survey, measured)
@@ -222,13 +219,13 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
         try:
             found = find_scans(session, scanner.name)
         except GroundTruthError as error:
-            print(f"warning: {error}: its scans are not used", file=sys.stderr)
+            warn(f"{error}: its scans are not used")
             continue
         # If a clock was set, times step back; the poses' own times are looked up.
         boards.append(Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
         files.append(found)
     if not boards:
-        print("warning: no scans of a scanner on board: using distances only", file=sys.stderr)
+        warn("no scans of a scanner on board: using distances only")
     return boards, files
 
 

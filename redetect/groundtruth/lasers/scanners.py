@@ -159,7 +159,7 @@ def with_measured_noise(
 def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Path) -> list[str]:
     """What to say about scanners that are used with another noise than stated in a file."""
     return [
-        f"warning: scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
+        f"scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
         f"mm, not by {1e3 * a.sigma_m:.1f} mm as in {path}: the larger value is used"
         for a, b in zip(stated, used)
         if b.sigma_m > a.sigma_m
