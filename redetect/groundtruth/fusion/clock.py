@@ -150,9 +150,8 @@ def _extended(
     at: FloatArray, knots: FloatArray, values: FloatArray, slopes: tuple[float, float]
 ) -> FloatArray:
     """Values between knots, and beyond the first and the last along straight lines."""
-    beyond = slopes[0] * np.minimum(at - knots[0], 0.0) + slopes[1] * np.maximum(
-        at - knots[-1], 0.0
-    )
+    before, after = np.minimum(at - knots[0], 0.0), np.maximum(at - knots[-1], 0.0)
+    beyond = slopes[0] * before + slopes[1] * after
     return np.asarray(np.interp(at, knots, values) + beyond)
 
 
@@ -204,18 +203,17 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     if len(determined) < 2 or others:
         return list(segments)
     middle = float(np.mean([segment.reference_s for segment in determined]))
-    rows, values, sigmas = [], [], []
-    for segment in determined:
-        rows += [(1.0, segment.reference_s - middle), (0.0, 1.0)]
-        values += [segment.offset_s, segment.rate - 1.0]
-        sigmas += [segment.sigma_offset_s, segment.sigma_rate]
-    weight = 1.0 / np.array(sigmas)
-    design = np.array(rows) * weight[:, None]
-    target = np.array(values) * weight
+    rows: list[tuple[float, ...]] = []  # Derivatives by the line, value, deviation
+    for s in determined:
+        rows.append((1.0, s.reference_s - middle, s.offset_s, s.sigma_offset_s))
+        rows.append((0.0, 1.0, s.rate - 1.0, s.sigma_rate))
+    table = np.array(rows)
+    weight = 1.0 / table[:, 3]
+    design, target = table[:, :2] * weight[:, None], table[:, 2] * weight
     covariance = np.linalg.inv(design.T @ design)
     line = covariance @ design.T @ target
     squared = float(np.sum((target - design @ line) ** 2))
-    freedom = len(values) - 2
+    freedom = len(rows) - 2
     if squared > chdtri(freedom, 1.0 - _AGREEMENT):
         return list(segments)
     note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {freedom}"

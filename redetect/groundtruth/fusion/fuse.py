@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -98,12 +99,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
-    some = [
-        part.thinned(_SPACING_S)
-        for part in short.with_only(short.innovations(noise).accepted).split(
-            _LONGEST_GAP_TO_LEARN_FROM_S
-        )
-    ]
+    short = short.with_only(short.innovations(noise).accepted)
+    some = [part.thinned(_SPACING_S) for part in short.split(_LONGEST_GAP_TO_LEARN_FROM_S)]
     numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
@@ -253,14 +250,9 @@ def fuse(
     over_seconds = math.sqrt(inflation) * noise
     kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], deviations)
     if not np.all(kept):
-        turn, bend, way = np.where(kept, systematic_sigmas(chosen), 0.0).tolist()
-        fewer = replace(
-            chosen,
-            turn_scale_sigma=turn,
-            turn_bias_per_metre_sigma=bend,
-            distance_scale_sigma=way,
-        )
-        problem = replace(problem, settings=fewer)
+        names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
+        fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
+        problem = replace(problem, settings=replace(chosen, **fewer))
         smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.

@@ -78,7 +78,7 @@ def as_localisation(
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None
     own, _ = interpolate_poses(odometry, thin.measured_s)
-    measured = PlanarPoses(thin.measured_s, thin.measured.poses, thin.measured.covariances)
+    measured = PlanarPoses(thin.measured_s, *thin.measured[1:])
     trimmed = _trimmed_alignment(own, measured)
     if trimmed is None:
         return None
