@@ -24,14 +24,13 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Raise an error if an output exists and must not be replaced, or two are the same file."""
     given = [path for path in paths if path is not None]
     demand_free(given, overwrite=force)
-    places: set[Path] = set()
-    for path in given:
-        if path.resolve() in places:
+    places = [path.resolve() for path in given]
+    for i, path in enumerate(given):
+        if places[i] in places[:i]:
             raise GroundTruthError(
                 f"{path}: two of the outputs would be written there: expected different names or "
                 "endings"
             )
-        places.add(path.resolve())
 
 
 def warn(text: str) -> None:

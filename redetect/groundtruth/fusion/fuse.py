@@ -204,9 +204,7 @@ class Fusion:
 
 
 def fuse(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    settings: FuseSettings | None = None,
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
 ) -> Fusion:
     """Fuse odometry with poses measured by other means.
 
@@ -326,9 +324,7 @@ class LeftOut:
 
 
 def leave_out(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    settings: FuseSettings | None = None,
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
@@ -346,43 +342,25 @@ def leave_out(
             f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "
             "more, to leave one out between two others"
         )
-    return tuple(
-        _left_out(own, streams, truth, float(times[0]), float(times[-1]), settings)
-        for times in parts[1:-1]
-    )
-
-
-def _left_out(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    truth: PlanarPoses,
-    from_s: float,
-    to_s: float,
-    settings: FuseSettings | None,
-) -> LeftOut:
-    fusion = fuse(
-        odometry,
-        {name: one.only(~one.during(from_s, to_s)) for name, one in streams.items()},
-        settings,
-    )
-    here = truth.during(from_s, to_s)
-    segment, others = truth.only(here), truth.only(~here)
-    predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
-    error = pose_differences(predicted.poses, segment.only(known).poses)
-    assert predicted.covariances is not None
-    assert segment.covariances is not None
-    covariances = predicted.covariances + segment.covariances[known]
-    beside, aligned = interpolate_poses(odometry, others.times_s, _LARGEST_GAP_S)
-    moved = moved_poses(odometry, planar_alignment(beside, others.only(aligned)))
-    rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
-    return LeftOut(
-        from_s,
-        to_s,
-        len(predicted),
-        *_rms(error),
-        float(np.mean(squared_mahalanobis(error, covariances)) / 3.0),
-        *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
-    )
+    found = []
+    for times in parts[1:-1]:
+        span = (float(times[0]), float(times[-1]))
+        others = {name: one.only(~one.during(*span)) for name, one in streams.items()}
+        path = fuse(own, others, settings).poses
+        here = truth.during(*span)
+        segment, rest = truth.only(here), truth.only(~here)
+        predicted, known = interpolate_poses(path, segment.times_s, _LARGEST_GAP_S)
+        error = pose_differences(predicted.poses, segment.only(known).poses)
+        assert predicted.covariances is not None
+        assert segment.covariances is not None
+        covariances = predicted.covariances + segment.covariances[known]
+        nees = float(np.mean(squared_mahalanobis(error, covariances)) / 3.0)
+        beside, aligned = interpolate_poses(own, rest.times_s, _LARGEST_GAP_S)
+        moved = moved_poses(own, planar_alignment(beside, rest.only(aligned)))
+        rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
+        rigid_error = pose_differences(rigid.poses, segment.only(known).poses)
+        found.append(LeftOut(*span, len(predicted), *_rms(error), nees, *_rms(rigid_error)))
+    return tuple(found)
 
 
 def _rms(difference: FloatArray) -> tuple[float, float]:

@@ -112,9 +112,7 @@ class ScanSets:
 
 
 def fixed_scanners(
-    scanners: Sequence[Scanner],
-    empties: Sequence[Scans],
-    covariance: FloatArray | None = None,
+    scanners: Sequence[Scanner], empties: Sequence[Scans], covariance: FloatArray | None = None
 ) -> FixedScanners:
     """Arrange scanners, and the background from their scans of the empty area, for the kernels.
 
@@ -223,13 +221,6 @@ def outline_faces(outline: ArrayLike) -> FloatArray:
     return faces
 
 
-def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
-    """Middle (2,) of the outline's bounding box, and its farthest corner's distance from it (m)."""
-    corners = faces[:, :2]
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    return middle, float(np.max(np.hypot(*(corners - middle).T)))
-
-
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
     """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
 
@@ -304,7 +295,9 @@ def refine(
 def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
     """Prepare an outline (k, 2); raises `GroundTruthError` if it is not valid."""
     faces = outline_faces(outline)
-    middle, radius = outline_radius_m(faces)
+    corners = faces[:, :2]
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    radius = float(np.max(np.hypot(*(corners - middle).T)))
     return Body(faces, middle, radius, outline_symmetries(faces, symmetry_m))
 
 
@@ -325,16 +318,13 @@ def acquire(
     found: list[tuple[float, FloatArray]] = []
     for place in _places(seen.points, body, settings):
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
-        if int(near.sum()) < settings.acquire_readings:
-            continue
-        found += _search(place, seen.where(near), scans, fixed, body, settings)
+        if np.count_nonzero(near) >= settings.acquire_readings:
+            found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
-    found.sort(key=lambda entry: -entry[0])
-    best, pose = found[0]
-    for score, other in found[1:]:
-        if score > 0.85 * best and not _same(pose, other, body):
-            return None
+    best, pose = max(found, key=lambda entry: entry[0])
+    if any(score > 0.85 * best and not _same(pose, other, body) for score, other in found):
+        return None
     return pose
 
 
@@ -385,9 +375,8 @@ def _search(
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
         _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
-        if agree < settings.least_agreement * (agree + through + hidden + beside):
-            continue
-        found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
+        if agree >= settings.least_agreement * (agree + through + hidden + beside):
+            found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 
 

@@ -26,14 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.bounds import (
-    ABOVE_0,
-    FINITE,
-    NotNegative,
-    Positive,
-    demand_fields,
-    whole,
-)
+from redetect.bounds import ABOVE_0, FINITE, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line

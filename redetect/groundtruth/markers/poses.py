@@ -25,12 +25,7 @@ from redetect.groundtruth.markers.refinement import (
     refined_poses,
 )
 from redetect.groundtruth.settings import PoseSettings, Solver
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    inverse,
-    log_se3,
-    transform,
-)
+from redetect.groundtruth.trajectories.transforms import apply, inverse, log_se3, transform
 
 _RANSAC_PX = 4.0
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.

@@ -223,10 +223,7 @@ def _root(
 
 
 def _reasons(
-    ids: tuple[int, ...],
-    kept: IntArray,
-    seen: Sequence[Sequence[View]],
-    settings: RigSettings,
+    ids: tuple[int, ...], kept: IntArray, seen: Sequence[Sequence[View]], settings: RigSettings
 ) -> dict[int, str]:
     """Why markers are left out."""
     times = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]

@@ -14,13 +14,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
-from redetect.groundtruth.markers.session import (
-    MarkerFrame,
-    Network,
-    Rig,
-    View,
-    rig_views,
-)
+from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
@@ -107,10 +101,7 @@ def excess_of(pose: RefinedPose) -> float:
 
 
 def track_by_markers(
-    groups: Iterable[tuple[MarkerFrame, ...]],
-    rig: Rig,
-    network: Network,
-    settings: PoseSettings,
+    groups: Iterable[tuple[MarkerFrame, ...]], rig: Rig, network: Network, settings: PoseSettings
 ) -> Track:
     """Compute the robot's poses from the markers found in a session's images.
 
