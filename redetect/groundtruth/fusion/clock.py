@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -251,18 +250,7 @@ def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
     the master.
     """
-    rows = _rows(Path(path))
-    if not rows:
-        raise GroundTruthError(
-            f"{path}: no line reports an offset from master: expected a log of ptpd"
-        )
-    table = np.array(rows, dtype=np.float64)
-    return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
-
-
-def _rows(path: Path) -> list[list[float]]:
-    """Time, offset (s) and drift (ppb) of each report."""
-    rows: list[list[float]] = []
+    rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}
     content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)
     for line in content.decode(errors="replace").splitlines():
@@ -276,12 +264,16 @@ def _rows(path: Path) -> list[list[float]]:
             if rows and math.isnan(rows[-1][2]):
                 rows[-1][2] = float(drift[1])
         elif _OFFSET in lowered and "," in lowered:
-            names = [name.strip(" #\t") for name in lowered.split(",")]
-            found = {name: k for k, name in enumerate(names)}
+            found = {name.strip(" #\t"): k for k, name in enumerate(lowered.split(","))}
             columns = found if _OFFSET in found else {}
         elif columns and (row := _table_row(line, columns)) is not None:
             rows.append(row)
-    return rows
+    if not rows:
+        raise GroundTruthError(
+            f"{path}: no line reports an offset from master: expected a log of ptpd"
+        )
+    table = np.array(rows, dtype=np.float64)
+    return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
 
 
 def _table_row(line: str, columns: dict[str, int]) -> list[float] | None:

@@ -168,7 +168,13 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     )
     poses[:, 2] = wrap_angle(poses[:, 2])
     cost = np.sum(distance_residuals(poses, measured)[0] ** 2, axis=1) / measured.sigma_m**2
-    kept = _distinct(poses, cost, _SAME_M)
+    # The best first, without those that are equal to a better one.
+    kept: list[int] = []
+    for i in np.argsort(cost, kind="stable").tolist():
+        apart = np.abs(poses[kept] - poses[i])
+        apart[:, 2] = np.abs(wrap_angle(apart[:, 2]))
+        if not np.any(apart.max(axis=1, initial=0.0) < _SAME_M):
+            kept.append(i)
     return poses[kept], cost[kept]
 
 
@@ -249,17 +255,6 @@ def _starts(measured: Measured) -> FloatArray:
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
     point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
     return np.column_stack([point - rotation(heading) @ measured.levers[0], heading])
-
-
-def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
-    """Indices of poses, the best first, without those closer than `closer` to a better one."""
-    kept: list[int] = []
-    for i in np.argsort(cost, kind="stable").tolist():
-        apart = np.abs(poses[kept] - poses[i])
-        apart[:, 2] = np.abs(wrap_angle(apart[:, 2]))
-        if not np.any(apart.max(axis=1, initial=0.0) < closer):
-            kept.append(i)
-    return kept
 
 
 class Dimension(NamedTuple):
