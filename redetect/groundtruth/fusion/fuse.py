@@ -70,7 +70,7 @@ def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
     logarithms = np.zeros(3)
-    bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
+    bounds, options = tuple(math.log(factor) for factor in _NOISE_FACTORS), {"xatol": 0.05}
 
     def scaled(values: FloatArray) -> FloatArray:
         return np.asarray(given * np.exp(values[[0, 1, 2, 2]]))
@@ -83,9 +83,7 @@ def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
                 tried[axis] = value
                 return sum(part.innovations(scaled(tried)).deviance for part in some)
 
-            found = minimize_scalar(
-                deviance, bounds=bounds, method="bounded", options={"xatol": 0.05}
-            )
+            found = minimize_scalar(deviance, bounds=bounds, method="bounded", options=options)
             logarithms[axis] = float(found.x)
     return scaled(logarithms)
 

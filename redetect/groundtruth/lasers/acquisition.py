@@ -127,8 +127,7 @@ def fixed_scanners(
     near = np.zeros((len(scanners), width))
     direction, beam_times = np.zeros((len(scanners), width, 2)), np.zeros((len(scanners), width))
     for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
-        reach_m = np.minimum(background.near_m, scanner.max_range_m)
-        near[i, : scanner.readings] = 1e3 * reach_m
+        near[i, : scanner.readings] = 1e3 * np.minimum(background.near_m, scanner.max_range_m)
         beam_times[i, : scanner.readings] = scanner.beam_times_s
         angle = scanner.pose[2] + scanner.angles_rad
         direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -235,19 +234,15 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
     x1, y1, x2, y2 = faces.T
     twice = x1 * y2 - x2 * y1
     centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
-    poses, errors = [], []
-    for degrees in range(-180, 180, 3):
-        angle = math.radians(degrees)
-        pose = np.array([*(centre - rotation(angle) @ centre), angle])
-        poses.append(pose)
-        errors.append(_farthest_m(points, faces, pose))
+    angles = [math.radians(degrees) for degrees in range(-180, 180, 3)]
+    poses = [np.array([*(centre - rotation(angle) @ centre), angle]) for angle in angles]
+    errors = [_farthest_m(points, faces, pose) for pose in poses]
     found: list[FloatArray] = []
     for i, error in enumerate(errors):
         if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
             continue
         # Refined by an ICP of the whole outline to itself.
-        pose, _, _ = fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)
-        pose = invert(pose)
+        pose = invert(fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)[0])
         pose[2] = _turn(pose[2])
         far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
         if far and _farthest_m(points, faces, pose) <= tolerance_m:
@@ -266,13 +261,12 @@ def _turn(angle: float) -> float:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> bool:
-    def side(face: FloatArray, x: float, y: float) -> float:
-        return float((face[2] - face[0]) * (y - face[1]) - (face[3] - face[1]) * (x - face[0]))
+    def on_both_sides(face: FloatArray, other: FloatArray) -> bool:
+        (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
+        sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
+        return bool(sides[0] * sides[1] < 0.0)
 
-    return (
-        side(a, b[0], b[1]) * side(a, b[2], b[3]) < 0.0
-        and side(b, a[0], a[1]) * side(b, a[2], a[3]) < 0.0
-    )
+    return on_both_sides(a, b) and on_both_sides(b, a)
 
 
 def refine(

@@ -209,11 +209,10 @@ def _scanners(content: JsonObject) -> tuple[Scanner, ...]:
     content.demand_version()
     scanners = tuple(_scanner(entry) for entry in content.rows("scanners"))
     names = [scanner.name for scanner in scanners]
-    for name in names:
-        if names.count(name) > 1:
-            raise GroundTruthError(
-                f"{content.place}: scanner {excerpt(name)} is listed more than once"
-            )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise GroundTruthError(
+            f"{content.place}: scanner {excerpt(twice[0])} is listed more than once"
+        )
     return scanners
 
 

@@ -133,15 +133,17 @@ class Tracker:
                 if t - searched_s < self.settings.acquire_s:
                     continue
                 searched_s = t
-                acquired = self._acquired(i)
+                # From the scans of this set alone, if they show the robot.
+                found = acquire(self.sets[i], self.fixed, self.body, self.settings)
+                acquired = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
                 if acquired is not None:
+                    if self.track.status[i] == OK:
+                        self.track.status[i] = REACQUIRED
                     pose, motion, segment, tracked = acquired, np.zeros(3), segment + 1, True
                     posed_s = before_s = determined_s = t
-                    begun = i
-                    self.track.segment[i] = segment
+                    self.track.segment[i], begun = segment, i
                 continue
-            step = t - before_s
-            before_s = t
+            step, before_s = t - before_s, t
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
@@ -159,14 +161,6 @@ class Tracker:
             posed_s = t
             determined_s = t if self.track.status[i] == OK else determined_s
         return self._finished()
-
-    def _acquired(self, i: int) -> FloatArray | None:
-        """Pose of set i from its scans alone, if they show the robot."""
-        found = acquire(self.sets[i], self.fixed, self.body, self.settings)
-        pose = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
-        if pose is not None and self.track.status[i] == OK:
-            self.track.status[i] = REACQUIRED
-        return pose
 
     def _fit(
         self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
@@ -247,7 +241,13 @@ class Tracker:
         scale = self._scales(good)
         for covariances in (self.track.covariances, self.track.noise):
             covariances[good] *= scale[:, None, None]
-        self._correct()
+        # Corrections of the scanners' poses, by all residuals.
+        for k, information in enumerate(self.information):
+            values, vectors = np.linalg.eigh(information)
+            if values[0] > 1e-9 * max(values[2], 1e-9):
+                covariance = (vectors / values) @ vectors.T
+                self.track.corrections[k] = -covariance @ self.gradient[k]
+                self.track.correction_sigma[k] = np.sqrt(np.diag(covariance))
         return self.track
 
     def _again(self, i: int, motion: FloatArray) -> None:
@@ -336,15 +336,6 @@ class Tracker:
         # A ratio above 1 within its own scatter is not significant.
         ratio = squared / total
         return np.where(ratio > 1.0 + 4.0 * np.sqrt(2.0 / total), ratio, 1.0)
-
-    def _correct(self) -> None:
-        """Corrections of the scanners' poses, by all residuals."""
-        for k, information in enumerate(self.information):
-            values, vectors = np.linalg.eigh(information)
-            if values[0] > 1e-9 * max(values[2], 1e-9):
-                covariance = (vectors / values) @ vectors.T
-                self.track.corrections[k] = -covariance @ self.gradient[k]
-                self.track.correction_sigma[k] = np.sqrt(np.diag(covariance))
 
 
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:

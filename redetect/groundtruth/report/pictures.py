@@ -239,7 +239,7 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     Pairwise estimates are drawn as the position of one marker relative to the other.
     """
     rig = estimate.rig
-    agreeing, differing = _clouds(estimate, rig)
+    agreeing, differing = _clouds(estimate)
     with figure_file((13.5, 5.0), "png") as (figure, content):
         centre = rig.robot_from_marker[:, :3, 3]
         middle = 0.5 * (centre.min(axis=0) + centre.max(axis=0))
@@ -262,17 +262,15 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     return content.getvalue()
 
 
-def _clouds(estimate: RigEstimate, rig: Rig) -> tuple[FloatArray, FloatArray]:
+def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
     """Markers' centres from the pairwise estimates that agree, and from those that differ."""
-    agreeing, differing = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for (a, b), pair in sorted(estimate.pairs.items()):
-        poses = rig.robot_from_marker
-        estimates = poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)
-        places = np.concatenate(estimates)[:, :3, 3]
-        agrees = np.tile(pair.agrees, 2)
-        agreeing.append(places[agrees])
-        differing.append(places[~agrees])
-    return np.concatenate(agreeing), np.concatenate(differing)
+    poses, pairs = estimate.rig.robot_from_marker, sorted(estimate.pairs.items())
+    estimates = [np.zeros((0, 4, 4))]
+    for (a, b), pair in pairs:
+        estimates += [poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)]
+    places = np.concatenate(estimates)[:, :3, 3]
+    agrees = np.array([one for _, pair in pairs for one in (*pair.agrees, *pair.agrees)], bool)
+    return places[agrees], places[~agrees]
 
 
 def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
