@@ -61,11 +61,9 @@ def perform(options: Fuse) -> int:
         filtered=with_common(fusion.filtered, common),
     )
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
+    inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
-        **provenance(
-            settings,
-            [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
-        ),
+        **provenance(settings, inputs),
         "used": fusion.used,
         "odometry": asdict(fusion.odometry),
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,

@@ -155,9 +155,8 @@ def describe(
     excess = excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):
         out = scanner.name in left_out
-        shift, sigma = (
-            left_out[scanner.name] if out else (track.corrections[k], track.correction_sigma[k])
-        )
+        found = (track.corrections[k], track.correction_sigma[k])
+        shift, sigma = left_out.get(scanner.name, found)
         entries.append(
             {
                 "name": scanner.name,

@@ -50,15 +50,13 @@ def perform(options: Lasers) -> int:
     far_off = [
         a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
     ]
-    steps = {name: poses.tolist() for name, poses in alignment.steps.items()}
-    pairs = [
-        {"scanners": [measured[i].name, measured[j].name], "explained": share}
-        for (i, j), share in sorted(alignment.pairs.items())
-    ]
     extra: dict[str, Any] = {
         **provenance(options.settings, [by_hand, map_file]),
-        "steps": steps,
-        "pairs": pairs,
+        "steps": {name: poses.tolist() for name, poses in alignment.steps.items()},
+        "pairs": [
+            {"scanners": [measured[i].name, measured[j].name], "explained": share}
+            for (i, j), share in sorted(alignment.pairs.items())
+        ],
         "beams_on_map": alignment.matched.tolist(),
         "rms_m": alignment.rms_m.tolist(),
         "far_off_measured": far_off,
@@ -77,11 +75,8 @@ def perform(options: Lasers) -> int:
         icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
         for cloud, scanner in zip(points, measured)
     ]
-    write_bytes(
-        picture,
-        draw_alignment(measured, alignment, points, building, by_step),
-        overwrite=options.force,
-    )
+    drawn = draw_alignment(measured, alignment, points, building, by_step)
+    write_bytes(picture, drawn, overwrite=options.force)
     _print_differences(measured, alignment, far_off)
     return 0
 

@@ -55,16 +55,12 @@ def perform(command: NetworkCommand) -> int:
             ]
         )
     ]
-    write_network(
-        command.output,
-        network,
-        {
-            "made_by": provenance(command.settings),
-            "reduced_cost": estimate.adjusted.reduced_cost,
-            "residuals": table,
-        },
-        overwrite=command.force,
-    )
+    extra = {
+        "made_by": provenance(command.settings),
+        "reduced_cost": estimate.adjusted.reduced_cost,
+        "residuals": table,
+    }
+    write_network(command.output, network, extra, overwrite=command.force)
     print_table(table)
     print_sigmas("camera", list(estimate.names), estimate.covariance)
     print(f"{command.output}: {len(estimate.names)} cameras")

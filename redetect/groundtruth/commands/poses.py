@@ -72,20 +72,16 @@ def perform(command: Poses) -> int:
             "or a lens calibration may be wrong"
         )
     write_planar_poses(output, poses, overwrite=command.force)
-    write_json(
-        settings_path,
-        {
-            **provenance(command.settings, (rig_path, network_path)),
-            "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
-            "times": dict(track.counts),
-            "reduced_cost": track.reduced_cost,
-        },
-        overwrite=command.force,
-    )
+    content = {
+        **provenance(command.settings, (rig_path, network_path)),
+        "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
+        "times": dict(track.counts),
+        "reduced_cost": track.reduced_cost,
+    }
+    write_json(settings_path, content, overwrite=command.force)
     if command.tum is not None:
-        text = format_tum(
-            poses.times_s, np.stack([pose.world_from_robot for _, pose in track.posed])
-        )
+        in_space = np.stack([pose.world_from_robot for _, pose in track.posed])
+        text = format_tum(poses.times_s, in_space)
         write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0

@@ -78,12 +78,23 @@ class LaserTrack:
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
 
-    @classmethod
-    def empty(cls, times_s: FloatArray, scanners: int) -> LaserTrack:
-        """A track without poses, to be filled."""
-        n = len(times_s)
-        return cls(
-            times_s,
+
+class Tracker:
+    """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
+
+    def __init__(
+        self,
+        sets: ScanSets,
+        fixed: FixedScanners,
+        body: Body,
+        largest_speed_m_s: float,
+        settings: LaserSettings,
+    ) -> None:
+        self.sets, self.fixed, self.body = sets, fixed, body
+        self.speed, self.settings = largest_speed_m_s, settings
+        n, scanners = len(sets), len(fixed.origins)
+        self.track = LaserTrack(
+            sets.times_s,
             status=np.full(n, LOST),
             segment=np.full(n, -1),
             poses=np.full((n, 3), np.nan),
@@ -100,25 +111,8 @@ class LaserTrack:
             correction_sigma=np.full((scanners, 3), np.nan),
             fronts={},
         )
-
-
-class Tracker:
-    """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
-
-    def __init__(
-        self,
-        sets: ScanSets,
-        fixed: FixedScanners,
-        body: Body,
-        largest_speed_m_s: float,
-        settings: LaserSettings,
-    ) -> None:
-        self.sets, self.fixed, self.body = sets, fixed, body
-        self.speed, self.settings = largest_speed_m_s, settings
-        self.track = LaserTrack.empty(sets.times_s, len(fixed.origins))
-        self.prior_m = np.full(len(sets), 0.02)
-        self.information = np.zeros((len(fixed.origins), 3, 3))
-        self.gradient = np.zeros((len(fixed.origins), 3))
+        self.prior_m = np.full(n, 0.02)
+        self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""

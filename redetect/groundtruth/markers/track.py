@@ -134,10 +134,18 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     }
     if tracked.reason:
         entry["reason"] = tracked.reason
+    markers: list[dict[str, Any]] = [
+        {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
+    ]
     estimate, choice = tracked.estimate, tracked.choice
-    chosen = None
     if estimate is not None:
         chosen = estimate.candidates[(choice.candidate or 0) if choice is not None else 0]
+        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
+        for marker, is_used in zip(markers, estimate.views):
+            marker["used"] = bool(is_used)
+            if is_used:
+                error, rms = next(figures)
+                marker["error"], marker["rms_px"] = round(float(error), 3), round(float(rms), 4)
         entry["ambiguous"] = estimate.ambiguous
         if choice is not None and estimate.ambiguous:
             entry["margin"] = round(choice.margin, 3)
@@ -155,17 +163,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
             }
             for candidate, odds in zip(estimate.candidates, estimate.log_odds)
         ]
-    entry["markers"] = [
-        {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
-    ]
-    if estimate is not None and chosen is not None:
-        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
-        for marker, is_used in zip(entry["markers"], estimate.views):
-            marker["used"] = bool(is_used)
-            if is_used:
-                error, rms = next(figures)
-                marker["error"], marker["rms_px"] = round(float(error), 3), round(float(rms), 4)
-    return entry
+    return {**entry, "markers": markers}
 
 
 def _estimated(
