@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from itertools import product
 from pathlib import Path
 
 from redetect.groundtruth.commands.options import Network as NetworkCommand
@@ -45,19 +46,14 @@ def perform(command: NetworkCommand) -> int:
         estimate.world_from_camera,
         estimate.covariance,
     )
-    table = [
-        {"camera": name, "board": board, **residual_figures(estimate.adjusted, chosen)}
-        for name in estimate.names
-        for board in sorted({view.board for view in estimate.views})
-        if (
-            chosen := [
-                i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)
-            ]
-        )
-    ]
+    adjusted, table = estimate.adjusted, []
+    for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
+        chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
+        if chosen:
+            table.append({"camera": name, "board": board, **residual_figures(adjusted, chosen)})
     extra = {
         "made_by": provenance(command.settings),
-        "reduced_cost": estimate.adjusted.reduced_cost,
+        "reduced_cost": adjusted.reduced_cost,
         "residuals": table,
     }
     write_network(command.output, network, extra, overwrite=command.force)

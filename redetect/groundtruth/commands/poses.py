@@ -53,10 +53,8 @@ def perform(command: Poses) -> int:
         print(f"{track.unknown_markers} markers found are not on the rig: ignored")
         sets = {marker.dictionary for frame in frames for marker in frame.markers}
         if others := sorted(sets - {rig.dictionary}):
-            warn(
-                f"markers of {', '.join(others)} were found, those in {rig_path} are of "
-                f"{rig.dictionary}"
-            )
+            found = f"markers of {', '.join(others)} were found"
+            warn(f"{found}, those in {rig_path} are of {rig.dictionary}")
     print_left_out(track, rig_path, network_path)
     if command.report is not None:
         lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
