@@ -41,8 +41,13 @@ def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
 
 
 class Scan:
-    """Points (n, 2) of a scan in the order of the beams, and the normals (n, 2) of the lines
-    through them; zeros if there is none.
+    """Points of a scan in the order of the beams, and the lines through them.
+
+    Attributes
+    ----------
+    points : (n, 2) float64
+    normals : (n, 2) float64
+        Of the lines; zeros if there is none.
     """
 
     def __init__(self, points: FloatArray, normals: FloatArray) -> None:
