@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from redetect.groundtruth.commands.options import Fuse
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
@@ -62,11 +61,9 @@ def perform(options: Fuse) -> int:
         filtered=with_common(fusion.filtered, common),
     )
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
+    inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
-        **provenance(
-            settings,
-            [options.odometry, *files.values(), *([options.clock] if options.clock else [])],
-        ),
+        **provenance(settings, inputs),
         "used": fusion.used,
         "odometry": asdict(fusion.odometry),
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
@@ -115,11 +112,10 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
         )
     if fusion.pauses_s:
         begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
-        print(
-            f"warning: {options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
+        warn(
+            f"{options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
             f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: the robot's path there is "
-            "unknown, and covariances are increased",
-            file=sys.stderr,
+            "unknown, and covariances are increased"
         )
 
 
@@ -127,24 +123,21 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
     """Say where odometry, measured poses and their covariances contradict each other."""
     for name, factor in fusion.raised.items():
         if factor > 1.0:
-            print(
-                f"warning: the poses of {name} jitter {factor:.1f} times as much as their "
-                "covariances allow: their deviations were raised by this factor",
-                file=sys.stderr,
+            warn(
+                f"the poses of {name} jitter {factor:.1f} times as much as their "
+                "covariances allow: their deviations were raised by this factor"
             )
     for name, count in fusion.used.items():
         rejected = sum(one.stream == name for one in fusion.rejected)
         if rejected > _MANY_REJECTED * (count + rejected):
-            print(
-                f"warning: {rejected} of {count + rejected} poses of {name} contradict the others "
-                f"and {options.odometry}: the clock, or the poses, may be wrong",
-                file=sys.stderr,
+            warn(
+                f"{rejected} of {count + rejected} poses of {name} contradict the others "
+                f"and {options.odometry}: the clock, or the poses, may be wrong"
             )
     if fusion.slips_s:
         begin, end = max(fusion.slips_s, key=lambda slip: slip[1] - slip[0])
-        print(
-            f"warning: {options.odometry}: contradicts the measured poses {len(fusion.slips_s)} "
+        warn(
+            f"{options.odometry}: contradicts the measured poses {len(fusion.slips_s)} "
             f"times, as after a slip of the wheels, the longest from {begin:.3f} s to {end:.3f} s "
-            "on the ground truth's clock",
-            file=sys.stderr,
+            "on the ground truth's clock"
         )

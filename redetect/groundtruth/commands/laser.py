@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.bounds import demand, whole
 from redetect.groundtruth.commands.options import Laser
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.stream_errors import COMMON
@@ -52,15 +51,14 @@ def perform(options: Laser) -> int:
     calibration = options.scanners or options.session / "aligned.json"
     if options.scanners is None and not calibration.is_file():
         calibration = options.session / "scanners.json"
-        print(
-            f"warning: no {options.session / 'aligned.json'}: the scanners' poses are those of "
+        warn(
+            f"no {options.session / 'aligned.json'}: the scanners' poses are those of "
             f"{calibration}; their errors are common to all poses, and do not average out in a "
-            "fusion",
-            file=sys.stderr,
+            "fusion"
         )
     scanners, robot, fixed, sets = load_session(options.session, calibration)
-    for line in noise_warnings(read_scanners(calibration), scanners, calibration):
-        print(line, file=sys.stderr)
+    for text in noise_warnings(read_scanners(calibration), scanners, calibration):
+        warn(text)
     print_sweeps(scanners, sets, robot)
     track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
 
@@ -82,22 +80,20 @@ def perform(options: Laser) -> int:
     )
     share = seen_through(track)
     if share > _MOST_SEEN_THROUGH:
-        print(
-            f"warning: {100.0 * share:.0f} % of the beams that should meet the robot see what is "
-            "behind it: the outline in robot.json is too large, or the pose of a scanner is wrong",
-            file=sys.stderr,
+        warn(
+            f"{100.0 * share:.0f} % of the beams that should meet the robot see what is "
+            "behind it: the outline in robot.json is too large, or the pose of a scanner is wrong"
         )
     for segment in described["segments"]:
         print(f"  {segment['from_s']:.2f} to {segment['to_s']:.2f} s: front: {segment['front']}")
     for scanner in described["scanners"]:
         if scanner["suspect"]:
             shift = scanner["correction"]
-            print(
-                f"warning: scanner {scanner['name']} does not fit the others: its readings suggest "
+            warn(
+                f"scanner {scanner['name']} does not fit the others: its readings suggest "
                 f"a shift of {1e3 * shift[0]:.1f}, {1e3 * shift[1]:.1f} mm and "
                 f"{np.degrees(shift[2]):.2f} deg; "
-                + ("it was excluded" if scanner["left_out"] else "it was used nevertheless"),
-                file=sys.stderr,
+                + ("it was excluded" if scanner["left_out"] else "it was used nevertheless")
             )
     return 0 if len(poses) else 1
 
@@ -110,10 +106,9 @@ def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) ->
     sweep_s = turn * float(np.median(np.diff(sets.times_s)))
     moved_m = 0.5 * sweep_s * robot.largest_speed_m_s
     if moved_m > _LARGEST_SWEEP_M:
-        print(
-            f"warning: no sweep_s of any scanner: if a mirror turns once a scan, its beams take "
-            f"{1e3 * sweep_s:.0f} ms, in which the robot moves up to {2e3 * moved_m:.0f} mm",
-            file=sys.stderr,
+        warn(
+            f"no sweep_s of any scanner: if a mirror turns once a scan, its beams take "
+            f"{1e3 * sweep_s:.0f} ms, in which the robot moves up to {2e3 * moved_m:.0f} mm"
         )
 
 
@@ -160,9 +155,8 @@ def describe(
     excess = excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):
         out = scanner.name in left_out
-        shift, sigma = (
-            left_out[scanner.name] if out else (track.corrections[k], track.correction_sigma[k])
-        )
+        found = (track.corrections[k], track.correction_sigma[k])
+        shift, sigma = left_out.get(scanner.name, found)
         entries.append(
             {
                 "name": scanner.name,

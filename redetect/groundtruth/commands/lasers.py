@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from redetect.groundtruth.commands.options import Lasers
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import (
@@ -44,22 +43,20 @@ def perform(options: Lasers) -> int:
     building = read_building(map_file)
     empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in stated]
     measured = with_measured_noise(stated, empties)
-    for line in noise_warnings(stated, measured, by_hand):
-        print(line, file=sys.stderr)
+    for text in noise_warnings(stated, measured, by_hand):
+        warn(text)
     alignment = align_scanners(measured, empties, building, options.settings)
 
     far_off = [
         a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
     ]
-    steps = {name: poses.tolist() for name, poses in alignment.steps.items()}
-    pairs = [
-        {"scanners": [measured[i].name, measured[j].name], "explained": share}
-        for (i, j), share in sorted(alignment.pairs.items())
-    ]
     extra: dict[str, Any] = {
         **provenance(options.settings, [by_hand, map_file]),
-        "steps": steps,
-        "pairs": pairs,
+        "steps": {name: poses.tolist() for name, poses in alignment.steps.items()},
+        "pairs": [
+            {"scanners": [measured[i].name, measured[j].name], "explained": share}
+            for (i, j), share in sorted(alignment.pairs.items())
+        ],
         "beams_on_map": alignment.matched.tolist(),
         "rms_m": alignment.rms_m.tolist(),
         "far_off_measured": far_off,
@@ -78,11 +75,8 @@ def perform(options: Lasers) -> int:
         icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
         for cloud, scanner in zip(points, measured)
     ]
-    write_bytes(
-        picture,
-        draw_alignment(measured, alignment, points, building, by_step),
-        overwrite=options.force,
-    )
+    drawn = draw_alignment(measured, alignment, points, building, by_step)
+    write_bytes(picture, drawn, overwrite=options.force)
     _print_differences(measured, alignment, far_off)
     return 0
 
@@ -100,23 +94,16 @@ def _print_differences(
             f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
         )
     if alignment.map_sigma_m > 0.0:
-        print(
-            f"warning: the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm: the "
-            "scanners were aligned with it as one body, and their errors are common to all",
-            file=sys.stderr,
+        warn(
+            f"the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm: the "
+            "scanners were aligned with it as one body, and their errors are common to all"
         )
     for name in far_off:
-        print(
-            f"warning: scanner {name}: was measured wrong, or another place of the map is similar",
-            file=sys.stderr,
-        )
+        warn(f"scanner {name}: was measured wrong, or another place of the map is similar")
     for name in alignment.undetermined:
-        print(f"warning: scanner {name}: a direction is not determined", file=sys.stderr)
+        warn(f"scanner {name}: a direction is not determined")
     for name in alignment.inconsistent:
-        print(
-            f"warning: scanner {name}: its pose on the map disagrees with the other scanners",
-            file=sys.stderr,
-        )
+        warn(f"scanner {name}: its pose on the map disagrees with the other scanners")
 
 
 def _sigmas(before: Scanner, after: Scanner) -> float:

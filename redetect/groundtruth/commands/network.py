@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 from redetect.groundtruth.commands.options import Network as NetworkCommand
 from redetect.groundtruth.commands.outputs import (
@@ -18,7 +18,7 @@ from redetect.groundtruth.commands.outputs import (
 )
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
-from redetect.groundtruth.markers.network_estimation import NetworkEstimate, estimate_network
+from redetect.groundtruth.markers.network_estimation import estimate_network
 from redetect.groundtruth.markers.session import Network, write_network
 
 
@@ -46,31 +46,18 @@ def perform(command: NetworkCommand) -> int:
         estimate.world_from_camera,
         estimate.covariance,
     )
-    table = _board_residuals(estimate)
-    write_network(
-        command.output,
-        network,
-        {
-            "made_by": provenance(command.settings),
-            "reduced_cost": estimate.adjusted.reduced_cost,
-            "residuals": table,
-        },
-        overwrite=command.force,
-    )
+    adjusted, table = estimate.adjusted, []
+    for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
+        chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
+        if chosen:
+            table.append({"camera": name, "board": board, **residual_figures(adjusted, chosen)})
+    extra = {
+        "made_by": provenance(command.settings),
+        "reduced_cost": adjusted.reduced_cost,
+        "residuals": table,
+    }
+    write_network(command.output, network, extra, overwrite=command.force)
     print_table(table)
     print_sigmas("camera", list(estimate.names), estimate.covariance)
     print(f"{command.output}: {len(estimate.names)} cameras")
     return 0
-
-
-def _board_residuals(estimate: NetworkEstimate) -> list[dict[str, Any]]:
-    adjusted = estimate.adjusted
-    rows = []
-    for name in estimate.names:
-        for board in sorted({view.board for view in estimate.views}):
-            chosen = [
-                i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)
-            ]
-            if chosen:
-                rows.append({"camera": name, "board": board, **residual_figures(adjusted, chosen)})
-    return rows

@@ -24,14 +24,18 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Raise an error if an output exists and must not be replaced, or two are the same file."""
     given = [path for path in paths if path is not None]
     demand_free(given, overwrite=force)
-    places: set[Path] = set()
-    for path in given:
-        if path.resolve() in places:
+    places = [path.resolve() for path in given]
+    for i, path in enumerate(given):
+        if places[i] in places[:i]:
             raise GroundTruthError(
                 f"{path}: two of the outputs would be written there: expected different names or "
                 "endings"
             )
-        places.add(path.resolve())
+
+
+def warn(text: str) -> None:
+    """Print a warning."""
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
@@ -57,12 +61,10 @@ def progress(items: Sequence[T], label: str) -> Iterable[T]:
 def residual_figures(adjusted: Any, views: Sequence[int]) -> dict[str, Any]:
     """Figures of some of a bundle's views: number, outliers, residuals of the others."""
     chosen = np.isin(adjusted.bundle.view, views)
-    used = chosen & adjusted.used
-    wrong = len(np.unique(adjusted.bundle.view[chosen & ~adjusted.used]))
-    residuals = adjusted.residuals[used]
+    residuals = adjusted.residuals[chosen & adjusted.used]
     return {
         "views": len(views),
-        "left_out": wrong,
+        "left_out": len(np.unique(adjusted.bundle.view[chosen & ~adjusted.used])),
         "rms_px": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else None,
         "max_px": float(np.linalg.norm(residuals, axis=1).max()) if len(residuals) else None,
     }

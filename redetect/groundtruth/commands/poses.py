@@ -11,7 +11,7 @@ import numpy as np
 
 from redetect.command_line import EXIT_ERROR
 from redetect.groundtruth.commands.options import Poses
-from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance, warn
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.session import (
     find_runs,
@@ -53,11 +53,8 @@ def perform(command: Poses) -> int:
         print(f"{track.unknown_markers} markers found are not on the rig: ignored")
         sets = {marker.dictionary for frame in frames for marker in frame.markers}
         if others := sorted(sets - {rig.dictionary}):
-            print(
-                f"warning: markers of {', '.join(others)} were found, those in {rig_path} are of "
-                f"{rig.dictionary}",
-                file=sys.stderr,
-            )
+            found = f"markers of {', '.join(others)} were found"
+            warn(f"{found}, those in {rig_path} are of {rig.dictionary}")
     print_left_out(track, rig_path, network_path)
     if command.report is not None:
         lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
@@ -67,27 +64,22 @@ def perform(command: Poses) -> int:
         return EXIT_ERROR
     print(f"squared residuals per degree of freedom: {track.reduced_cost:.2f}")
     if track.reduced_cost > _MUCH_TOO_LARGE:
-        print(
-            f"warning: residuals are {track.reduced_cost**0.5:.0f} times as large as expected: the "
+        warn(
+            f"residuals are {track.reduced_cost**0.5:.0f} times as large as expected: the "
             f"widths and poses of markers in {rig_path}, the poses of cameras in {network_path}, "
-            "or a lens calibration may be wrong",
-            file=sys.stderr,
+            "or a lens calibration may be wrong"
         )
     write_planar_poses(output, poses, overwrite=command.force)
-    write_json(
-        settings_path,
-        {
-            **provenance(command.settings, (rig_path, network_path)),
-            "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
-            "times": dict(track.counts),
-            "reduced_cost": track.reduced_cost,
-        },
-        overwrite=command.force,
-    )
+    content = {
+        **provenance(command.settings, (rig_path, network_path)),
+        "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
+        "times": dict(track.counts),
+        "reduced_cost": track.reduced_cost,
+    }
+    write_json(settings_path, content, overwrite=command.force)
     if command.tum is not None:
-        text = format_tum(
-            poses.times_s, np.stack([pose.world_from_robot for _, pose in track.posed])
-        )
+        in_space = np.stack([pose.world_from_robot for _, pose in track.posed])
+        text = format_tum(poses.times_s, in_space)
         write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0
@@ -110,9 +102,8 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
     wrong = [m for m, count in sorted(left_out.items()) if count > _MOST_LEFT_OUT * seen[m]]
     named = wrong and sum(left_out[m] for m in wrong) > _OF_THE_WRONG * total
     first = f"the pose of marker {', '.join(map(str, wrong))}, or else " if named else ""
-    print(
-        f"warning: {total} of {seen.total()} markers disagree with others, and {failed} times "
+    warn(
+        f"{total} of {seen.total()} markers disagree with others, and {failed} times "
         f"have no pose since they do: {first}poses or widths of markers, in {rig_path}, or poses "
-        f"of cameras, in {network_path}, may be wrong",
-        file=sys.stderr,
+        f"of cameras, in {network_path}, may be wrong"
     )

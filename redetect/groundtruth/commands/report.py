@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 from redetect import __version__
 from redetect.groundtruth.commands.options import Report
-from redetect.groundtruth.commands.outputs import check_outputs
+from redetect.groundtruth.commands.outputs import check_outputs, warn
 from redetect.groundtruth.report.inputs import gather
 from redetect.groundtruth.report.page import report_page
 from redetect.storage import write_bytes
@@ -20,7 +18,7 @@ def perform(options: Report) -> int:
     page = report_page(inputs, __version__)
     write_bytes(output, page, overwrite=options.force)
     for problem in inputs.problems:
-        print(f"warning: {problem}", file=sys.stderr)
+        warn(problem)
     shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]
     print(f"{output}: {', '.join(shown) or 'no poses'}; {len(inputs.missing)} missing files")
     return 0

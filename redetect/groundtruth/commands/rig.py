@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,15 +50,13 @@ def perform(command: RigCommand) -> int:
     if command.robot is not None:
         frame = f"robot, by {command.robot.name}"
     rig = estimate.rig
+    views = [
+        [i for i, view in enumerate(estimate.views) if view.rig_index == index]
+        for index in range(len(rig.ids))
+    ]
     table = [
-        {
-            "marker": marker,
-            **residual_figures(
-                estimate.adjusted,
-                [i for i, view in enumerate(estimate.views) if view.rig_index == index],
-            ),
-        }
-        for index, marker in enumerate(rig.ids)
+        {"marker": marker, **residual_figures(estimate.adjusted, own)}
+        for marker, own in zip(rig.ids, views)
     ]
     pairs = [
         {
@@ -98,8 +95,12 @@ def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]
         network = read_network(command.network)
         frames = read_network_frames(command.runs, network)
         return network, group_by_time(frames, command.settings.time_tolerance_s)
-    count = len(command.runs)
-    files = [_calibration(run) for run in command.runs]
+    count, files = len(command.runs), []
+    for run in command.runs:
+        found = camera_file_in(run)
+        if found is None:
+            raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
+        files.append(found)
     network = Network(
         tuple(run.name for run in command.runs),
         tuple(map(read_camera, files)),
@@ -112,10 +113,3 @@ def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]
         for index, run in enumerate(command.runs)
         for frame in read_marker_frames(run, index, timed=False)
     ]
-
-
-def _calibration(run: Path) -> Path:
-    found = camera_file_in(run)
-    if found is None:
-        raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
-    return found

@@ -11,12 +11,7 @@ import numpy as np
 from redetect.groundtruth.commands.options import Sync
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.fusion.clock import (
-    ClockModel,
-    ClockSegment,
-    PtpdLog,
-    read_ptpd,
-)
+from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, PtpdLog, read_ptpd
 from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 
@@ -43,7 +38,11 @@ def perform(options: Sync) -> int:
     }
     if log is not None:
         document["ptpd"] = compare_with_ptpd(model, determined, log)
-        print(_ptpd_line(document["ptpd"]))
+        rms, inside = (document["ptpd"][k] for k in ("rms_difference_s", "reports_in_segments"))
+        print(
+            f"ptpd: {len(log.offset_s)} reports, {inside} compared, "
+            + ("none in a segment" if rms is None else f"rms difference {1e3 * rms:.2f} ms")
+        )
     write_json(options.output, document, overwrite=options.force)
     return 0
 
@@ -100,11 +99,3 @@ def _line(segment: ClockSegment) -> str:
         f"turned {math.degrees(segment.turned_rad):.0f} deg"
     )
     return head + text + (f" ({segment.status}: {segment.note})" if segment.note else "")
-
-
-def _ptpd_line(figures: dict[str, float | int | None]) -> str:
-    rms = figures["rms_difference_s"]
-    compared = "none in a segment" if rms is None else f"rms difference {1e3 * rms:.2f} ms"
-    return (
-        f"ptpd: {figures['reports']} reports, {figures['reports_in_segments']} compared, {compared}"
-    )

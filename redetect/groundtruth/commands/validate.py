@@ -14,7 +14,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.options import Validate
-from redetect.groundtruth.commands.outputs import check_outputs, provenance
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
@@ -74,10 +74,7 @@ def perform(options: Validate) -> int:
         beside = session / "clock.json"
         clock_path = options.clock or (beside if beside.is_file() else None)
         if onboard and clock_path is None:
-            print(
-                "warning: no clock.json: the times of the on-board scans are not corrected",
-                file=sys.stderr,
-            )
+            warn("no clock.json: the times of the on-board scans are not corrected")
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     solved = poses_from_distances(survey, measured)
@@ -98,7 +95,7 @@ def perform(options: Validate) -> int:
         figures["normalised_band"] = normalised_band(score.normalised)
     content = {
         **provenance({"refine": options.refine}, files),
-        "poses": str(options.poses.name),
+        "poses": options.poses.name,
         "clock": None if clock_path is None else clock_path.name,
         "figures": figures,
         "published": [asdict(published) for published in PUBLISHED],
@@ -131,20 +128,17 @@ def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray
     for low, high in pairwise(INCIDENCES_DEG):
         inside = errors[(np.degrees(angles) >= low) & (np.degrees(angles) <= high)]
         mean = float(inside.mean()) if len(inside) else math.nan
-        rows.append(
-            {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean,
-             "sigma_m": sigma_of(inside)}
-        )  # fmt: skip
-    found = refine_mounts(references, segments)
-    if found is None:
-        return {"incidence": rows}
-    sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
-    scanners = next(r.still.scanners for r in references if r.still is not None)
-    mounts = [
-        {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
-        for s, m, e in zip(scanners, found.poses, sigma)
-    ]
-    return {"incidence": rows, "mounts": mounts}
+        row = {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean}
+        rows.append({**row, "sigma_m": sigma_of(inside)})
+    content: dict[str, Any] = {"incidence": rows}
+    if (found := refine_mounts(references, segments)) is not None:
+        sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
+        scanners = next(r.still.scanners for r in references if r.still is not None)
+        content["mounts"] = [
+            {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
+            for s, m, e in zip(scanners, found.poses, sigma)
+        ]
+    return content
 
 
 def _table_rows(
@@ -197,20 +191,19 @@ def summary_lines(
     """The printed figures, with RAWSEEDS' beside them."""
     refined = sum(reference.scans == "used" for reference in references)
     chi2 = distances["chi2_per_freedom"]
-    lines = [
+    return [
         f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by "
         "scans",
         f"distances          rms residual {1e3 * distances['rms_m']:.2f} mm, squared residuals per "
         f"degree of freedom {'-' if chi2 is None else f'{chi2:.2f}'}",
         *score.lines(),
-    ]
-    for p in PUBLISHED:
-        lines.append(
+        *(
             f"{p.name:<18} mean {1e3 * p.position_mean_m:.0f} mm, sigma "
             f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
             f"{p.angle_sigma_deg:.2f} (published)"
-        )
-    return lines
+            for p in PUBLISHED
+        ),
+    ]
 
 
 def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
@@ -222,13 +215,13 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
         try:
             found = find_scans(session, scanner.name)
         except GroundTruthError as error:
-            print(f"warning: {error}: its scans are not used", file=sys.stderr)
+            warn(f"{error}: its scans are not used")
             continue
         # If a clock was set, times step back; the poses' own times are looked up.
         boards.append(Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
         files.append(found)
     if not boards:
-        print("warning: no scans of a scanner on board: using distances only", file=sys.stderr)
+        warn("no scans of a scanner on board: using distances only")
     return boards, files
 
 

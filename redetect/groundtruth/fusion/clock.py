@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -150,9 +149,8 @@ def _extended(
     at: FloatArray, knots: FloatArray, values: FloatArray, slopes: tuple[float, float]
 ) -> FloatArray:
     """Values between knots, and beyond the first and the last along straight lines."""
-    beyond = slopes[0] * np.minimum(at - knots[0], 0.0) + slopes[1] * np.maximum(
-        at - knots[-1], 0.0
-    )
+    before, after = np.minimum(at - knots[0], 0.0), np.maximum(at - knots[-1], 0.0)
+    beyond = slopes[0] * before + slopes[1] * after
     return np.asarray(np.interp(at, knots, values) + beyond)
 
 
@@ -204,18 +202,17 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     if len(determined) < 2 or others:
         return list(segments)
     middle = float(np.mean([segment.reference_s for segment in determined]))
-    rows, values, sigmas = [], [], []
-    for segment in determined:
-        rows += [(1.0, segment.reference_s - middle), (0.0, 1.0)]
-        values += [segment.offset_s, segment.rate - 1.0]
-        sigmas += [segment.sigma_offset_s, segment.sigma_rate]
-    weight = 1.0 / np.array(sigmas)
-    design = np.array(rows) * weight[:, None]
-    target = np.array(values) * weight
+    rows: list[tuple[float, ...]] = []  # Derivatives by the line, value, deviation
+    for s in determined:
+        rows.append((1.0, s.reference_s - middle, s.offset_s, s.sigma_offset_s))
+        rows.append((0.0, 1.0, s.rate - 1.0, s.sigma_rate))
+    table = np.array(rows)
+    weight = 1.0 / table[:, 3]
+    design, target = table[:, :2] * weight[:, None], table[:, 2] * weight
     covariance = np.linalg.inv(design.T @ design)
     line = covariance @ design.T @ target
     squared = float(np.sum((target - design @ line) ** 2))
-    freedom = len(values) - 2
+    freedom = len(rows) - 2
     if squared > chdtri(freedom, 1.0 - _AGREEMENT):
         return list(segments)
     note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {freedom}"
@@ -253,18 +250,7 @@ def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
     Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
     the master.
     """
-    rows = _rows(Path(path))
-    if not rows:
-        raise GroundTruthError(
-            f"{path}: no line reports an offset from master: expected a log of ptpd"
-        )
-    table = np.array(rows, dtype=np.float64)
-    return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
-
-
-def _rows(path: Path) -> list[list[float]]:
-    """Time, offset (s) and drift (ppb) of each report."""
-    rows: list[list[float]] = []
+    rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}
     content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)
     for line in content.decode(errors="replace").splitlines():
@@ -278,12 +264,16 @@ def _rows(path: Path) -> list[list[float]]:
             if rows and math.isnan(rows[-1][2]):
                 rows[-1][2] = float(drift[1])
         elif _OFFSET in lowered and "," in lowered:
-            names = [name.strip(" #\t") for name in lowered.split(",")]
-            found = {name: k for k, name in enumerate(names)}
+            found = {name.strip(" #\t"): k for k, name in enumerate(lowered.split(","))}
             columns = found if _OFFSET in found else {}
         elif columns and (row := _table_row(line, columns)) is not None:
             rows.append(row)
-    return rows
+    if not rows:
+        raise GroundTruthError(
+            f"{path}: no line reports an offset from master: expected a log of ptpd"
+        )
+    table = np.array(rows, dtype=np.float64)
+    return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
 
 
 def _table_row(line: str, columns: dict[str, int]) -> list[float] | None:

@@ -50,26 +50,23 @@ class Movements:
     noise: FloatArray  # (2,) variances of their noise
 
     @classmethod
-    def of(cls, poses: PlanarPoses, first: int, last: int) -> Movements:
-        """The movements of a stream at the grid's steps from `first` to `last`."""
-        middle = _STEP_S * np.arange(first, last + 1)
+    def of(cls, poses: PlanarPoses) -> Movements:
+        """The movements of a stream at the grid's steps around its time."""
+        first = int(np.floor(poses.times_s[0] / _STEP_S))
+        middle = _STEP_S * np.arange(first, int(np.ceil(poses.times_s[-1] / _STEP_S)) + 1)
         interval = float(np.median(np.diff(poses.times_s)))
         longest = max(_LONGEST_GAP_S, _INTERVALS * interval)
-        x, y, heading = poses.poses.T
+        columns = (*poses.poses[:, :2].T, np.unwrap(poses.poses[:, 2]))
         ends, known = [], np.ones(len(middle), dtype=np.bool_)
         for times in (middle - 0.5 * _WINDOW_S, middle + 0.5 * _WINDOW_S):
             at = np.clip(np.searchsorted(poses.times_s, times), 1, len(poses) - 1)
             known &= poses.times_s[at] - poses.times_s[at - 1] <= longest
             known &= (times >= poses.times_s[0]) & (times <= poses.times_s[-1])
-            ends.append([np.interp(times, poses.times_s, v) for v in (x, y, np.unwrap(heading))])
+            ends.append([np.interp(times, poses.times_s, values) for values in columns])
         dx, dy, turn = np.array(ends[1]) - np.array(ends[0])
-        jitter = [roughness(v) for v in (x, y, np.unwrap(heading))]
-        noise = 2.0 * np.array([jitter[2] ** 2, 0.5 * (jitter[0] ** 2 + jitter[1] ** 2)])
+        x, y, heading = (roughness(values) for values in columns)
+        noise = 2.0 * np.array([heading**2, 0.5 * (x**2 + y**2)])
         return cls(first, np.column_stack([turn, np.hypot(dx, dy)]), known, noise)
-
-
-def _steps(poses: PlanarPoses) -> tuple[int, int]:
-    return int(np.floor(poses.times_s[0] / _STEP_S)), int(np.ceil(poses.times_s[-1] / _STEP_S))
 
 
 class OffsetSearch:
@@ -86,8 +83,9 @@ class OffsetSearch:
         if long:
             near = odometry.only(odometry.during(long[0][0] - reach, long[-1][-1] + reach))
         few = len(near) < _FEWEST_SAMPLES or np.ptp(near.times_s) > _LONGEST_SESSION_S
-        self._own = None if few else Movements.of(near, *_steps(near))
-        self._largest = int(np.ceil(largest_s / _STEP_S))
+        self._own = None if few else Movements.of(near)
+        largest = int(np.ceil(largest_s / _STEP_S))
+        self._steps = np.arange(-largest, largest + 1)
 
     def offset_s(self, parts: Sequence[PlanarPoses], around_s: float) -> float:
         """Robot time minus ground truth time for parts of the ground truth.
@@ -97,7 +95,7 @@ class OffsetSearch:
         compared = self._compared(parts)
         if compared is None:
             return around_s
-        steps = np.arange(-self._largest, self._largest + 1)
+        steps = self._steps
         errors = compared.errors(steps)
         near = np.abs(_STEP_S * steps - around_s) <= NEAR_S
         best = int(np.argmin(errors))
@@ -117,8 +115,7 @@ class OffsetSearch:
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return None
-        steps = np.arange(-self._largest, self._largest + 1)
-        own = np.minimum(compared.single_errors(steps), compared.unrelated)
+        own = np.minimum(compared.single_errors(self._steps), compared.unrelated)
         before = np.cumsum(own, axis=1)
         after = before[:, -1:] - before
         parted = before.min(axis=0) + after.min(axis=0)
@@ -150,7 +147,7 @@ class OffsetSearch:
     def _compared(self, parts: Sequence[PlanarPoses]) -> _Compared | None:
         if self._own is None:
             return None
-        moved = [Movements.of(part, *_steps(part)) for part in parts if len(part) > 1]
+        moved = [Movements.of(part) for part in parts if len(part) > 1]
         at = [one.first - self._own.first + np.flatnonzero(one.known) for one in moved]
         if sum(map(len, at)) < _FEWEST_SAMPLES or not np.any(self._own.known):
             return None

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -69,7 +70,7 @@ def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
     logarithms = np.zeros(3)
-    bounds = tuple(math.log(factor) for factor in _NOISE_FACTORS)
+    bounds, options = tuple(math.log(factor) for factor in _NOISE_FACTORS), {"xatol": 0.05}
 
     def scaled(values: FloatArray) -> FloatArray:
         return np.asarray(given * np.exp(values[[0, 1, 2, 2]]))
@@ -82,9 +83,7 @@ def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
                 tried[axis] = value
                 return sum(part.innovations(scaled(tried)).deviance for part in some)
 
-            found = minimize_scalar(
-                deviance, bounds=bounds, method="bounded", options={"xatol": 0.05}
-            )
+            found = minimize_scalar(deviance, bounds=bounds, method="bounded", options=options)
             logarithms[axis] = float(found.x)
     return scaled(logarithms)
 
@@ -98,12 +97,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
-    some = [
-        part.thinned(_SPACING_S)
-        for part in short.with_only(short.innovations(noise).accepted).split(
-            _LONGEST_GAP_TO_LEARN_FROM_S
-        )
-    ]
+    short = short.with_only(short.innovations(noise).accepted)
+    some = [part.thinned(_SPACING_S) for part in short.split(_LONGEST_GAP_TO_LEARN_FROM_S)]
     numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
@@ -207,9 +202,7 @@ class Fusion:
 
 
 def fuse(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    settings: FuseSettings | None = None,
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
 ) -> Fusion:
     """Fuse odometry with poses measured by other means.
 
@@ -253,14 +246,9 @@ def fuse(
     over_seconds = math.sqrt(inflation) * noise
     kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], deviations)
     if not np.all(kept):
-        turn, bend, way = np.where(kept, systematic_sigmas(chosen), 0.0).tolist()
-        fewer = replace(
-            chosen,
-            turn_scale_sigma=turn,
-            turn_bias_per_metre_sigma=bend,
-            distance_scale_sigma=way,
-        )
-        problem = replace(problem, settings=fewer)
+        names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
+        fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
+        problem = replace(problem, settings=replace(chosen, **fewer))
         smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.
@@ -334,9 +322,7 @@ class LeftOut:
 
 
 def leave_out(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    settings: FuseSettings | None = None,
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
@@ -354,43 +340,25 @@ def leave_out(
             f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "
             "more, to leave one out between two others"
         )
-    return tuple(
-        _left_out(own, streams, truth, float(times[0]), float(times[-1]), settings)
-        for times in parts[1:-1]
-    )
-
-
-def _left_out(
-    odometry: PlanarPoses,
-    streams: Mapping[str, PlanarPoses],
-    truth: PlanarPoses,
-    from_s: float,
-    to_s: float,
-    settings: FuseSettings | None,
-) -> LeftOut:
-    fusion = fuse(
-        odometry,
-        {name: one.only(~one.during(from_s, to_s)) for name, one in streams.items()},
-        settings,
-    )
-    here = truth.during(from_s, to_s)
-    segment, others = truth.only(here), truth.only(~here)
-    predicted, known = interpolate_poses(fusion.poses, segment.times_s, _LARGEST_GAP_S)
-    error = pose_differences(predicted.poses, segment.only(known).poses)
-    assert predicted.covariances is not None
-    assert segment.covariances is not None
-    covariances = predicted.covariances + segment.covariances[known]
-    beside, aligned = interpolate_poses(odometry, others.times_s, _LARGEST_GAP_S)
-    moved = moved_poses(odometry, planar_alignment(beside, others.only(aligned)))
-    rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
-    return LeftOut(
-        from_s,
-        to_s,
-        len(predicted),
-        *_rms(error),
-        float(np.mean(squared_mahalanobis(error, covariances)) / 3.0),
-        *_rms(pose_differences(rigid.poses, segment.only(known).poses)),
-    )
+    found = []
+    for times in parts[1:-1]:
+        span = (float(times[0]), float(times[-1]))
+        others = {name: one.only(~one.during(*span)) for name, one in streams.items()}
+        path = fuse(own, others, settings).poses
+        here = truth.during(*span)
+        segment, rest = truth.only(here), truth.only(~here)
+        predicted, known = interpolate_poses(path, segment.times_s, _LARGEST_GAP_S)
+        error = pose_differences(predicted.poses, segment.only(known).poses)
+        assert predicted.covariances is not None
+        assert segment.covariances is not None
+        covariances = predicted.covariances + segment.covariances[known]
+        nees = float(np.mean(squared_mahalanobis(error, covariances)) / 3.0)
+        beside, aligned = interpolate_poses(own, rest.times_s, _LARGEST_GAP_S)
+        moved = moved_poses(own, planar_alignment(beside, rest.only(aligned)))
+        rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)
+        rigid_error = pose_differences(rigid.poses, segment.only(known).poses)
+        found.append(LeftOut(*span, len(predicted), *_rms(error), nees, *_rms(rigid_error)))
+    return tuple(found)
 
 
 def _rms(difference: FloatArray) -> tuple[float, float]:

@@ -78,7 +78,7 @@ def as_localisation(
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None
     own, _ = interpolate_poses(odometry, thin.measured_s)
-    measured = PlanarPoses(thin.measured_s, thin.measured.poses, thin.measured.covariances)
+    measured = PlanarPoses(thin.measured_s, *thin.measured[1:])
     trimmed = _trimmed_alignment(own, measured)
     if trimmed is None:
         return None
@@ -170,19 +170,16 @@ def _stationary(
         squared = normal[-1, -1] - normal[:-1, -1] @ mean
         determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(lower)))
         determinant -= np.linalg.slogdet(covariance / _LEVEL_SIGMA**2)[1]
-        return _Stationary(
-            sigma, correlation, mean, covariance, stride * float(squared + determinant)
-        )
+        deviance = stride * float(squared + determinant)
+        return _Stationary(sigma, correlation, mean, covariance, deviance)
 
     def with_prior(logarithms: FloatArray) -> float:
         off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
         return fitted(logarithms).deviance / stride + float(off / _LOG_CORRELATION_SIGMA) ** 2
 
     start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
-    found = minimize(
-        with_prior, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02}
-    )
-    return fitted(found.x)
+    options = {"xatol": 0.02, "fatol": 0.02}
+    return fitted(minimize(with_prior, start, method="Nelder-Mead", options=options).x)
 
 
 def _bridged(

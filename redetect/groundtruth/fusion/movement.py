@@ -157,12 +157,11 @@ class MovementProblem:
         It begins with the given means and deviations of odometry's systematic errors, by default
         those of the settings.
         """
-        return self._forward(self._variances(noise), systematic=systematic)
+        return self.forward(self._variances(noise), systematic=systematic)
 
     def thinned(self, spacing_s: float) -> MovementProblem:
         """The problem with measurements at least this far apart."""
-        kept = np.zeros(len(self.streams), dtype=np.bool_)
-        last = -np.inf
+        kept, last = np.zeros(len(self.streams), dtype=np.bool_), -np.inf
         for i, time in enumerate(self.measured_s):
             if time - last >= spacing_s:
                 kept[i] = True
@@ -181,7 +180,7 @@ class MovementProblem:
         `slips` (N, 3): variances of movements that are added for slips.
         """
         history = empty_history(len(self.times_s))
-        self._forward(self._variances(noise) + slips, history=history)
+        self.forward(self._variances(noise) + slips, history=history)
         return history.filtered, history.filtered_covariance
 
     def smooth(self, noise: FloatArray, looser_in_gaps: float = 1.0) -> Smoothed:
@@ -200,7 +199,7 @@ class MovementProblem:
         history = empty_history(len(self.times_s))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
-            innovations = self._forward(variances, cuts=cuts, history=history)
+            innovations = self.forward(variances, cuts=cuts, history=history)
             unfit = self._ends_that_did_not_fit(innovations)
             if not unfit:
                 break
@@ -216,7 +215,7 @@ class MovementProblem:
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):
             before = states
-            innovations = self._forward(variances, before, cuts, history)
+            innovations = self.forward(variances, before, cuts, history)
             states, covariances = smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
@@ -266,10 +265,6 @@ class MovementProblem:
             other = share[:, None, None] * apart[:, :, None] * apart[:, None]
             covariances[begin + 1 : end, :POSE, :POSE] += other
 
-    def filtered_forward(self, variances: FloatArray) -> Innovations:
-        """Innovations with variances (N, 3) of the movements to nodes."""
-        return self._forward(variances)
-
     def gate(self) -> float:
         """Largest squared normalised innovation."""
         return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
@@ -293,7 +288,7 @@ class MovementProblem:
         way = way + hidden_way
         return np.column_stack([along * way + aside, across * way + aside, rest])
 
-    def _forward(
+    def forward(
         self,
         variances: FloatArray,
         points: FloatArray | None = None,
@@ -301,6 +296,7 @@ class MovementProblem:
         history: FilterHistory | None = None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
     ) -> Innovations:
+        """Innovations of a forward filter with variances (N, 3) of the movements to nodes."""
         means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
         return filter_forward(
             Odometry(self.controls, variances),

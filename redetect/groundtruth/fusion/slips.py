@@ -9,6 +9,7 @@ the measurements return to the path as predicted is one of gross errors of their
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
 _LEAST_RUN, _LEAST_LAST_RUN = 10, 20
 # A squared innovation beyond this share of the gate is no return to the predicted path.
 _NO_RETURN = 1.0 / 3.0
-# Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried.
-# A measurement that contradicts nothing any more costs about as much as a rejected one.
-_TRIED_LENGTHS, _TRIED_RATES = (1, 2, 4, 8, 16, 32), (1.0, 100.0)
-_COST_OF_LENGTH = {1.0: 20.0, 100.0: 50.0}
+# Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried,
+# with the cost of a measurement: one that contradicts nothing any more costs about as much as a
+# rejected one.
+_TRIED_LENGTHS, _TRIED_RATES = (1, 2, 4, 8, 16, 32), {1.0: 20.0, 100.0: 50.0}
 # The run's squared errors must become smaller by this factor.
 _LEAST_GAIN = 0.8
 _ROUNDS = 12
@@ -42,7 +43,7 @@ def slip_variances(
     """
     slips = np.zeros_like(variances)
     nodes, times_s, gate = problem.measured.nodes, problem.measured_s, problem.gate()
-    found = problem.filtered_forward(variances)
+    found = problem.forward(variances)
     hopeless: set[int] = set()
     for _ in range(_ROUNDS):
         runs = [
@@ -50,7 +51,7 @@ def slip_variances(
             for begin, end in _runs(found, nodes)
             if begin not in hopeless
             and times_s[begin] - times_s[begin - 1] <= longest_gap_s
-            and _is_slip(found, times_s, begin, end, gate, longest_gap_s)
+            and _is_slip(found, times_s, (begin, end), gate, longest_gap_s)
         ]
         if not runs:
             break
@@ -61,21 +62,20 @@ def slip_variances(
             for begin, end in runs
         ]
         chosen: list[_Slip | None] = [None] * len(runs)
-        for length in _TRIED_LENGTHS:
-            for rate in _TRIED_RATES:
-                tried = [
-                    _Slip(int(nodes[begin - 1]), int(nodes[min(begin + length, end) - 1]), rate)
-                    for begin, end in runs
-                ]
-                with_them = variances + _added(slips, problem.times_s, tried)
-                clipped = np.minimum(problem.filtered_forward(with_them).squared, gate)
-                for i, (begin, end) in enumerate(runs):
-                    cost = float(np.sum(clipped[begin:end])) + length * _COST_OF_LENGTH[rate]
-                    if cost < least[i]:
-                        least[i], chosen[i] = cost, tried[i]
+        for length, (rate, cost_of_length) in product(_TRIED_LENGTHS, _TRIED_RATES.items()):
+            tried = [
+                _Slip(int(nodes[begin - 1]), int(nodes[min(begin + length, end) - 1]), rate)
+                for begin, end in runs
+            ]
+            with_them = variances + _added(slips, problem.times_s, tried)
+            clipped = np.minimum(problem.forward(with_them).squared, gate)
+            for i, (begin, end) in enumerate(runs):
+                cost = float(np.sum(clipped[begin:end])) + length * cost_of_length
+                if cost < least[i]:
+                    least[i], chosen[i] = cost, tried[i]
         hopeless.update(begin for (begin, _), one in zip(runs, chosen) if one is None)
         slips = _added(slips, problem.times_s, [one for one in chosen if one is not None])
-        found = problem.filtered_forward(variances + slips)
+        found = problem.forward(variances + slips)
     return slips
 
 
@@ -121,15 +121,11 @@ def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
 
 
 def _is_slip(
-    found: Innovations,
-    times_s: FloatArray,
-    begin: int,
-    end: int,
-    gate: float,
-    longest_gap_s: float,
+    found: Innovations, times_s: FloatArray, run: tuple[int, int], gate: float, longest_gap_s: float
 ) -> bool:
     """Whether the measurements after a run of rejections do not return to the predicted path."""
+    begin, end = run
     if end == len(times_s) or times_s[end] - times_s[end - 1] > longest_gap_s:
         return end - begin >= _LEAST_LAST_RUN
-    restarted = bool(found.accepted[end - 1])
-    return restarted or bool(found.squared[end] > _NO_RETURN * gate)
+    # Where the filter restarted, the last measurement of the run is accepted.
+    return bool(found.accepted[end - 1] or found.squared[end] > _NO_RETURN * gate)

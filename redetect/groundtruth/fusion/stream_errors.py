@@ -100,11 +100,11 @@ def without_common(poses: PlanarPoses, common: FloatArray) -> tuple[PlanarPoses,
     """
     if poses.covariances is None or not len(poses):
         return poses, np.zeros((3, 3))
-    usual = np.median(np.diagonal(poses.covariances, axis1=1, axis2=2), axis=0)
-    if np.all(np.diag(common) <= _NEGLIGIBLE * usual):
+    variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
+    if np.all(np.diag(common) <= _NEGLIGIBLE * np.median(variances, axis=0)):
         return poses, np.zeros((3, 3))
     # In units of each pose's deviations, no direction may lose all of its variance.
-    scale = np.sqrt(np.diagonal(poses.covariances, axis1=1, axis2=2))
+    scale = np.sqrt(variances)
     units = scale[:, :, None] * scale[:, None, :]
     values, vectors = np.linalg.eigh((poses.covariances - common) / units)
     own = (vectors * np.maximum(values, _LEAST_OWN)[:, None]) @ np.swapaxes(vectors, 1, 2)

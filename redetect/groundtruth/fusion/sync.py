@@ -25,12 +25,7 @@ from scipy.optimize import Bounds, direct, minimize, minimize_scalar
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.clock import (
-    ClockSegment,
-    Status,
-    knots_of,
-    on_one_line,
-)
+from redetect.groundtruth.fusion.clock import ClockSegment, knots_of, on_one_line
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
@@ -130,11 +125,7 @@ def synchronise(
             clock = replace(clock, offset_s=clock.offset_s + around_s)
             clock = _if_matching(clock, part, search, bounds)
             beside = [at for at in set_at_s if at in (clock.from_s, clock.to_s)]
-            if beside and clock.status == "ok":
-                clock = replace(
-                    clock, status="jump", note=f"the clock was set near {beside[0]:.2f} s"
-                )
-            found.append(clock)
+            found.append(_set_near(beside[0], clock) if beside else clock)
     if all(segment.note == _NO_ODOMETRY for segment in found):
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
@@ -209,10 +200,9 @@ def _segment(
         if abs(start_s - best.clock[0]) > _ANOTHER_START_S:
             starts.append(np.array([start_s, 0.0]))
         fits = [_most_likely_clock(own, jittered, pair.reference_s, at, bounds) for at in starts]
-        moving = min(
-            (fit for fit in fits if fit is not None), key=lambda fit: fit.deviance, default=None
-        )
-        if moving is not None and moving.uncertainty(measured) < best.uncertainty(measured):
+        maxima = [fit for fit in fits if fit is not None]
+        moving = min(maxima, key=lambda fit: fit.deviance, default=best)
+        if moving.uncertainty(measured) < best.uncertainty(measured):
             best = moving
     # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, bounds) if jumps_left > 0 else None
@@ -222,14 +212,8 @@ def _segment(
             part = segment.only(which)
             parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
         if _differ(parts):
-            return [
-                replace(part, status="jump", note=f"the clock was set near {place:.2f} s")
-                if part.status == "ok"
-                else part
-                for part in parts
-            ]
+            return [_set_near(place, part) for part in parts]
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
-    status: Status = "at a bound" if at_bound else "ok"
     return [
         ClockSegment(
             from_s=float(segment.times_s[0]),
@@ -241,9 +225,16 @@ def _segment(
             sigma_offset_s=float(best.sigmas[0]),
             sigma_rate=float(best.sigmas[1]),
             turned_rad=turned,
-            status=status,
+            status="at a bound" if at_bound else "ok",
         )
     ]
+
+
+def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
+    """The clock of a segment at an end of which it was set."""
+    if clock.status != "ok":
+        return clock
+    return replace(clock, status="jump", note=f"the clock was set near {time_s:.2f} s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -417,16 +408,15 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
 
     A localisation jitters from sample to sample, and this error does not accumulate.
     """
-    covariances = np.zeros((len(measured), 3, 3))
-    if measured.covariances is None:
-        covariances[:, 2, 2] = roughness(np.unwrap(measured.poses[:, 2])) ** 2
-    else:
-        covariances += measured.covariances
+    covariances = measured.covariances
+    if covariances is None:
+        covariances = np.diag([0.0, 0.0, roughness(np.unwrap(measured.poses[:, 2])) ** 2])
     columns = (*odometry.poses[:, :2].T, np.unwrap(odometry.poses[:, 2]))
     jitter = np.array([roughness(values) for values in columns])
     # Between two samples odometry's path is unknown by the sag of what it bends.
     sag = np.array([np.sqrt(np.mean(np.square(np.diff(values, 2)))) / 8.0 for values in columns])
-    return PlanarPoses(measured.times_s, measured.poses, covariances + np.diag(jitter**2 + sag**2))
+    own = np.tile(np.diag(jitter**2 + sag**2), (len(measured), 1, 1))
+    return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 
 
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
@@ -435,10 +425,10 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     If samples have a constant phase relative to the measured poses, that difference would look like
     a better or worse fit of the clock.
     """
-    x, y, theta = odometry.poses.T
     # Relative to the first one, since sums of times since 1970 lose digits.
     begin_s = odometry.times_s[0]
-    columns = np.column_stack([odometry.times_s - begin_s, x, y, np.unwrap(theta)])
+    columns = np.column_stack([odometry.times_s - begin_s, odometry.poses])
+    columns[:, 3] = np.unwrap(columns[:, 3])
     interval_s = float(np.median(np.diff(odometry.times_s)))
     aside = min(_SMOOTHED_SAMPLES, int(_SMOOTHED_S / interval_s)) // 2
     means = uniform_filter1d(columns, 1 + 2 * aside, axis=0)

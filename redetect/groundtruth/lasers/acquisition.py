@@ -112,9 +112,7 @@ class ScanSets:
 
 
 def fixed_scanners(
-    scanners: Sequence[Scanner],
-    empties: Sequence[Scans],
-    covariance: FloatArray | None = None,
+    scanners: Sequence[Scanner], empties: Sequence[Scans], covariance: FloatArray | None = None
 ) -> FixedScanners:
     """Arrange scanners, and the background from their scans of the empty area, for the kernels.
 
@@ -129,8 +127,7 @@ def fixed_scanners(
     near = np.zeros((len(scanners), width))
     direction, beam_times = np.zeros((len(scanners), width, 2)), np.zeros((len(scanners), width))
     for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
-        reach_m = np.minimum(background.near_m, scanner.max_range_m)
-        near[i, : scanner.readings] = 1e3 * reach_m
+        near[i, : scanner.readings] = 1e3 * np.minimum(background.near_m, scanner.max_range_m)
         beam_times[i, : scanner.readings] = scanner.beam_times_s
         angle = scanner.pose[2] + scanner.angles_rad
         direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -223,13 +220,6 @@ def outline_faces(outline: ArrayLike) -> FloatArray:
     return faces
 
 
-def outline_radius_m(faces: FloatArray) -> tuple[FloatArray, float]:
-    """Middle (2,) of the outline's bounding box, and its farthest corner's distance from it (m)."""
-    corners = faces[:, :2]
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    return middle, float(np.max(np.hypot(*(corners - middle).T)))
-
-
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
     """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
 
@@ -244,19 +234,15 @@ def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatAr
     x1, y1, x2, y2 = faces.T
     twice = x1 * y2 - x2 * y1
     centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
-    poses, errors = [], []
-    for degrees in range(-180, 180, 3):
-        angle = math.radians(degrees)
-        pose = np.array([*(centre - rotation(angle) @ centre), angle])
-        poses.append(pose)
-        errors.append(_farthest_m(points, faces, pose))
+    angles = [math.radians(degrees) for degrees in range(-180, 180, 3)]
+    poses = [np.array([*(centre - rotation(angle) @ centre), angle]) for angle in angles]
+    errors = [_farthest_m(points, faces, pose) for pose in poses]
     found: list[FloatArray] = []
     for i, error in enumerate(errors):
         if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
             continue
         # Refined by an ICP of the whole outline to itself.
-        pose, _, _ = fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)
-        pose = invert(pose)
+        pose = invert(fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)[0])
         pose[2] = _turn(pose[2])
         far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
         if far and _farthest_m(points, faces, pose) <= tolerance_m:
@@ -275,13 +261,12 @@ def _turn(angle: float) -> float:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> bool:
-    def side(face: FloatArray, x: float, y: float) -> float:
-        return float((face[2] - face[0]) * (y - face[1]) - (face[3] - face[1]) * (x - face[0]))
+    def on_both_sides(face: FloatArray, other: FloatArray) -> bool:
+        (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
+        sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
+        return bool(sides[0] * sides[1] < 0.0)
 
-    return (
-        side(a, b[0], b[1]) * side(a, b[2], b[3]) < 0.0
-        and side(b, a[0], a[1]) * side(b, a[2], a[3]) < 0.0
-    )
+    return on_both_sides(a, b) and on_both_sides(b, a)
 
 
 def refine(
@@ -304,7 +289,9 @@ def refine(
 def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
     """Prepare an outline (k, 2); raises `GroundTruthError` if it is not valid."""
     faces = outline_faces(outline)
-    middle, radius = outline_radius_m(faces)
+    corners = faces[:, :2]
+    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    radius = float(np.max(np.hypot(*(corners - middle).T)))
     return Body(faces, middle, radius, outline_symmetries(faces, symmetry_m))
 
 
@@ -325,16 +312,13 @@ def acquire(
     found: list[tuple[float, FloatArray]] = []
     for place in _places(seen.points, body, settings):
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
-        if int(near.sum()) < settings.acquire_readings:
-            continue
-        found += _search(place, seen.where(near), scans, fixed, body, settings)
+        if np.count_nonzero(near) >= settings.acquire_readings:
+            found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
-    found.sort(key=lambda entry: -entry[0])
-    best, pose = found[0]
-    for score, other in found[1:]:
-        if score > 0.85 * best and not _same(pose, other, body):
-            return None
+    best, pose = max(found, key=lambda entry: entry[0])
+    if any(score > 0.85 * best and not _same(pose, other, body) for score, other in found):
+        return None
     return pose
 
 
@@ -385,9 +369,8 @@ def _search(
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
         _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
-        if agree < settings.least_agreement * (agree + through + hidden + beside):
-            continue
-        found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
+        if agree >= settings.least_agreement * (agree + through + hidden + beside):
+            found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 
 

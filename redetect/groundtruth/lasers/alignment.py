@@ -16,13 +16,7 @@ from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.lasers.icp import (
-    Scan,
-    align_scans,
-    explained,
-    fit_outline,
-    scan_normals,
-)
+from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.walls import (
     FLOOR_M,
@@ -113,31 +107,26 @@ def align_scanners(
     steps["merged"] = _merged(scans, steps["pairs"], shares, s)
     steps["realigned"] = _round(scans, steps["merged"], s)
     steps["together"] = _together(scans, steps["realigned"], s)
-    steps["map as a whole"] = _whole_to_map(scans, steps["together"], measured, building, s)
+    whole = _whole_to_map(scans, steps["together"], measured, building, s)
+    steps["map as a whole"] = whole
     narrowing = (*(n for n in _NARROWING_M if n <= s.gate_m), FLOOR_M)
     fits: list[WallFit | None] = []
     failed: GeometryError | None = None
-    for scanner, still, start in zip(scanners, stills, steps["map as a whole"]):
+    origin = np.zeros((1, 3))
+    for scanner, still, start in zip(scanners, stills, whole):
         try:
             fits.append(
-                fit_to_walls(
-                    [still], np.zeros((1, 3)), building, start, s.gate_m, narrowing, _WEAK_M
-                )
+                fit_to_walls([still], origin, building, start, s.gate_m, narrowing, _WEAK_M)
             )
         except GeometryError as error:
             fits.append(None)
             failed = failed or GeometryError(f"scanner {scanner.name}: {error}")
-    body = body_on_inexact_map(
-        stills, fits, steps["map as a whole"], building, narrowing, s.gate_m, _WEAK_M
-    )
+    body = body_on_inexact_map(stills, fits, whole, building, narrowing, s.gate_m, _WEAK_M)
     if body is None and failed is not None:
         raise failed
-    steps["each to the map"] = np.stack(
-        [whole if fit is None else fit.pose for whole, fit in zip(steps["map as a whole"], fits)]
-    )
-    poses = steps["each to the map"]
-    moved = poses - steps["map as a whole"]
-    far = np.hypot(moved[:, 0], moved[:, 1]) > _INCONSISTENT_M
+    poses = np.stack([start if fit is None else fit.pose for start, fit in zip(whole, fits)])
+    steps["each to the map"] = poses
+    far = np.hypot(*(poses - whole)[:, :2].T) > _INCONSISTENT_M
     if body is not None:
         poses, covariance, map_sigma_m = body.poses, body.covariance, body.map_sigma_m
         fits = [fit or body.fit._replace(used=0) for fit in fits]
@@ -194,13 +183,10 @@ def _chained(
         pair = max(
             (p for p in shares if (p[0] in placed) != (p[1] in placed)), key=lambda p: shares[p]
         )
-        i, j = pair
-        if i in placed:
-            poses[j] = compose(poses[i], relative[pair])
-            placed.append(j)
-        else:
-            poses[i] = compose(poses[j], invert(relative[pair]))
-            placed.append(i)
+        a, b = pair if pair[0] in placed else pair[::-1]
+        a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
+        poses[b] = compose(poses[a], a_from_b)
+        placed.append(b)
     return poses
 
 

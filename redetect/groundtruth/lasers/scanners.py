@@ -26,14 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.bounds import (
-    ABOVE_0,
-    FINITE,
-    NotNegative,
-    Positive,
-    demand_fields,
-    whole,
-)
+from redetect.bounds import ABOVE_0, FINITE, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
@@ -159,7 +152,7 @@ def with_measured_noise(
 def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Path) -> list[str]:
     """What to say about scanners that are used with another noise than stated in a file."""
     return [
-        f"warning: scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
+        f"scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
         f"mm, not by {1e3 * a.sigma_m:.1f} mm as in {path}: the larger value is used"
         for a, b in zip(stated, used)
         if b.sigma_m > a.sigma_m
@@ -216,11 +209,10 @@ def _scanners(content: JsonObject) -> tuple[Scanner, ...]:
     content.demand_version()
     scanners = tuple(_scanner(entry) for entry in content.rows("scanners"))
     names = [scanner.name for scanner in scanners]
-    for name in names:
-        if names.count(name) > 1:
-            raise GroundTruthError(
-                f"{content.place}: scanner {excerpt(name)} is listed more than once"
-            )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise GroundTruthError(
+            f"{content.place}: scanner {excerpt(twice[0])} is listed more than once"
+        )
     return scanners
 
 

@@ -78,12 +78,23 @@ class LaserTrack:
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
 
-    @classmethod
-    def empty(cls, times_s: FloatArray, scanners: int) -> LaserTrack:
-        """A track without poses, to be filled."""
-        n = len(times_s)
-        return cls(
-            times_s,
+
+class Tracker:
+    """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
+
+    def __init__(
+        self,
+        sets: ScanSets,
+        fixed: FixedScanners,
+        body: Body,
+        largest_speed_m_s: float,
+        settings: LaserSettings,
+    ) -> None:
+        self.sets, self.fixed, self.body = sets, fixed, body
+        self.speed, self.settings = largest_speed_m_s, settings
+        n, scanners = len(sets), len(fixed.origins)
+        self.track = LaserTrack(
+            sets.times_s,
             status=np.full(n, LOST),
             segment=np.full(n, -1),
             poses=np.full((n, 3), np.nan),
@@ -100,25 +111,8 @@ class LaserTrack:
             correction_sigma=np.full((scanners, 3), np.nan),
             fronts={},
         )
-
-
-class Tracker:
-    """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
-
-    def __init__(
-        self,
-        sets: ScanSets,
-        fixed: FixedScanners,
-        body: Body,
-        largest_speed_m_s: float,
-        settings: LaserSettings,
-    ) -> None:
-        self.sets, self.fixed, self.body = sets, fixed, body
-        self.speed, self.settings = largest_speed_m_s, settings
-        self.track = LaserTrack.empty(sets.times_s, len(fixed.origins))
-        self.prior_m = np.full(len(sets), 0.02)
-        self.information = np.zeros((len(fixed.origins), 3, 3))
-        self.gradient = np.zeros((len(fixed.origins), 3))
+        self.prior_m = np.full(n, 0.02)
+        self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""
@@ -133,15 +127,17 @@ class Tracker:
                 if t - searched_s < self.settings.acquire_s:
                     continue
                 searched_s = t
-                acquired = self._acquired(i)
+                # From the scans of this set alone, if they show the robot.
+                found = acquire(self.sets[i], self.fixed, self.body, self.settings)
+                acquired = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
                 if acquired is not None:
+                    if self.track.status[i] == OK:
+                        self.track.status[i] = REACQUIRED
                     pose, motion, segment, tracked = acquired, np.zeros(3), segment + 1, True
                     posed_s = before_s = determined_s = t
-                    begun = i
-                    self.track.segment[i] = segment
+                    self.track.segment[i], begun = segment, i
                 continue
-            step = t - before_s
-            before_s = t
+            step, before_s = t - before_s, t
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
@@ -159,14 +155,6 @@ class Tracker:
             posed_s = t
             determined_s = t if self.track.status[i] == OK else determined_s
         return self._finished()
-
-    def _acquired(self, i: int) -> FloatArray | None:
-        """Pose of set i from its scans alone, if they show the robot."""
-        found = acquire(self.sets[i], self.fixed, self.body, self.settings)
-        pose = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
-        if pose is not None and self.track.status[i] == OK:
-            self.track.status[i] = REACQUIRED
-        return pose
 
     def _fit(
         self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
@@ -247,7 +235,13 @@ class Tracker:
         scale = self._scales(good)
         for covariances in (self.track.covariances, self.track.noise):
             covariances[good] *= scale[:, None, None]
-        self._correct()
+        # Corrections of the scanners' poses, by all residuals.
+        for k, information in enumerate(self.information):
+            values, vectors = np.linalg.eigh(information)
+            if values[0] > 1e-9 * max(values[2], 1e-9):
+                covariance = (vectors / values) @ vectors.T
+                self.track.corrections[k] = -covariance @ self.gradient[k]
+                self.track.correction_sigma[k] = np.sqrt(np.diag(covariance))
         return self.track
 
     def _again(self, i: int, motion: FloatArray) -> None:
@@ -280,8 +274,9 @@ class Tracker:
         best = int(np.argmin(costs.mean(axis=0)))
         worse = np.delete(costs, best, axis=1) - costs[:, best : best + 1]
         error = worse.std(axis=0) / math.sqrt(len(sample)) + 1e-9
-        by = f"outline, by {float(np.min(worse.mean(axis=0) / error)):.0f} sigma"
-        if np.min(worse.mean(axis=0) / error) < self.settings.front_sigma:
+        sigmas = float(np.min(worse.mean(axis=0) / error))
+        by = f"outline, by {sigmas:.0f} sigma"
+        if sigmas < self.settings.front_sigma:
             ahead = self._ahead(rows, velocity, choices)
             order = np.argsort(ahead)[::-1]
             best = int(order[0])
@@ -298,15 +293,13 @@ class Tracker:
 
     def _cost(self, i: int, choice: FloatArray) -> float:
         """Squared normalised residuals of set i from a choice of its front, those gated at most."""
-        s, body = self.settings, self.body
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
         start, _ = self._aligned(seen, start)
-        found = refine(seen, start, self.fixed, body, s, 0.02)
-        _, _, through, hidden, _, beside = explain_set(
-            self.sets[i], self.fixed, self.body, found.pose
-        )
-        return float(found.chi2 + s.gate_sigma**2 * (through + hidden + beside))
+        found = refine(seen, start, self.fixed, self.body, self.settings, 0.02)
+        beams = explain_set(self.sets[i], self.fixed, self.body, found.pose)
+        wrong = beams.through + beams.hidden + beams.beside
+        return float(found.chi2 + self.settings.gate_sigma**2 * wrong)
 
     def _ahead(
         self, rows: IntArray, velocity: FloatArray, choices: list[FloatArray]
@@ -338,15 +331,6 @@ class Tracker:
         ratio = squared / total
         return np.where(ratio > 1.0 + 4.0 * np.sqrt(2.0 / total), ratio, 1.0)
 
-    def _correct(self) -> None:
-        """Corrections of the scanners' poses, by all residuals."""
-        for k, information in enumerate(self.information):
-            values, vectors = np.linalg.eigh(information)
-            if values[0] > 1e-9 * max(values[2], 1e-9):
-                covariance = (vectors / values) @ vectors.T
-                self.track.corrections[k] = -covariance @ self.gradient[k]
-                self.track.correction_sigma[k] = np.sqrt(np.diag(covariance))
-
 
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     """(n, 3) slopes of lines through the poses of the window around each time."""
@@ -355,9 +339,8 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     out = np.zeros_like(values)
     first = np.searchsorted(times_s, times_s - _VELOCITY_WINDOW_S)
     last = np.searchsorted(times_s, times_s + _VELOCITY_WINDOW_S, side="right")
-    origin = times_s[0] if len(times_s) else 0.0
-    t = times_s - origin
-    terms = (t[:, None], t[:, None] ** 2, values, values * t[:, None])
+    t = (times_s - times_s[:1])[:, None]
+    terms = (t, t**2, values, values * t)
     sums = [np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v, axis=0)]) for v in terms]
     n = (last - first)[:, None].astype(np.float64)
     st, stt, sx, stx = (total[last] - total[first] for total in sums)
@@ -390,32 +373,27 @@ def track_without_suspects(
     standard deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
-    track = track_by_lasers(sets, fixed, robot, settings)
-    while len(scanners) - len(left_out) >= 3:
+    while True:
+        track = track_by_lasers(sets, fixed, robot, settings)
         excess = excess_shifts(track, scanners)
         worst = int(np.argmax(excess))
-        if excess[worst] <= 1.0:
-            break
+        if len(scanners) - len(left_out) < 3 or excess[worst] <= 1.0:
+            return track, left_out
         left_out[scanners[worst].name] = np.stack(
             [track.corrections[worst], track.correction_sigma[worst]]
         )
         rows = sets.rows.copy()
         rows[:, worst] = -1
         sets = replace(sets, rows=rows)
-        track = track_by_lasers(sets, fixed, robot, settings)
-    return track, left_out
 
 
 def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:
     """(scanners,) ratio of their shifts to the allowed ones; above 1 is suspect."""
     least = np.array([_SUSPECT_M, _SUSPECT_M, _SUSPECT_RAD])
-    excess = np.zeros(len(scanners))
-    for k, scanner in enumerate(scanners):
-        shift, sigma = track.corrections[k], track.correction_sigma[k]
-        if np.isfinite(shift).all():
-            allowed = _SUSPECT_SIGMA * np.sqrt(sigma**2 + np.diag(scanner.covariance))
-            excess[k] = float(np.max(np.abs(shift) / np.maximum(allowed, least)))
-    return excess
+    given = np.array([np.diag(scanner.covariance) for scanner in scanners])
+    allowed = _SUSPECT_SIGMA * np.sqrt(track.correction_sigma**2 + given)
+    excess = np.max(np.abs(track.corrections) / np.maximum(allowed, least), axis=1)
+    return np.where(np.isfinite(track.corrections).all(axis=1), excess, 0.0)
 
 
 def usual_sets_per_pose(track: LaserTrack) -> int:
@@ -473,10 +451,9 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     apart = pose_differences(moved, lead[block])
     # Equal weights: information computed at a wrong pose would favour wrong poses, and with equal
     # weights at the mean time an error of the motion cancels.
-    mean, noise = mean_of(apart), mean_of(track.noise[rows]) / size[:, None, None]
-    shared = mean_of((track.covariances - track.noise)[rows])
-    poses = lead + mean
+    poses = lead + mean_of(apart)
     poses[:, 2] = wrap_angle(poses[:, 2])
-    covariances = noise + shared
+    noise = mean_of(track.noise[rows]) / size[:, None, None]
+    covariances = noise + mean_of((track.covariances - track.noise)[rows])
     covariances = 0.5 * (covariances + np.swapaxes(covariances, 1, 2))
     return PlanarPoses(middle + origin, poses, covariances)

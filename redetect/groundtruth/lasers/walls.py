@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from redetect.array_types import FloatArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.lasers.tracking_kernels import NewReadings, OutlineFit, refine_outline
@@ -154,6 +154,25 @@ def fit_to_walls(
     )
 
 
+def first_walls(
+    origin: FloatArray, directions: FloatArray, walls: FloatArray
+) -> tuple[FloatArray, IntArray, FloatArray]:
+    """The walls (S, 4) that rays from a point meet first: distances (N,), infinite if there is
+    none, indices (N,), and cosines (N,) of the angles of incidence.
+
+    `directions`: (N, 2) unit vectors.
+    """
+    start, along = walls[:, :2] - origin, walls[:, 2:] - walls[:, :2]
+    across = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
+        part = (start[:, 0] * directions[:, 1:] - start[:, 1] * directions[:, :1]) / across
+    far = np.where((far > 0.0) & (part >= 0.0) & (part <= 1.0), far, np.inf)
+    rows, first = np.arange(len(directions)), np.argmin(far, axis=1)
+    cosines = np.abs(across[rows, first]) / np.hypot(*along[first].T)
+    return far[rows, first], first, cosines
+
+
 class WallOffsets(NamedTuple):
     """By how much walls are off the map, according to the readings that they reflect."""
 
@@ -173,20 +192,9 @@ def wall_offsets(scans: Sequence[StillScan], poses: FloatArray, walls: FloatArra
     """
     wall, off = [], []
     for scan, pose in zip(scans, poses):
-        ray = scan.direction @ rotation(pose[2]).T
-        along = walls[:, 2:] - walls[:, :2]
-        to_wall = walls[:, :2] - pose[:2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            across = ray[:, :1] * along[:, 1] - ray[:, 1:] * along[:, 0]
-            distance = (to_wall[:, 0] * along[:, 1] - to_wall[:, 1] * along[:, 0]) / across
-            share = (to_wall[:, 0] * ray[:, 1:] - to_wall[:, 1] * ray[:, :1]) / across
-        hit = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
-        distance = np.where(hit, distance, np.inf)
-        first = np.argmin(distance, axis=1)
-        beams = np.arange(len(ray))
-        slope = across[beams, first] / np.hypot(*along[first].T)
+        far, first, cosines = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, walls)
         wall.append(first)
-        off.append((scan.range_m - distance[beams, first]) * np.abs(slope))
+        off.append((scan.range_m - far) * cosines)
     walls_met, offs = np.concatenate(wall), np.concatenate(off)
     near = np.abs(offs) < _NEAR_WALL_M
     walls_met, offs = walls_met[near], offs[near]

@@ -19,7 +19,7 @@ one odd number of corners, this orientation is unique.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +104,7 @@ def read_boards(path: Path) -> BoardsFile:
         double = DoubleBoard(None, np.zeros((6, 6)))
         if content.values.get("first_from_second") is not None:
             entry = content.inner("first_from_second")
-            double = replace(double, offset=parse_pose(entry), covariance=entry.uncertainty(6))
+            double = DoubleBoard(parse_pose(entry), entry.uncertainty(6))
     images = tuple(_image(row, path, boards) for row in content.rows("images"))
     cameras = {
         name: read_camera(_inside(path, calibration_of(name)))

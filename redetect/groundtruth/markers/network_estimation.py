@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -104,12 +105,11 @@ def _estimated_offset(seen: _PosedShots) -> FloatArray:
     """
     together: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for shot in seen:
-        for view_a, a in shot:
-            for view_b, b in shot:
-                if (view_a.board, view_b.board) == (FIRST, SECOND):
-                    if view_a.camera == view_b.camera:
-                        return np.asarray(inverse(a) @ b)
-                    together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
+        for (view_a, a), (view_b, b) in product(shot, repeat=2):
+            if (view_a.board, view_b.board) == (FIRST, SECOND):
+                if view_a.camera == view_b.camera:
+                    return np.asarray(inverse(a) @ b)
+                together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
     pairs = np.array(max(together.values(), key=len, default=[])).reshape(-1, 2, 4, 4)
     left, right = (inverse(poses[:1]) @ poses[1:] for poses in pairs.swapaxes(0, 1))
     if len(left) < 2 or np.linalg.svd(log_se3(left)[:, 3:], compute_uv=False)[1] < 0.05:
@@ -180,16 +180,12 @@ def _bundle(
 ) -> tuple[Bundle, tuple[BoardView, ...]]:
     """Bundle of all views; its first body is the world, the others are the double boards."""
     names, order = sorted(setup.cameras), list(parts)
-    body_index = {number: 1 + i for i, number in enumerate(bodies)}
+    body_index = {number: body for body, number in enumerate(bodies, 1)}
     views = [view for shot in seen for view, _ in shot]
     rows = [
-        (
-            names.index(view.camera),
-            0 if view.board == WORLD else body_index[number],
-            order.index(view.board),
-        )
-        for number, shot in enumerate(seen)
-        for view, _ in shot
+        (names.index(v.camera), 0 if v.board == WORLD else body_index[i], order.index(v.board))
+        for i, shot in enumerate(seen)
+        for v, _ in shot
     ]
     counts = [len(view.corners) for view in views]
     camera, body, part = np.repeat(np.array(rows).reshape(-1, 3), counts, axis=0).astype(np.int64).T

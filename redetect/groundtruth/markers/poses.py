@@ -25,12 +25,7 @@ from redetect.groundtruth.markers.refinement import (
     refined_poses,
 )
 from redetect.groundtruth.settings import PoseSettings, Solver
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    inverse,
-    log_se3,
-    transform,
-)
+from redetect.groundtruth.trajectories.transforms import apply, inverse, log_se3, transform
 
 _RANSAC_PX = 4.0
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
@@ -130,13 +125,9 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
     """Poses `world_from_robot` that one marker in one image allows, the best first; may be none."""
     chosen = np.flatnonzero(problem.view == view)
     camera, marker = int(problem.seen.camera[chosen[0]]), int(problem.seen.part[chosen[0]])
+    points, pixels = problem.seen.points[chosen], problem.seen.pixels[chosen]
     try:
-        found = solve_camera(
-            problem.network.cameras[camera],
-            problem.seen.points[chosen],
-            problem.seen.pixels[chosen],
-            "ippe",
-        )
+        found = solve_camera(problem.network.cameras[camera], points, pixels, "ippe")
     except GeometryError:
         return []
     marker_from_robot = inverse(problem.rig.robot_from_marker[marker])
@@ -160,13 +151,10 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
         "iterative": cv2.SOLVEPNP_ITERATIVE,
         "ippe": cv2.SOLVEPNP_IPPE_SQUARE,
     }
+    contiguous = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
-            np.ascontiguousarray(points),
-            np.ascontiguousarray(normalised),
-            np.eye(3),
-            None,
-            flags=flags[solver],
+            *contiguous, np.eye(3), None, flags=flags[solver]
         )
         poses = [
             transform(cv2.Rodrigues(rotation)[0], translation.ravel())
@@ -251,11 +239,19 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
         found = [refined]
     alone = problem.only(views)
     starts = _starts(alone)[:1] + _mirrored(alone)
-    candidates = _likely(_distinct(found + _refined(alone, starts)), settings)
-    best = candidates[0]
-    inflation = _inflation(best)
+    minima = _distinct(found + _refined(alone, starts))
+    best = minima[0]
+    # Squared residuals may be larger than their covariances imply.
+    inflation = max(1.0, best.cost / max(1, best.degrees_of_freedom))
+    limit = best.cost + 2.0 * np.log(settings.ambiguity_odds) * inflation
+    # The best minimum and those that it cannot exclude.
+    candidates = tuple(
+        pose
+        for pose in minima
+        if pose is best or (pose.cost <= limit and not _within_covariance(pose, best))
+    )
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
-    return PoseEstimate(tuple(candidates), views, log_odds)
+    return PoseEstimate(candidates, views, log_odds)
 
 
 def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:
@@ -308,22 +304,6 @@ def _same(a: FloatArray, b: FloatArray) -> bool:
     return bool(np.linalg.norm(apart[:3, 3]) < _SAME_PLACE_M and turn < _SAME_ANGLE_RAD)
 
 
-def _inflation(best: RefinedPose) -> float:
-    """Factor of the squared residuals to their covariances; at least 1."""
-    return max(1.0, best.cost / max(1, best.degrees_of_freedom))
-
-
-def _likely(minima: list[RefinedPose], settings: PoseSettings) -> list[RefinedPose]:
-    """The best minimum and those that it cannot exclude."""
-    best = minima[0]
-    limit = best.cost + 2.0 * np.log(settings.ambiguity_odds) * _inflation(best)
-    return [
-        pose
-        for pose in minima
-        if pose is best or (pose.cost <= limit and not _within_covariance(pose, best))
-    ]
-
-
 def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
     """Whether a second minimum is within the covariance of the best one."""
     apart = log_se3(inverse(best.world_from_robot) @ pose.world_from_robot)
@@ -370,16 +350,13 @@ def _explained(
             refined = refine_pose(problem.only(views), pose)
         except GeometryError:
             return None
-        wrong = _disagreeing(refined, problem.settings)
-        if np.any(wrong):
+        pose = refined.world_from_robot
+        if np.any(_disagreeing(refined, problem.settings)):
             if views.sum() == 1:
                 return None
             worst = np.flatnonzero(views)[int(np.argmax(refined.view_errors))]
-            views = views.copy()
-            views[worst] = False
-            pose = refined.world_from_robot
+            views = views & (np.arange(len(views)) != worst)
             continue
-        pose = refined.world_from_robot
         predicted = predicted_errors(problem, pose, refined.covariance)
         grown = views | (predicted < problem.settings.outlier_sigma)
         if np.array_equal(grown, views):

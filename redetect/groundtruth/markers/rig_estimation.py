@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -157,8 +158,7 @@ def _in_known_frame(
     priors, starts = [], []
     for marker in common:
         i, j = ids.index(marker), known.ids.index(marker)
-        covariance = _block(known.covariance, j) + _EXACT * np.eye(6)
-        priors.append(PosePrior(cameras + i, known.robot_from_marker[j], covariance))
+        priors.append(_prior(cameras + i, known.robot_from_marker[j], known.covariance, j))
         starts.append(known.robot_from_marker[j] @ inverse(rig_from_marker[i]))
     robot_from_rig, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return robot_from_rig @ rig_from_marker, tuple(priors)
@@ -199,11 +199,10 @@ def _consensus_of_pairs(
 ) -> dict[tuple[int, int], PairConsensus]:
     estimates: dict[tuple[int, int], list[MarkerPose]] = {}
     for views in solved:
-        for view_a, a in views:
-            for view_b, b in views:
-                pair = (view_a.rig_index, view_b.rig_index)
-                if a is not None and b is not None and pair[0] < pair[1]:
-                    estimates.setdefault(pair, []).append(pair_estimates(a, b))
+        for (view_a, a), (view_b, b) in product(views, repeat=2):
+            pair = (view_a.rig_index, view_b.rig_index)
+            if a is not None and b is not None and pair[0] < pair[1]:
+                estimates.setdefault(pair, []).append(pair_estimates(a, b))
     return {pair: pair_consensus(times) for pair, times in sorted(estimates.items())}
 
 
@@ -223,10 +222,7 @@ def _root(
 
 
 def _reasons(
-    ids: tuple[int, ...],
-    kept: IntArray,
-    seen: Sequence[Sequence[View]],
-    settings: RigSettings,
+    ids: tuple[int, ...], kept: IntArray, seen: Sequence[Sequence[View]], settings: RigSettings
 ) -> dict[int, str]:
     """Why markers are left out."""
     times = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]
@@ -258,11 +254,10 @@ def _bundle(
         if len({view.rig_index for view, _ in own}) < 2:
             continue
         pose = _best_start(own, rig, start, network, settings)
-        if pose is None:
-            continue
-        views += [view for view, _ in own]
-        bodies += [len(poses)] * len(own)
-        poses.append(pose)
+        if pose is not None:
+            views += [view for view, _ in own]
+            bodies += [len(poses)] * len(own)
+            poses.append(pose)
     points = chain_points(views, rig, settings.corner_floor_px)
     cameras = len(network.cameras)
     bundle = Bundle(
@@ -281,15 +276,14 @@ def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     seen = np.unique(bundle.seen.camera)
     free = bundle.free.copy()
     free[seen] = True
-    priors = tuple(
-        PosePrior(int(c), bundle.poses[c], _block(covariance, c) + _EXACT * np.eye(6)) for c in seen
-    )
+    priors = (_prior(c, bundle.poses[c], covariance, c) for c in seen.tolist())
     return replace(bundle, free=free, priors=(*bundle.priors, *priors))
 
 
-def _block(covariance: FloatArray, index: int) -> FloatArray:
-    """The (6, 6) covariance of one of several poses."""
-    return covariance[6 * index : 6 * index + 6, 6 * index : 6 * index + 6]
+def _prior(index: int, pose: FloatArray, covariance: FloatArray, among: int) -> PosePrior:
+    """The prior of one pose of a bundle, which is one `among` several with a covariance."""
+    own = slice(6 * among, 6 * among + 6)
+    return PosePrior(index, pose, covariance[own, own] + _EXACT * np.eye(6))
 
 
 def _best_start(

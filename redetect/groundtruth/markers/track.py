@@ -14,13 +14,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
-from redetect.groundtruth.markers.session import (
-    MarkerFrame,
-    Network,
-    Rig,
-    View,
-    rig_views,
-)
+from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
@@ -107,10 +101,7 @@ def excess_of(pose: RefinedPose) -> float:
 
 
 def track_by_markers(
-    groups: Iterable[tuple[MarkerFrame, ...]],
-    rig: Rig,
-    network: Network,
-    settings: PoseSettings,
+    groups: Iterable[tuple[MarkerFrame, ...]], rig: Rig, network: Network, settings: PoseSettings
 ) -> Track:
     """Compute the robot's poses from the markers found in a session's images.
 
@@ -143,10 +134,18 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
     }
     if tracked.reason:
         entry["reason"] = tracked.reason
+    markers: list[dict[str, Any]] = [
+        {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
+    ]
     estimate, choice = tracked.estimate, tracked.choice
-    chosen = None
     if estimate is not None:
         chosen = estimate.candidates[(choice.candidate or 0) if choice is not None else 0]
+        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
+        for marker, is_used in zip(markers, estimate.views):
+            marker["used"] = bool(is_used)
+            if is_used:
+                error, rms = next(figures)
+                marker["error"], marker["rms_px"] = round(float(error), 3), round(float(rms), 4)
         entry["ambiguous"] = estimate.ambiguous
         if choice is not None and estimate.ambiguous:
             entry["margin"] = round(choice.margin, 3)
@@ -164,17 +163,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
             }
             for candidate, odds in zip(estimate.candidates, estimate.log_odds)
         ]
-    entry["markers"] = [
-        {"camera": network.names[view.frame.camera], "id": view.marker.id} for view in tracked.views
-    ]
-    if estimate is not None and chosen is not None:
-        figures = iter(zip(chosen.view_errors, chosen.view_rms_px))
-        for marker, is_used in zip(entry["markers"], estimate.views):
-            marker["used"] = bool(is_used)
-            if is_used:
-                error, rms = next(figures)
-                marker["error"], marker["rms_px"] = round(float(error), 3), round(float(rms), 4)
-    return entry
+    return {**entry, "markers": markers}
 
 
 def _estimated(
@@ -256,7 +245,8 @@ def _steps(
 ) -> list[_Step]:
     """Steps between candidates of neighbouring frames, each with its cost, by their end.
 
-    `frame` (K,): frame of each candidate, counted over all frames.
+    The cost is half the squared Mahalanobis length of the movement, limited to a jump, and that of
+    the frames skipped. `frame` (K,): frame of each candidate, counted over all frames.
     """
     nearest = np.searchsorted(frame, frame)
     farthest = np.searchsorted(frame, frame - 1 - _MOST_LEFT_OUT)
@@ -264,32 +254,7 @@ def _steps(
     first = np.concatenate([np.arange(*part) for part in zip(farthest, nearest)])
     poses = np.stack([c.world_from_robot for e in estimates for c in e.candidates])
     covariances = np.stack([c.covariance for e in estimates for c in e.candidates])
-    at = np.asarray(times_s)[frame]
-    seconds = at[second] - at[first]
-    costs = _motion_costs(poses, covariances, first, second, seconds, settings)
-    costs += _REJECT_COST * (frame[second] - frame[first] - 1)
-    return list(zip(first.tolist(), second.tolist(), costs.tolist()))
-
-
-def _cheapest_paths(steps: Sequence[_Step], frame: IntArray) -> FloatArray:
-    """(K,) cost of the cheapest sequence through each candidate; `frame` (K,) is that of each."""
-    ahead, back = _REJECT_COST * frame, _REJECT_COST * (frame[-1] - frame)
-    for a, b, cost in steps:
-        ahead[b] = min(ahead[b], ahead[a] + cost)
-    for a, b, cost in reversed(steps):
-        back[a] = min(back[a], back[b] + cost)
-    return np.asarray(ahead + back)
-
-
-def _motion_costs(
-    poses: FloatArray,
-    covariances: FloatArray,
-    first: IntArray,
-    second: IntArray,
-    seconds: FloatArray,
-    settings: PoseSettings,
-) -> FloatArray:
-    """Half the squared Mahalanobis length of movements, in the world's axes, limited to a jump."""
+    # Movements in the world's axes.
     a, b = poses[first], poses[second]
     rotation_a, rotation_b = a[:, :3, :3], b[:, :3, :3]
     turned = Rotation.from_matrix(rotation_b @ rotation_a.transpose(0, 2, 1)).as_rotvec()
@@ -303,9 +268,22 @@ def _motion_costs(
         axes[:, :3, :3] = pose_rotation
         axes[:, 3:, 3:] = rotation_b
         spread += axes @ covariance @ axes.transpose(0, 2, 1)
+    at = np.asarray(times_s)[frame]
+    seconds = at[second] - at[first]
+    reach, turn = settings.speed_m_s * seconds, np.radians(settings.turn_deg_s) * seconds
     heave, wobble = settings.heave_m, np.radians(settings.wobble_deg)
-    reach = settings.speed_m_s * seconds
-    turn = np.radians(settings.turn_deg_s) * seconds
     for axis, sigma in enumerate((reach, reach, heave, wobble, wobble, turn)):
         spread[:, axis, axis] += np.square(sigma)
-    return np.asarray(np.minimum(0.5 * squared_mahalanobis(moved, spread), _JUMP_COST))
+    costs = np.minimum(0.5 * squared_mahalanobis(moved, spread), _JUMP_COST)
+    costs += _REJECT_COST * (frame[second] - frame[first] - 1)
+    return list(zip(first.tolist(), second.tolist(), costs.tolist()))
+
+
+def _cheapest_paths(steps: Sequence[_Step], frame: IntArray) -> FloatArray:
+    """(K,) cost of the cheapest sequence through each candidate; `frame` (K,) is that of each."""
+    ahead, back = _REJECT_COST * frame, _REJECT_COST * (frame[-1] - frame)
+    for a, b, cost in steps:
+        ahead[b] = min(ahead[b], ahead[a] + cost)
+    for a, b, cost in reversed(steps):
+        back[a] = min(back[a], back[b] + cost)
+    return np.asarray(ahead + back)

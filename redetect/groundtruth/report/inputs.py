@@ -88,14 +88,8 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     else:
         inputs.truth = _read(inputs, session / "truth.csv", read_planar_poses)
     inputs.clock = _read(inputs, session / "clock.json", read_clock)
-    for path in (
-        session / "aligned.json",
-        session / "laser.json",
-        session / "clock.json",
-        session / "fused.json",
-        session / "validation" / "validation.json",
-    ):
-        optional = path.name == "clock.json"
+    for name in ("aligned", "laser", "clock", "fused", "validation/validation"):
+        path, optional = session / f"{name}.json", name == "clock"
         if (document := _read(inputs, path, read_json, optional=optional)) is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)
@@ -158,9 +152,8 @@ def _visits(inputs: Inputs) -> list[tuple[float, float]]:
     """Intervals with measured ground truth; fused poses also cover the pauses between them."""
     streams = inputs.streams
     measured = [streams[name] for name in ("laser", "camera") if name in streams]
-    for stream in (inputs.truth, streams.get("fused")):
-        if not measured and stream is not None:
-            measured = [stream]
+    others = [one for one in (inputs.truth, streams.get("fused")) if one is not None]
+    measured = measured or others[:1]
     if not measured:
         return []
     times = np.sort(np.concatenate([stream.times_s for stream in measured]))

@@ -96,11 +96,8 @@ def _extent(poses: PlanarPoses) -> tuple[str, str, str, str]:
 
 
 def _building(inputs: Inputs) -> list[Part]:
-    content: list[Part] = []
-    if inputs.dimensions:
-        content += _dimensions(inputs.dimensions)
-    if inputs.fiducials is not None:
-        content += _fiducials(inputs.fiducials)
+    content = _dimensions(inputs.dimensions) if inputs.dimensions else []
+    content += [] if inputs.fiducials is None else _fiducials(inputs.fiducials)
     return content or [Part("note", "No measurements in the building: no dimensions.csv.")]
 
 
@@ -111,11 +108,9 @@ def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
         for d, e in zip(dimensions[:_MOST_ROWS], off)
     ]
     head = ("dimension", "drawn / m", "measured / m", "drawn minus measured / mm")
-    words = (
-        f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, worst "
-        f"{np.abs(off).max():.1f} mm."
-    )
     caption = "Dimensions in the drawing and measured in the building"
+    words = f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, "
+    words += f"worst {np.abs(off).max():.1f} mm."
     return [table(caption, head, rows), Part("text", words)]
 
 
@@ -152,11 +147,14 @@ def _scanners(inputs: Inputs) -> list[Part]:
     if rows:
         caption = "Distance from the final position after each step, after rigid alignment (mm)"
         content.append(table(caption, ("step", *names), rows))
-    picture = inputs.pictures.get("aligned.png")
-    if picture is not None:
-        words = "Scans of the empty area on the map, and the ICP of each scanner step by step."
-        content.append(image_part(words, picture, "png", *_ALIGNMENT_PX))
-    return content
+    words = "Scans of the empty area on the map, and the ICP of each scanner step by step."
+    return content + _picture(inputs, "aligned.png", words, _ALIGNMENT_PX)
+
+
+def _picture(inputs: Inputs, name: str, words: str, size: tuple[int, int]) -> list[Part]:
+    """A picture that a command wrote, if it did."""
+    picture = inputs.pictures.get(name)
+    return [] if picture is None else [image_part(words, picture, "png", *size)]
 
 
 def _stages(inputs: Inputs) -> list[Part]:
@@ -187,11 +185,10 @@ def _all_streams(inputs: Inputs) -> dict[str, PlanarPoses]:
 
 def _maps(inputs: Inputs) -> list[Part]:
     tracks = [_track(name, poses, inputs) for name, poses in inputs.streams.items()]
-    everything = list(tracks)
-    if inputs.odometry is not None:
-        everything.append(_track("odometry", inputs.odometry, inputs))
-    if inputs.truth is not None:
-        everything.append(_track("truth", inputs.truth, inputs))
+    beside = {"odometry": inputs.odometry, "truth": inputs.truth}
+    everything = tracks + [
+        _track(name, poses, inputs) for name, poses in beside.items() if poses is not None
+    ]
     if not everything and inputs.building is None:
         return [Part("note", "Neither a building nor a stream of poses: nothing to draw.")]
     words = "The building" if inputs.building is not None else "No building map in the session"
@@ -209,8 +206,9 @@ def _maps(inputs: Inputs) -> list[Part]:
 
 def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
-        words = "No truth in the session: give it by --truth to see errors over time."
-        return [Part("note", words)]
+        return [
+            Part("note", "No truth in the session: give it by --truth to see errors over time.")
+        ]
     rows: list[tuple[str, ...]] = []
     place, turn, faults = [], [], []
     compared = [
@@ -240,16 +238,14 @@ def _errors(inputs: Inputs) -> list[Part]:
     caption = "Errors during the visits: position (mm) and signed heading (deg)"
     if inputs.odometry is not None:
         caption += "; odometry is aligned with the truth in each visit"
-    content = [table(caption, head, rows), *faults]
-    content.append(
-        Part(
-            "note",
-            "NEES / 3 is 1 if covariances are right. Errors of neighbouring poses are correlated, "
-            "so it scatters more than the number of poses suggests.",
-        )
+    words = (
+        "NEES / 3 is 1 if covariances are right. Errors of neighbouring poses are correlated, "
+        "so it scatters more than the number of poses suggests."
     )
     return [
-        *content,
+        table(caption, head, rows),
+        *faults,
+        Part("note", words),
         series_figure("Position error over time by visit.", "mm", place, inputs.visits),
         series_figure("Absolute heading error over time by visit.", "deg", turn, inputs.visits),
     ]
@@ -271,8 +267,7 @@ def _score_words(score: PoseScore) -> tuple[str, ...]:
 def _validation(inputs: Inputs) -> list[Part]:
     document = inputs.documents.get("validation.json")
     if document is None:
-        words = "No validation in the session: groundtruth validate writes it."
-        return [Part("note", words)]
+        return [Part("note", "No validation in the session: groundtruth validate writes it.")]
     figures = _entry(document, "figures", dict)
     rows = [
         (
@@ -299,28 +294,19 @@ def _validation(inputs: Inputs) -> list[Part]:
         outside = not band[0] <= nees <= band[1]
     count = _number(figures.get("poses"), 1.0, 0)
     content.append(Part("problem" if outside else "text", f"{count} reference poses. {words}."))
-    for name, words, size in (
-        ("errors", "Linear and angular errors at each reference pose.", _VALIDATION_PX),
-        ("scans", "Readings of the scanners on board, for each set of poses.", _SCANS_PX),
-    ):
-        picture = inputs.pictures.get(f"validation/{name}.png")
-        if picture is not None:
-            content.append(image_part(words, picture, "png", *size))
+    words = "Linear and angular errors at each reference pose."
+    content += _picture(inputs, "validation/errors.png", words, _VALIDATION_PX)
+    words = "Readings of the scanners on board, for each set of poses."
+    content += _picture(inputs, "validation/scans.png", words, _SCANS_PX)
     content += [*_incidence(document), *_mounts(document)]
-    refused = _entries(document, "refused")
+    refused = [
+        (str(r.get("index")), _number(r.get("time_s"), 1.0, 3), str(r.get("status")),
+         str(r.get("reason")))
+        for r in _entries(document, "refused")[:_MOST_ROWS]
+    ]  # fmt: skip
     if refused:
-        content.append(
-            table(
-                "Poses not used as reference, or without ground truth",
-                ("pose", "t / s", "status", "reason"),
-                [
-                    (str(r.get("index")), _number(r.get("time_s"), 1.0, 3), str(r.get("status")),
-                     str(r.get("reason")))
-                    for r in refused[:_MOST_ROWS]
-                ],
-                text=(2, 3),
-            )
-        )  # fmt: skip
+        caption = "Poses not used as reference, or without ground truth"
+        content.append(table(caption, ("pose", "t / s", "status", "reason"), refused, text=(2, 3)))
     return content
 
 
@@ -357,8 +343,7 @@ def _mounts(document: dict[str, Any]) -> list[Part]:
 
 def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
-        words = "No clock.json: all times are assumed to be of one clock."
-        return [Part("note", words)]
+        return [Part("note", "No clock.json: all times are assumed to be of one clock.")]
     rows = [
         (
             f"{s.from_s:.2f}",
@@ -389,9 +374,8 @@ def _clock(inputs: Inputs) -> list[Part]:
         content.append(clock_figure(words, inputs.clock, inputs.ptpd))
     ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
     if isinstance(ptpd, dict):
-        content.append(
-            Part("text", "ptpd: " + ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items()) + ".")
-        )
+        figures = ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items())
+        content.append(Part("text", f"ptpd: {figures}."))
     return content
 
 
@@ -404,12 +388,11 @@ def _rejected(inputs: Inputs) -> list[Part]:
         content.append(Part("text", words))
     suspects = [str(s.get("name")) for s in _entries(laser, "scanners") if s.get("suspect")]
     if suspects:
-        words = "Scanners that disagree with the others: " + ", ".join(suspects) + "."
+        words = f"Scanners that disagree with the others: {', '.join(suspects)}."
         content.append(Part("problem", words))
     fused = inputs.documents.get("fused.json")
     if fused is None:
-        content.append(Part("note", "No results of a fusion (fused.json)."))
-        return content
+        return [*content, Part("note", "No results of a fusion (fused.json).")]
     rejected = _entries(fused, "rejected")
     used = ", ".join(f"{_value(v)} from {k}" for k, v in _entry(fused, "used", dict).items())
     restarts = _entry(fused, "restarts_s", list)

@@ -66,9 +66,9 @@ def map_figure(
     outlines: Sequence[FloatArray] | FloatArray = (),
 ) -> Part:
     """Walls, paths, and outlines (P, 2) in the first path's colour."""
-    low, high = _bounds(tracks, building)
-    size = np.maximum(_scale(tracks, building) * (high - low), (3.0, 2.0))
-    with figure_file((float(size[0]), float(size[1])), "svg") as (figure, content):
+    low, high, scale = _area(tracks, building)
+    width, height = np.maximum(scale * (high - low), (3.0, 2.0)).tolist()
+    with figure_file((width, height), "svg") as (figure, content):
         axes = figure.subplots()
         _draw_paths(axes, tracks, building)
         for outline in outlines:
@@ -77,12 +77,12 @@ def map_figure(
         axes.grid(alpha=0.25, lw=0.6)
         if len(tracks) > 1:
             axes.legend(fontsize=8)
-    return image_part(words, content.getvalue(), "svg+xml", 96.0 * size[0], 96.0 * size[1])
+    return image_part(words, content.getvalue(), "svg+xml", 96.0 * width, 96.0 * height)
 
 
 def ellipse_figure(track: Track, building: FloatArray | None, count: int) -> Part:
     """Walls, a path, and 3 sigma ellipses of some of its poses, magnified to be visible."""
-    outlines, factor = ellipses(track.poses, _scale([track], building), count)
+    outlines, factor = ellipses(track.poses, _area([track], building)[2], count)
     size = f"magnified {factor:g} times" if factor > 1.0 else "to scale"
     words = f"{track.label}: path and 3\N{GREEK SMALL LETTER SIGMA} ellipses, {size}."
     return map_figure(words, [track], building, outlines)
@@ -139,21 +139,20 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
     return poses.poses[chosen, None, :2] + outlines, factor
 
 
-def _bounds(tracks: Sequence[Track], building: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Corners of the drawn area: the paths with a margin, or else the whole building."""
+def _area(
+    tracks: Sequence[Track], building: FloatArray | None
+) -> tuple[FloatArray, FloatArray, float]:
+    """Corners of the drawn area: the paths with a margin, or else the whole building; and inches
+    on the page per metre.
+    """
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places:
         places = [np.array([[0.0, 0.0]]) if building is None else building.reshape(-1, 2)]
     everything = np.concatenate(places)
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = max(1.0, 0.08 * float((high - low).max()))
-    return low - margin, high + margin
-
-
-def _scale(tracks: Sequence[Track], building: FloatArray | None) -> float:
-    """Inches on the page per metre."""
-    low, high = _bounds(tracks, building)
-    return float(min(_WIDE_IN / (high[0] - low[0]), _TALLEST_IN / (high[1] - low[1])))
+    low, high = low - margin, high + margin
+    return low, high, float(np.min((_WIDE_IN, _TALLEST_IN) / (high - low)))
 
 
 def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None) -> None:
@@ -170,7 +169,7 @@ def _draw_paths(axes: Axes, tracks: Sequence[Track], building: FloatArray | None
 
 def stages_figure(words: str, stages: Sequence[Track], building: FloatArray | None) -> Part:
     """A map of each stage of one visit; the last stage's path is drawn beneath the others."""
-    low, high = _bounds(stages, building)
+    low, high, _ = _area(stages, building)
     rows = math.ceil(len(stages) / 2)
     tall = float((high - low)[1] / (high - low)[0])
     height = min(rows * (0.5 * _WIDE_IN * tall + 0.5), 11.0)
@@ -240,7 +239,7 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     Pairwise estimates are drawn as the position of one marker relative to the other.
     """
     rig = estimate.rig
-    agreeing, differing = _clouds(estimate, rig)
+    agreeing, differing = _clouds(estimate)
     with figure_file((13.5, 5.0), "png") as (figure, content):
         centre = rig.robot_from_marker[:, :3, 3]
         middle = 0.5 * (centre.min(axis=0) + centre.max(axis=0))
@@ -263,17 +262,15 @@ def draw_rig(estimate: RigEstimate) -> bytes:
     return content.getvalue()
 
 
-def _clouds(estimate: RigEstimate, rig: Rig) -> tuple[FloatArray, FloatArray]:
+def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
     """Markers' centres from the pairwise estimates that agree, and from those that differ."""
-    agreeing, differing = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for (a, b), pair in sorted(estimate.pairs.items()):
-        poses = rig.robot_from_marker
-        estimates = poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)
-        places = np.concatenate(estimates)[:, :3, 3]
-        agrees = np.tile(pair.agrees, 2)
-        agreeing.append(places[agrees])
-        differing.append(places[~agrees])
-    return np.concatenate(agreeing), np.concatenate(differing)
+    poses, pairs = estimate.rig.robot_from_marker, sorted(estimate.pairs.items())
+    estimates = [np.zeros((0, 4, 4))]
+    for (a, b), pair in pairs:
+        estimates += [poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)]
+    places = np.concatenate(estimates)[:, :3, 3]
+    agrees = np.array([one for _, pair in pairs for one in (*pair.agrees, *pair.agrees)], bool)
+    return places[agrees], places[~agrees]
 
 
 def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
@@ -346,10 +343,9 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
         if np.isfinite(expected).any():
             linear.plot(at, expected, "_", color=_ORANGE, ms=11, mew=2, label="expected (rms)")
         linear.axhline(1e3 * score.position_mean_m, color=_BLUE, lw=1.0, ls="--", label="mean")
-        published = PUBLISHED[0]
-        label = f"mean of {published.name}: {1e3 * published.position_mean_m:g} mm"
-        if published.position_mean_m < 2.0 * score.position_max_m:
-            height = 1e3 * published.position_mean_m
+        height = 1e3 * PUBLISHED[0].position_mean_m
+        label = f"mean of {PUBLISHED[0].name}: {height:g} mm"
+        if PUBLISHED[0].position_mean_m < 2.0 * score.position_max_m:
             linear.axhline(height, color=_GREY, lw=1.0, ls=":", label=label)
         else:
             linear.plot([], [], " ", label=f"{label}, above the plot")
@@ -409,10 +405,8 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
             draw_walls(axes, building)
             axes.plot(points[:, 0], points[:, 1], ".", color=_BLUE, ms=1.5, alpha=0.4, mew=0)
             axes.plot(poses[:, 0], poses[:, 1], "x", color=_ORANGE, ms=4)
-            low, high = (
-                np.quantile(points, 0.01, axis=0) - 0.5,
-                np.quantile(points, 0.99, axis=0) + 0.5,
-            )
+            low, high = np.quantile(points, (0.01, 0.99), axis=0)
             rms = 1e3 * float(np.sqrt(np.mean(near**2))) if len(near) else math.nan
-            _frame(axes, low, high, f"{title}: {rms:.1f} mm rms from the walls", fontsize=10)
+            title += f": {rms:.1f} mm rms from the walls"
+            _frame(axes, low - 0.5, high + 0.5, title, fontsize=10)
     return content.getvalue()

@@ -239,9 +239,7 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     turn = np.eye(3)
     turn[:2, :2] = rotation(motion[2])
     moved = poses.poses @ turn.T + motion
-    covariances = None
-    if poses.covariances is not None:
-        covariances = turn @ poses.covariances @ turn.T
+    covariances = None if poses.covariances is None else turn @ poses.covariances @ turn.T
     return PlanarPoses(poses.times_s, moved, covariances)
 
 

@@ -22,7 +22,7 @@ from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import StillScan, fit_to_walls, still_scan
+from redetect.groundtruth.lasers.walls import StillScan, first_walls, fit_to_walls, still_scan
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
@@ -203,26 +203,6 @@ class RefinedMounts(NamedTuple):
     covariance: FloatArray  # (3 M, 3 M)
 
 
-def first_walls(
-    origin: FloatArray, directions: FloatArray, segments: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Distances (N,) of the walls that rays from a point meet first, infinite if none, and the
-    angles of incidence (N,).
-
-    `directions`: (N, 2) unit vectors. `segments`: (S, 4).
-    """
-    start, along = segments[:, :2] - origin, segments[:, 2:] - segments[:, :2]
-    across = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
-        part = (start[:, 0] * directions[:, 1:] - start[:, 1] * directions[:, :1]) / across
-    far = np.where((far > 0.0) & (part >= 0.0) & (part <= 1.0), far, np.inf)
-    first = np.argmin(far, axis=1)
-    rows = np.arange(len(directions))
-    cosine = np.abs(across[rows, first]) / np.hypot(along[first, 0], along[first, 1])
-    return far[rows, first], np.arccos(np.minimum(cosine, 1.0))
-
-
 def range_errors(
     references: Sequence[ReferencePose], segments: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -237,9 +217,10 @@ def range_errors(
             continue
         for mount, scan in zip(reference.still.mounts, reference.still.scans):
             pose = compose(reference.pose, mount)
-            far, incidence = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
+            rays = scan.direction @ rotation(pose[2]).T
+            far, _, cosines = first_walls(pose[:2], rays, segments)
             of_a_wall = np.abs(scan.range_m - far) < OF_A_WALL_M
-            angles.append(incidence[of_a_wall])
+            angles.append(np.arccos(np.minimum(cosines, 1.0))[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])
     return np.concatenate(angles), np.concatenate(errors)
 

@@ -154,8 +154,13 @@ class Measured(NamedTuple):
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    By Levenberg-Marquardt from many starts, in all directions and headings.
+    By Levenberg-Marquardt from many starts: with all headings, all around the fiducial of the first
+    distance.
     """
+    angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
+    bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
+    point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
+    starts = np.column_stack([point - rotation(heading) @ measured.levers[0], heading])
 
     def residuals(pose: FloatArray) -> FloatArray:
         return distance_residuals(pose, measured)[0]
@@ -163,12 +168,16 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
     def jacobian(pose: FloatArray) -> FloatArray:
         return distance_residuals(pose, measured)[1]
 
-    poses = np.array(
-        [least_squares(residuals, pose, jacobian, method="lm").x for pose in _starts(measured)]
-    )
+    poses = np.array([least_squares(residuals, at, jacobian, method="lm").x for at in starts])
     poses[:, 2] = wrap_angle(poses[:, 2])
     cost = np.sum(distance_residuals(poses, measured)[0] ** 2, axis=1) / measured.sigma_m**2
-    kept = _distinct(poses, cost, _SAME_M)
+    # The best first, without those that are equal to a better one.
+    kept: list[int] = []
+    for i in np.argsort(cost, kind="stable").tolist():
+        apart = np.abs(poses[kept] - poses[i])
+        apart[:, 2] = np.abs(wrap_angle(apart[:, 2]))
+        if not np.any(apart.max(axis=1, initial=0.0) < _SAME_M):
+            kept.append(i)
     return poses[kept], cost[kept]
 
 
@@ -241,25 +250,6 @@ def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
     if not values[0] > 1e-10 * values[2]:
         return np.diag(np.full(3, np.inf))
     return np.asarray((vectors / values) @ vectors.T)
-
-
-def _starts(measured: Measured) -> FloatArray:
-    """(S, 3) poses with all headings, all around the fiducial of the first distance."""
-    angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
-    bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
-    point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
-    return np.column_stack([point - rotation(heading) @ measured.levers[0], heading])
-
-
-def _distinct(poses: FloatArray, cost: FloatArray, closer: float) -> list[int]:
-    """Indices of poses, the best first, without those closer than `closer` to a better one."""
-    kept: list[int] = []
-    for i in np.argsort(cost, kind="stable").tolist():
-        apart = np.abs(poses[kept] - poses[i])
-        apart[:, 2] = np.abs(wrap_angle(apart[:, 2]))
-        if not np.any(apart.max(axis=1, initial=0.0) < closer):
-            kept.append(i)
-    return kept
 
 
 class Dimension(NamedTuple):

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     outline_faces,
-    outline_radius_m,
     outline_symmetries,
+    robot_body,
 )
 from tests.groundtruth.lasers.scene import FRONTED, PLAIN
 
@@ -22,9 +22,9 @@ def test_faces_run_counter_clockwise_whichever_way_the_file_goes() -> None:
         faces = outline_faces(corners)
         twice = np.sum(faces[:, 0] * faces[:, 3] - faces[:, 2] * faces[:, 1])
         assert twice == pytest.approx(2 * 0.42)
-    middle, radius = outline_radius_m(outline_faces(PLAIN))
-    assert middle == pytest.approx([-0.05, 0.0])
-    assert radius == pytest.approx(np.hypot(0.35, 0.3))
+    body = robot_body(PLAIN)
+    assert body.middle == pytest.approx([-0.05, 0.0])
+    assert body.radius_m == pytest.approx(np.hypot(0.35, 0.3))
 
 
 def test_symmetries() -> None:

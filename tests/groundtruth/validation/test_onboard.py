@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from redetect.groundtruth.lasers.walls import first_walls
 from redetect.groundtruth.validation.onboard import (
     ReferencePose,
-    first_walls,
     range_errors,
     reference_poses,
     refine_mounts,
@@ -29,9 +29,10 @@ def test_rays_meet_the_first_wall_at_its_angle() -> None:
     walls = np.array([[2.0, -5.0, 2.0, 5.0], [3.0, -5.0, 3.0, 5.0]])
     angles = np.radians([0.0, 30.0, -60.0, 180.0])
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
-    far, incidence = first_walls(np.zeros(2), rays, walls)
+    far, first, cosines = first_walls(np.zeros(2), rays, walls)
     np.testing.assert_allclose(far, [2.0, 2.0 / math.cos(math.pi / 6), 4.0, np.inf])
-    np.testing.assert_allclose(np.degrees(incidence[:3]), [0.0, 30.0, 60.0], atol=1e-5)
+    assert not np.any(first)
+    np.testing.assert_allclose(cosines, np.abs(np.cos(angles)))
 
 
 def references(
