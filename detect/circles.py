@@ -20,7 +20,7 @@ from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
-from detect.discs.fit import Scene, least_noise, working_space
+from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
@@ -43,6 +43,8 @@ from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
+#: The same in fits: that of rounded grey values.
+_ROUNDING_NOISE = 0.3
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Number of rows from which an image's noise is estimated.
 _NOISE_ROWS = 16
@@ -163,7 +165,10 @@ def judged_discs(
     candidates = candidates_of(image, table, settings, noise)
     judgement = judged(image, camera, settings, candidates, noise)
     log_odds = adjusted_log_odds(judgement, settings)
-    best = best_discs(judgement, log_odds, settings)
+    taken = np.flatnonzero(log_odds >= settings.evidence)
+    best_first = np.argsort(-log_odds[taken], kind="stable")
+    # Without those too close to a better one.
+    best = taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
     return judgement.where(best), log_odds[best]
 
 
@@ -206,20 +211,13 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
     return adjusted
 
 
-def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
-    """Indices of the candidates that are discs, without those too close to a better one."""
-    taken = np.flatnonzero(log_odds >= settings.evidence)
-    best_first = np.argsort(-log_odds[taken], kind="stable")
-    return taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
-
-
 def scene_of(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
     """The input of the fits in an image; parameters as for `detect_circles`."""
     # Optics blur equally in all directions. Where pixels are not square, as in single fields of
     # interlaced frames, the same blur spans fewer pixels along v.
-    ratio, noise = camera.scale_y / camera.scale_x, least_noise(noise)
+    ratio, noise = camera.scale_y / camera.scale_x, max(noise, _ROUNDING_NOISE)
     return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 

@@ -58,7 +58,8 @@ def perform(options: View) -> int:
             for position, frame in zip(count(step=options.every), frames):
                 recording.set_time("frame", sequence=position)
                 if frame.time_s is not None:
-                    recording.set_time("time", **_clock(frame.time_s))
+                    kind = "timestamp" if frame.time_s >= _EARLIEST_DATE_S else "duration"
+                    recording.set_time("time", **{kind: frame.time_s})
                 rows = source.of(frame.step.prefix)
                 _log_world(rr, recording, rows, poses[position + 1], settings.radius_m)
                 try:
@@ -92,11 +93,6 @@ def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, Floa
         return poses, {}
     known = read_map(options.map)
     return poses, {"discs": known.discs.xy, "verticals": known.lines.xy}
-
-
-def _clock(time_s: float) -> dict[str, float]:
-    """A frame's time for Rerun: a date if possible, else seconds since a start."""
-    return {"timestamp" if time_s >= _EARLIEST_DATE_S else "duration": time_s}
 
 
 def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius_m: float) -> None:

@@ -168,9 +168,11 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
     rows = [row for row, _, _ in drawn]
     curves = line_curves(camera, ends_of(rows))
     bars = sigma_bars(camera, ends_of(rows), numbers(rows, "sigma"))
+    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas, curve, colour)
-        draw_bar(canvas, bar, SIGMA_COLOUR)
+        for points in (bar, bar[0] + tick, bar[1] + tick):
+            draw_curve(canvas, points, SIGMA_COLOUR)
         draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
@@ -234,13 +236,6 @@ def draw_curve(
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         width = enlargement(canvas)
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def draw_bar(canvas: ByteArray, ends: FloatArray, colour: Colour) -> None:
-    """Draw an error bar between two points (2, 2) u, v, with a tick at each."""
-    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
-    for points in (ends, ends[0] + tick, ends[1] + tick):
-        draw_curve(canvas, points, colour)
 
 
 def draw_text(
