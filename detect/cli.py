@@ -44,7 +44,8 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
 from detect.terminal import show_announcements
-from redetect.command_line import EXIT_INTERRUPTED, Program, all_but
+from redetect.command_line import Program, all_but
+from redetect.interrupts import EXIT_INTERRUPTED
 from redetect.messages import is_quiet
 
 #: Flags that only `--help-all` shows.

@@ -28,15 +28,13 @@ import tyro
 from tyro.conf import Suppress, arg, subcommand
 
 from redetect import __version__
-from redetect.interrupts import interrupts_noted
+from redetect.interrupts import interrupts_noted, say_interrupted
 from redetect.messages import QUIET, OneLineError, excerpt, one_line
 
 #: The command failed.
 EXIT_ERROR = 1
 #: The command line was wrong.
 EXIT_WRONG_COMMAND_LINE = 2
-#: Interrupted from the keyboard.
-EXIT_INTERRUPTED = 130
 #: The reader of the output has closed it (``| head``); the code of system tools in this case.
 EXIT_UNREAD = 141
 
@@ -78,12 +76,6 @@ def exit_code_of(work: Callable[[], int]) -> int:
             raise
         print(f"error: {one_line(_message(error))}", file=sys.stderr)
         return EXIT_ERROR
-
-
-def say_interrupted() -> int:
-    """Report an interrupt; returns the exit code."""
-    print("interrupted", file=sys.stderr, flush=True)
-    return EXIT_INTERRUPTED
 
 
 def _is_unread() -> bool:

@@ -94,8 +94,6 @@ def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
 
 def perform(options: Report) -> int:
     """Execute the command; returns the exit code."""
-    if options.worst < 0:
-        raise DetectError(f"worst is {options.worst}: expected 0 or more")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output

@@ -14,7 +14,7 @@ from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Ma
 from detect.row_files import KINDS, RunRows, read_head
 from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
-from detect.runs.stream import detect_run, make_folder
+from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
@@ -48,7 +48,7 @@ def perform(command: DetectorFlags) -> int:
     pictures = getattr(command, "draw", None)
     if pictures is not None:
         demand_recording(command.run)
-        make_folder(pictures)
+        pictures.mkdir(parents=True, exist_ok=True)
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:
@@ -84,20 +84,17 @@ def _circles(command: Circles, run: Run) -> Job:
     settings = _with_radius(command.parameters, run) if command.find_radius else command.parameters
     plan = FramePlan(run.camera, circles=settings)
     tilts = None if command.tilt is None else read_tilts(command.tilt)
-    known = replace(_known_discs(command.ids), tilts=tilts)
-    return Job(run, plan, places, known)
+    return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
 
 
 def _lines(command: Lines, run: Run) -> Job:
-    output = _output(command, run, "lines")
-    settings = command.parameters
+    output, settings = _output(command, run, "lines"), command.parameters
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
     plan = FramePlan(run.camera, lines=settings)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
-    known = Known(lines=_frames(command.ids_from))
-    return Job(run, plan, places, known)
+    return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
 
 
 def _markers(command: Markers) -> Job:
@@ -109,7 +106,7 @@ def _markers(command: Markers) -> Job:
 
 def _all(command: All, run: Run) -> Job:
     if command.output is not None:
-        make_folder(command.output)
+        command.output.mkdir(parents=True, exist_ok=True)
     places = {
         kind: run.output(kind) if command.output is None else command.output / f"detected.{kind}"
         for kind in ("lines", "tilt", "circles")

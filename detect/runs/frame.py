@@ -159,7 +159,7 @@ def _path(
             by_frame = found.tilt if plan.levelling == "frame" else None
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
-                settings = _of_known_tilt(settings)
+                settings = replace(settings, tilt_sigma_deg=0.0)
             seen = _discs(image, camera, settings, search_of(camera, plan.circles, plan.lean))
             if plan.lean is None and by_frame is not None and settings.refine:
                 lean = lean_of_frame(by_frame)
@@ -198,11 +198,6 @@ def _discs(
     return found if leaning == camera else as_calibrated(found, leaning, camera)
 
 
-@lru_cache(maxsize=4)
-def _of_known_tilt(settings: CircleSettings) -> CircleSettings:
-    return replace(settings, tilt_sigma_deg=0.0)
-
-
 def reason_of(error: Exception, task: FrameTask) -> str:
     """Why a frame cannot be processed, in words."""
     if isinstance(error, FrameError):
@@ -239,10 +234,9 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
     if found.error is not None:
         return rows_of_failure(task, found.error)
     try:
-        rows = _rows_by_kind(task, found, plan)
         return FrameRows(
             task.frame.step.prefix,
-            rows,
+            _rows_by_kind(task, found, plan),
             {
                 "discs": len(found.discs or ()),
                 "lines": len(found.lines or ()),
@@ -275,7 +269,18 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
         discs = _disc_rows(found.discs, found.seen, task.known)
         rows["circles"] = head + note + _text(discs)
         if plan.json:
-            records = _disc_records(found.discs, discs)
+            seen = zip(discs, found.discs.pixels.tolist(), found.discs.evidence.tolist())
+            records = [
+                {
+                    "pixel": pixel,
+                    "x_m": row.px,
+                    "y_m": row.py,
+                    "quality": row.quality,
+                    "evidence": evidence if math.isfinite(evidence) else None,
+                    "covariance_m2": [row.cxx, row.cxy, row.cyy],
+                }
+                for row, pixel, evidence in seen
+            ]
             rows["json"] = json_record({"frame": step.prefix, "discs": records})
     if found.markers is not None:
         rows["markers"] = head + _text(found.markers.landmarks())
@@ -308,22 +313,6 @@ def _disc_rows(
         for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
             ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
-
-
-def _disc_records(
-    found: CircleDetections, rows: Sequence[CircleLandmark]
-) -> list[dict[str, object]]:
-    return [
-        {
-            "pixel": pixel,
-            "x_m": row.px,
-            "y_m": row.py,
-            "quality": row.quality,
-            "evidence": evidence if math.isfinite(evidence) else None,
-            "covariance_m2": [row.cxx, row.cxy, row.cyy],
-        }
-        for pixel, evidence, row in zip(found.pixels.tolist(), found.evidence.tolist(), rows)
-    ]
 
 
 def pays(leaning: float, evidence: float) -> bool:

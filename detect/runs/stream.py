@@ -230,9 +230,8 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     That is the camera's lean and, if positions are not levelled by the run, the usual tilt.
     """
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
-    if not (camera and circles and circles.refine and plan.levelling != "none"):
-        return plan
-    if expected < LEAST_FRAMES:
+    wanted = camera and circles and circles.refine and plan.levelling != "none"
+    if not (wanted and expected >= LEAST_FRAMES):
         return plan
     from detect.runs.frame import (  # loads the compiler
         evidence_of,
@@ -259,16 +258,6 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
         return plan
     return replace(plan, lean=lean)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results, if there is none yet."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise DetectError(
-            f"{folder}: is not a folder: expected one, or the name of a new one"
-        ) from None
 
 
 class RunFiles:
@@ -311,7 +300,13 @@ class RunFiles:
         self._resumes = self._job.resume and journal.is_by(self._made_by)
         complete = journal.complete()
         if complete is not None:
-            self._complete(*complete)
+            _log.info("renaming the files of a run that was killed at its very end")
+            numbers, overwrite = complete
+            for path, number in zip(self._paths, numbers):
+                part = left_part(path, number=number)
+                if part is not None:
+                    with part:
+                        part.replace(path, overwrite=overwrite)
         if self._resumes:
             self._journal = journal
             self._overwrite |= complete is not None  # the files are its own
@@ -324,15 +319,6 @@ class RunFiles:
             )
         else:
             _log.info("removing the journal of an unfinished run (--resume would continue it)")
-
-    def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
-        """Complete a run that was killed while its files were renamed."""
-        _log.info("renaming the files of a run that was killed at its very end")
-        for path, number in zip(self._paths, numbers):
-            part = left_part(path, number=number)
-            if part is not None:
-                with part:
-                    part.replace(path, overwrite=overwrite)
 
     def _begin(self) -> None:
         file = new_part(self._base, "journal", named=self._paths[0])
