@@ -127,8 +127,7 @@ def detect_lines(
     if judged.tilt is not None:
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
         judged = judged._replace(tilt=error)
-    lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
-    return LineDetections(lines, tracks, judged)
+    return LineDetections(lines_of_tracks(strip, tracks, judged, numbers.joining), tracks, judged)
 
 
 def carry_ids(

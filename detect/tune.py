@@ -63,8 +63,7 @@ def perform(options: Tune) -> int:
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # nothing else needs a server
 
-        session = TuningSession(run, list(frames), base, output, options.force)
-        return serve(session, options.port)
+        return serve(TuningSession(run, list(frames), base, output, options.force), options.port)
 
     names = "table.json", "curve.png"
     demand_free([output / name for name in names], overwrite=options.force)

@@ -31,7 +31,9 @@ _EARLIEST_DATE_S = 1e8
 
 def perform(options: View) -> int:
     """Execute the command; returns the exit code."""
-    rr = _rerun()
+    os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
+    with imported_for("detect view needs the package rerun-sdk", "view"):
+        import rerun as rr
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
@@ -49,8 +51,7 @@ def perform(options: View) -> int:
         else:
             recording.save(str(raw))
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        path = rr.LineStrips3D([poses * [1.0, 1.0, 0.0]])
-        recording.log("world/path", path, static=True)
+        recording.log("world/path", rr.LineStrips3D([poses * [1.0, 1.0, 0.0]]), static=True)
         for name, places in known.items():
             at = rr.Points3D(np.pad(places, ((0, 0), (0, 1))), colors=_MAP)
             recording.log(f"world/map/{name}", at, static=True)
@@ -121,11 +122,3 @@ def _show(recording: Any) -> None:
             "Rerun's viewer cannot be started: expected the program `rerun` of the package "
             "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
         ) from None
-
-
-def _rerun() -> Any:
-    """The package of Rerun, with its telemetry disabled."""
-    os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    with imported_for("detect view needs the package rerun-sdk", "view"):
-        import rerun
-    return rerun

@@ -149,7 +149,14 @@ class Program:
         words = [word for word in arguments if word not in _QUIET]
         command = self.parsed(words)
         if getattr(command, "json", None) == _STANDARD_OUTPUT:
-            return _with_json_alone(command, self.carry_out)
+            # Only the content of the JSON file is written to standard output.
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / "result.json"
+                with _quietly():
+                    code = self.carry_out(replace(command, json=path))
+                if path.exists():
+                    sys.stdout.write(path.read_text("utf-8"))
+            return code
         if len(words) == len(arguments):
             return self.carry_out(command)
         with _quietly():
@@ -242,17 +249,6 @@ def _quietly() -> Iterator[None]:
             yield
     finally:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
-
-
-def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
-    """Execute a command with only the content of its JSON file on standard output."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "result.json"
-        with _quietly():
-            code = carry_out(replace(command, json=path))
-        if path.exists():
-            sys.stdout.write(path.read_text("utf-8"))
-    return code
 
 
 def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:

@@ -165,8 +165,7 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
         )
         for match in c.worst_frames(most)
     )
-    head = ("image", *c.counts, f"largest error {c.unit}")
-    return FigureTable("Worst frames", head, rows)
+    return FigureTable("Worst frames", ("image", *c.counts, f"largest error {c.unit}"), rows)
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -160,16 +160,7 @@ def find_centres(
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
-    """Find the centres of a table within some limits.
-
-    Parameters
-    ----------
-    image : (H, W) uint8
-        Of the table's size.
-    table : DiscTable
-        The camera's.
-    limits : Limits
-    """
+    """Find the centres of a table within some limits, in an image (H, W) of its size."""
     grey = image.ravel()
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))

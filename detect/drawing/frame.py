@@ -152,8 +152,7 @@ def _draw_discs(
             outline = view.detected_px(circle_on_floor(centre_xy, radius_m))
             draw_curve(canvas, outline, colour, closed=True)
         top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
-        label = f"{row.quality:.2f}{text}"
-        draw_text(canvas, label, top, _TEXT_COLOUR, shift=(-14, -3))
+        draw_text(canvas, f"{row.quality:.2f}{text}", top, _TEXT_COLOUR, shift=(-14, -3))
 
 
 def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:

@@ -124,7 +124,6 @@ def fit_marker(
     outside[templates.grid, templates.grid] = False
     contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
     unexplained = float(np.mean(left.residual**2)) - picture.noise**2
-    total = max(float(np.var(samples.grey)), 1e-9)
     return PatternFit(
         corners=corners_of(homography) + centre,
         covariance=np.einsum("kikj->kij", whole.reshape(4, 2, 4, 2)),
@@ -132,7 +131,7 @@ def fit_marker(
         cell_sigma=sigma[templates.grid, templates.grid].ravel(),
         border=cells[outside],
         misfit=math.sqrt(variance - noise**2) / contrast,
-        explained=1.0 - max(0.0, unexplained) / total,
+        explained=1.0 - max(0.0, unexplained) / max(float(np.var(samples.grey)), 1e-9),
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
         blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
     )

@@ -99,8 +99,7 @@ def _lines(command: Lines, run: Run) -> Job:
 
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
-    camera = run.camera if isinstance(run, Run) else None
-    plan = FramePlan(camera, markers=command.parameters)
+    plan = FramePlan(run.camera if isinstance(run, Run) else None, markers=command.parameters)
     return Job(run, plan, {"markers": _output(command, run, "markers")})
 
 
@@ -189,8 +188,8 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     if "lines" in places:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
     if "tilt" in places and tilt is not None:
-        frames_tilt = frames_tilt_place(places["tilt"])
-        print(f"{frames_tilt}: the separate tilts of {found['tilts']} frames")
+        place = frames_tilt_place(places["tilt"])
+        print(f"{place}: the separate tilts of {found['tilts']} frames")
         print(f"{places['tilt']}: {tilt.sentence()}")
     elif "tilt" in places:
         others = _other_frames(job.plan, summary)
@@ -258,19 +257,16 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
     if hardly_any or none:
         yield from _hints_on_discs(run, settings, summary)
     elif found["discs"] >= seen >= _FEWEST_FRAMES:
-        yield from _hint_on_height(run, settings)
+        from detect.discs.radius import ratio_of_radii
 
-
-def _hint_on_height(run: Run, settings: CircleSettings) -> Iterator[str]:
-    from detect.discs.radius import ratio_of_radii
-
-    ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), run.camera, settings)
-    if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
-        yield (
-            f"the discs look {ratio:.2f} times as large as with a radius of {settings.radius_m:g} "
-            "m: if that is right, the camera is not as high as calibrated, or leans, and positions "
-            "are wrong by as much; measure the discs and its height"
-        )
+        ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), run.camera, settings)
+        if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
+            yield (
+                f"the discs look {ratio:.2f} times as large as with a radius of "
+                f"{settings.radius_m:g} m: if that is right, the camera is not as high as "
+                "calibrated, or leans, and positions are wrong by as much; measure the discs and "
+                "its height"
+            )
 
 
 def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:

@@ -206,8 +206,7 @@ def detect_run(
         files = stack.enter_context(RunFiles(job))
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
-        tasks = files.take_over(every, count)
-        for frames in pool.detect_chunks(tasks, plan):
+        for frames in pool.detect_chunks(files.take_over(every, count), plan):
             files.add(frames)
             for _, rows in frames:
                 count(rows)

@@ -86,8 +86,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[float,
     try:
         connections = [c for c in reader.connections if c.topic == topic]
         for connection, recorded_ns, content in reader.messages(connections):
-            message = reader.deserialize(content, connection.msgtype)
-            yield recorded_ns / 1e9, message
+            yield recorded_ns / 1e9, reader.deserialize(content, connection.msgtype)
             number += 1
     except Exception as error:  # as above
         raise DetectError(
