@@ -11,6 +11,7 @@ position.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -40,6 +41,7 @@ from lut import (
 )
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.landmarks import CircleLandmark, associate, circle_arrays, squared_mahalanobis
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -51,6 +53,9 @@ _NOISE_ROWS = 16
 #: Lowest gradient of an edge that votes, and the same in images full of edges, grey levels per
 #: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
+
+#: Gate of IDs: chi-squared of two degrees of freedom exceeds this once in a thousand.
+_GATE = 2.0 * math.log(1000.0)
 
 #: A camera in the form that kernels take.
 _numbers = lru_cache(maxsize=4)(camera_numbers)
@@ -298,3 +303,28 @@ def refined_covariance(
             tilt_sigma_rad**2,
         )
     )
+
+
+def ids_of_rows(
+    xy: FloatArray,
+    rows: Sequence[CircleLandmark],
+    covariance: FloatArray | None = None,
+    slack_m: float = 0.0,
+) -> list[tuple[int, ...]]:
+    """IDs of discs, from rows of the same discs in the same frame; () for discs without a row.
+
+    If the rows are not corrected for the tilt, the discs (N, 2) must not be either: then both refer
+    to the same pixels, whatever the tilt, and the discs' own covariance is not used. `slack_m` is
+    the standard deviation, per axis, of errors that no covariance includes.
+    """
+    known = circle_arrays(rows)
+    spread = known.covariance + slack_m**2 * np.eye(2)
+    if covariance is not None:
+        spread = spread + covariance[:, None]
+    distance = squared_mahalanobis(xy[:, None] - known.xy, spread)
+    # Below 0 where a covariance is not positive definite.
+    pairs = associate(distance, (distance >= 0.0) & (distance <= _GATE))
+    ids: list[tuple[int, ...]] = [()] * len(xy)
+    for disc, row in zip(pairs.first, pairs.second):
+        ids[disc] = rows[row].ids
+    return ids

@@ -78,9 +78,8 @@ def _cached(
     build: Callable[..., Table],
     folder: Path | None,
 ) -> Table:
-    camera, *shape = of
-    numbers = [float(value).hex() for each in shape for value in astuple(each)]
-    parts = [str(TABLE_VERSION), camera.content_hash, *numbers]
+    values = [value for shape in of[1:] for value in astuple(shape)]
+    parts = [str(TABLE_VERSION), of[0].content_hash, *(float(value).hex() for value in values)]
     key = hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
     path = (folder or cache_folder()) / f"{name}-{key}.table"
     table = _read(path, kind)

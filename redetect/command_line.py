@@ -140,8 +140,7 @@ class Program:
 
     def main(self, arguments: list[str] | None = None) -> int:
         """Run the command line, quietly if requested; returns the exit code."""
-        given = sys.argv[1:] if arguments is None else arguments
-        return exit_code_of(lambda: self._run(given))
+        return exit_code_of(lambda: self._run(sys.argv[1:] if arguments is None else arguments))
 
     def _run(self, arguments: Sequence[str]) -> int:
         # Matrices are small or sparse here: BLAS threads would cost more time than they save.

@@ -73,8 +73,7 @@ def draw_rows(
     words = [title] if title else []
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
-        lines = rows.reference_lines, rows.lines, None
-        match = match_frame("lines", title, lines, options)
+        match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
         _draw_lines(canvas, sight.camera, match, compared)
         words.append(_count("verticals", match, compared))

@@ -181,7 +181,11 @@ def _solved(
         if not np.hypot(*off.T).max() <= reach_px:
             return None
         p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
-        p[BLUR] = _confined(p[BLUR], min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE))
+        # The blur's variances are clamped in all directions.
+        values, vectors = np.linalg.eigh(p[BLUR][[0, 1, 1, 2]].reshape(2, 2))
+        largest = min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE)
+        confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
+        p[BLUR] = confined.flat[[0, 1, 3]]
     return p, left, inverse
 
 
@@ -200,13 +204,6 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 def _homography_of(p: FloatArray) -> FloatArray:
     return np.append(p[HOMOGRAPHY], 1.0).reshape(3, 3)
-
-
-def _confined(blur: FloatArray, largest: float) -> FloatArray:
-    """A covariance uu, uv, vv with its variances clamped in all directions."""
-    values, vectors = np.linalg.eigh(blur[[0, 1, 1, 2]].reshape(2, 2))
-    confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
-    return np.asarray(confined.flat[[0, 1, 3]])
 
 
 def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:

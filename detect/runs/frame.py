@@ -8,7 +8,6 @@ compiler, and does not load them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_table
-from detect.discs.identity import ids_of_rows
+from detect.circles import CircleDetections, detect_circles, disc_table, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (
@@ -244,6 +242,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                 "markers": len(found.markers or ()),
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
+            evidence=0.0 if found.discs is None else float(np.nansum(found.discs.evidence)),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
@@ -318,12 +317,6 @@ def _disc_rows(
 def pays(leaning: float, evidence: float) -> bool:
     """Whether a search with the camera's lean finds clearly more evidence of discs."""
     return leaning > _MORE_EVIDENCE * evidence
-
-
-def evidence_of(frames: Iterable[FrameRows]) -> float:
-    """Total evidence of the discs in the rows of frames, which must include JSON."""
-    discs = [disc for rows in frames for disc in json.loads(rows.rows["json"]).get("discs", ())]
-    return sum(disc["evidence"] or 0.0 for disc in discs)
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:

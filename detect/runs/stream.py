@@ -51,7 +51,7 @@ from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
-_JOURNAL_VERSION = 7
+_JOURNAL_VERSION = 8
 
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
@@ -229,15 +229,11 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     That is the camera's lean and, if positions are not levelled by the run, the usual tilt.
     """
     camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
-    wanted = camera and circles and circles.refine and plan.levelling != "none"
-    if not (wanted and expected >= LEAST_FRAMES):
+    if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    from detect.runs.frame import (  # loads the compiler
-        evidence_of,
-        pays,
-        searched_lean,
-        tilt_of_some,
-    )
+    if expected < LEAST_FRAMES:
+        return plan
+    from detect.runs.frame import pays, searched_lean, tilt_of_some  # loads the compiler
 
     step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
     tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]
@@ -245,7 +241,7 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
 
-    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
+    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
     rows = rows_by(level)
     tilt = tilt_of_some(camera, rows)
     if tilt is None:
@@ -254,9 +250,12 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(tilt.usual_rad), 2))
         plan = replace(plan, circles=circles)
     lean = searched_lean(tilt)
-    if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
+    if lean is None:
         return plan
-    return replace(plan, lean=lean)
+    leaning, upright = (
+        sum(each.evidence for each in found) for found in (rows_by(replace(level, lean=lean)), rows)
+    )
+    return replace(plan, lean=lean) if pays(leaning, upright) else plan
 
 
 class RunFiles:
