@@ -78,8 +78,8 @@ def _cached(
     build: Callable[..., Table],
     folder: Path | None,
 ) -> Table:
-    values = [value for shape in of[1:] for value in astuple(shape)]
-    parts = [str(TABLE_VERSION), of[0].content_hash, *(float(value).hex() for value in values)]
+    parts = [str(TABLE_VERSION), of[0].content_hash]
+    parts += [float(value).hex() for shape in of[1:] for value in astuple(shape)]
     key = hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
     path = (folder or cache_folder()) / f"{name}-{key}.table"
     table = _read(path, kind)
