@@ -249,12 +249,11 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
     seen = summary.frames - summary.failed
-    hardly_any = seen >= _FEWEST_FRAMES and 3 * found["discs"] < seen
-    none = not found["discs"] and seen > 0
+    hardly_any = 3 * found["discs"] < seen and (seen >= _FEWEST_FRAMES or not found["discs"])
     run, settings = job.run, plan.circles
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
-    if hardly_any or none:
+    if hardly_any:
         yield from _hints_on_discs(run, settings, summary)
     elif found["discs"] >= seen >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii

@@ -252,10 +252,8 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     lean = searched_lean(tilt)
     if lean is None:
         return plan
-    leaning, upright = (
-        sum(each.evidence for each in found) for found in (rows_by(replace(level, lean=lean)), rows)
-    )
-    return replace(plan, lean=lean) if pays(leaning, upright) else plan
+    leaning = sum(each.evidence for each in rows_by(replace(level, lean=lean)))
+    return replace(plan, lean=lean) if pays(leaning, sum(each.evidence for each in rows)) else plan
 
 
 class RunFiles:
