@@ -46,10 +46,16 @@ def perform(options: View) -> int:
     failures: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         raw = Path(folder) / "view.rrd"
-        if options.output is None:
-            _show(recording)
-        else:
+        if options.output is not None:
             recording.save(str(raw))
+        else:
+            try:
+                recording.spawn()
+            except RuntimeError:
+                raise DetectError(
+                    "Rerun's viewer cannot be started: expected the program `rerun` of the package "
+                    "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
+                ) from None
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         recording.log("world/path", rr.LineStrips3D([poses * [1.0, 1.0, 0.0]]), static=True)
         for name, places in known.items():
@@ -111,14 +117,3 @@ def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
-
-
-def _show(recording: Any) -> None:
-    """Start the viewer."""
-    try:
-        recording.spawn()
-    except RuntimeError:
-        raise DetectError(
-            "Rerun's viewer cannot be started: expected the program `rerun` of the package "
-            "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
-        ) from None

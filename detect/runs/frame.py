@@ -162,12 +162,10 @@ def _path(
             if plan.lean is None and by_frame is not None and settings.refine:
                 lean = lean_of_frame(by_frame)
                 if lean is not None:
-                    search = search_of(camera, plan.circles, lean)
-                    leaning = _discs(image, camera, settings, search)
+                    leaning = _discs(image, camera, settings, search_of(camera, plan.circles, lean))
                     seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
-            found.seen = found.discs = seen
-            if by_frame is not None:
-                found.discs = levelled(found.seen, camera, by_frame)
+            found.seen = seen
+            found.discs = seen if by_frame is None else levelled(seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run does so later
                 discs, by_verticals = found.discs, by_frame is not None
                 covariance = discs.covariance + common_covariance(
