@@ -51,10 +51,19 @@ class HoughCandidates(NamedTuple):
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Find possible centres of discs of one radius (m) from the votes of edges.
+    """Find possible centres of discs of one radius from the votes of edges.
 
-    The table is for this radius; the sign is 1 for light discs, -1 for dark ones, 0 for both;
-    `least_step` is the gradient of an edge, grey levels per pixel.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    table : VoteTable
+        The camera's, for this radius.
+    radius : float
+        Metres.
+    sign : int
+        1 for light discs, -1 for dark ones, 0 for both.
+    least_step : float
+        Gradient of an edge, grey levels per pixel.
     """
     signs = np.array([sign] if sign else [1.0, -1.0], np.float64)
     places, scores = [], []

@@ -111,7 +111,17 @@ def judge(
 ) -> Judgement:
     """Judge candidates, the best first.
 
-    `nominal` is the radius of discs (m), `least_step` the lowest step of the grey value at a rim.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    candidates : HoughCandidates
+    nominal : float
+        Radius of discs, metres.
+    least_step : float
+        Lowest step of the grey value at a rim.
+    camera_numbers : (K,) float64
+        `camera.kernels.camera_numbers`.
+    networks : Networks
     """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()

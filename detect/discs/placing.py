@@ -71,8 +71,20 @@ class Size(NamedTuple):
 def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
     """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
-    `work` is the working space (`detect.discs.fit.WORK`). Returns the centres (N, 2), metres, and
-    their covariances (N, 2, 2).
+    Parameters
+    ----------
+    scene : Scene
+    discs : Judgement
+        N discs.
+    work : WORK
+        Working space (`detect.discs.fit`).
+
+    Returns
+    -------
+    floor_xy : (N, 2) float64
+        Centres, metres.
+    covariance : (N, 2, 2) float64
+        Square metres.
     """
     count = len(discs.step)
     whole = [NO_FIT for _ in range(count)]

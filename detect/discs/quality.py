@@ -160,7 +160,16 @@ def find_centres(
 
 
 def centres_of(image: GreyImage, table: DiscTable, limits: Limits) -> Centres:
-    """Find the centres of a table within some limits, in an image (H, W) of its size."""
+    """Find the centres of a table within some limits.
+
+    Parameters
+    ----------
+    image : (H, W) uint8
+        Of the table's size.
+    table : DiscTable
+        The camera's.
+    limits : Limits
+    """
     grey = image.ravel()
     if image.size < GROUP_COLUMNS:
         grey = np.append(grey, np.zeros(GROUP_COLUMNS, np.uint8))

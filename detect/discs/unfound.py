@@ -110,11 +110,16 @@ def explain_discs(
     settings: CircleSettings,
     at: tuple[float, float] | None = None,
 ) -> DiscExplanation:
-    """Explain what was found in an image (H, W) and what was not.
+    """Explain what was found in an image and what was not.
 
-    The setting `refine` is always on: the published detector rejects centres only for their low
-    quality. Given the pixel (u, v) of something that should have been found, only candidates near
-    it are listed.
+    Parameters
+    ----------
+    image : (H, W) uint8
+    camera : Camera
+    settings : CircleSettings
+        `refine` is always on: the published detector rejects centres only for their low quality.
+    at : (float, float), optional
+        Pixel (u, v) of something that should have been found; only candidates near it are listed.
     """
     scene = _Scene(image, camera, replace(settings, refine=True))
     candidates = list(_candidates(scene))
