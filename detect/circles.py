@@ -11,6 +11,7 @@ position.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,7 +21,7 @@ from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
 from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
-from detect.discs.fit import Scene, least_noise, working_space
+from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JUDGED, Judgement, judge
 from detect.discs.placing import place_discs
@@ -40,15 +41,21 @@ from lut import (
 )
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.landmarks import CircleLandmark, associate, circle_arrays, squared_mahalanobis
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
+#: The same in fits: that of rounded grey values.
+_ROUNDING_NOISE = 0.3
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Number of rows from which an image's noise is estimated.
 _NOISE_ROWS = 16
 #: Lowest gradient of an edge that votes, and the same in images full of edges, grey levels per
 #: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
+
+#: Gate of IDs: chi-squared of two degrees of freedom exceeds this once in a thousand.
+_GATE = 2.0 * math.log(1000.0)
 
 #: A camera in the form that kernels take.
 _numbers = lru_cache(maxsize=4)(camera_numbers)
@@ -163,7 +170,10 @@ def judged_discs(
     candidates = candidates_of(image, table, settings, noise)
     judgement = judged(image, camera, settings, candidates, noise)
     log_odds = adjusted_log_odds(judgement, settings)
-    best = best_discs(judgement, log_odds, settings)
+    taken = np.flatnonzero(log_odds >= settings.evidence)
+    best_first = np.argsort(-log_odds[taken], kind="stable")
+    # Without those too close to a better one.
+    best = taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
     return judgement.where(best), log_odds[best]
 
 
@@ -206,20 +216,13 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
     return adjusted
 
 
-def best_discs(judgement: Judgement, log_odds: FloatArray, settings: CircleSettings) -> IntArray:
-    """Indices of the candidates that are discs, without those too close to a better one."""
-    taken = np.flatnonzero(log_odds >= settings.evidence)
-    best_first = np.argsort(-log_odds[taken], kind="stable")
-    return taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
-
-
 def scene_of(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
 ) -> Scene:
     """The input of the fits in an image; parameters as for `detect_circles`."""
     # Optics blur equally in all directions. Where pixels are not square, as in single fields of
     # interlaced frames, the same blur spans fewer pixels along v.
-    ratio, noise = camera.scale_y / camera.scale_x, least_noise(noise)
+    ratio, noise = camera.scale_y / camera.scale_x, max(noise, _ROUNDING_NOISE)
     return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 
@@ -300,3 +303,28 @@ def refined_covariance(
             tilt_sigma_rad**2,
         )
     )
+
+
+def ids_of_rows(
+    xy: FloatArray,
+    rows: Sequence[CircleLandmark],
+    covariance: FloatArray | None = None,
+    slack_m: float = 0.0,
+) -> list[tuple[int, ...]]:
+    """IDs of discs, from rows of the same discs in the same frame; () for discs without a row.
+
+    If the rows are not corrected for the tilt, the discs (N, 2) must not be either: then both refer
+    to the same pixels, whatever the tilt, and the discs' own covariance is not used. `slack_m` is
+    the standard deviation, per axis, of errors that no covariance includes.
+    """
+    known = circle_arrays(rows)
+    spread = known.covariance + slack_m**2 * np.eye(2)
+    if covariance is not None:
+        spread = spread + covariance[:, None]
+    distance = squared_mahalanobis(xy[:, None] - known.xy, spread)
+    # Below 0 where a covariance is not positive definite.
+    pairs = associate(distance, (distance >= 0.0) & (distance <= _GATE))
+    ids: list[tuple[int, ...]] = [()] * len(xy)
+    for disc, row in zip(pairs.first, pairs.second):
+        ids[disc] = rows[row].ids
+    return ids

@@ -44,7 +44,8 @@ from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
 from detect.terminal import show_announcements
-from redetect.command_line import EXIT_INTERRUPTED, Program, all_but
+from redetect.command_line import Program, all_but
+from redetect.interrupts import EXIT_INTERRUPTED
 from redetect.messages import is_quiet
 
 #: Flags that only `--help-all` shows.
@@ -63,14 +64,6 @@ EXPERT: dict[type, frozenset[str]] = {
 }  # fmt: skip
 
 
-def _with_radius_found(arguments: Sequence[str]) -> list[str]:
-    """The command line with `--find-radius` instead of a radius of `auto`."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--radius-m", "--circles.radius-m", nargs="?", action="append", default=[])
-    given, rest = parser.parse_known_args(arguments)
-    return [*rest, "--find-radius"] if "auto" in given.radius_m else list(arguments)
-
-
 class DetectProgram(Program):
     """The program: presets and settings files decide the defaults of flags."""
 
@@ -82,7 +75,12 @@ class DetectProgram(Program):
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help` and on errors."""
-        arguments = _with_radius_found(arguments)
+        radius = ArgumentParser(add_help=False, allow_abbrev=False)
+        flags = "--radius-m", "--circles.radius-m"
+        radius.add_argument(*flags, dest="given", nargs="?", action="append", default=[])
+        found, rest = radius.parse_known_args(arguments)
+        if "auto" in found.given:
+            arguments = [*rest, "--find-radius"]
         deciding = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--preset", "--settings"):
             deciding.add_argument(flag, nargs="?", default="", const="")

@@ -23,8 +23,7 @@ def perform(command: Demo) -> int:
     code = detect_run(All(run=run, output=command.output, force=command.force))
     if code != 0:
         return code
-    detected = command.output / "detected.circles"
-    result = comparison_of(Compare(run=run, detected=detected))
+    result = comparison_of(Compare(run=run, detected=command.output / "detected.circles"))
     write_report(
         Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force)
     )

@@ -68,7 +68,11 @@ def perform(command: Export) -> int:
     if not tables:
         raise DetectError(f"{file}: contains no rows: expected STEP, LANDMARK or TILT rows")
     output = command.output or file.with_name(f"{file.name}.{to}")
-    places = {next(iter(tables)): output} if to == "mcap" else _table_files(output, [*tables])
+    # The first table except steps is the output, others are beside it; MCAP is one file.
+    first, *others = sorted(tables, key=lambda table: table == "steps")
+    places = {first: output}
+    if to != "mcap":
+        places |= {t: output.with_name(f"{output.stem}.{t}{output.suffix}") for t in others}
     for path in places.values():
         if path.exists() and path.samefile(file):
             raise DetectError(f"{path}: is the file to export: expected a different output")
@@ -84,13 +88,6 @@ def perform(command: Export) -> int:
                 write_parquet(stream, table, tables[table], file.name)
         print(f"{path}: {written}")
     return 0
-
-
-def _table_files(output: Path, tables: list[TableName]) -> dict[TableName, Path]:
-    """The file of each table: the first one except steps is `output`, others are beside it."""
-    first, *others = sorted(tables, key=lambda table: table == "steps")
-    beside = {table: output.with_name(f"{output.stem}.{table}{output.suffix}") for table in others}
-    return {first: output, **beside}
 
 
 def _times(command: Export) -> dict[str, float] | None:

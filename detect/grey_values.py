@@ -106,5 +106,4 @@ def _blank(image: GreyImage) -> int:
     # The first of these may be partly margin and partly image.
     margin = (blank // _COLUMNS + 1) * _COLUMNS
     step = np.abs(image[:, margin] - image[:, 0].mean())
-    is_edge = np.mean(step > _LEAST_STEP) >= _LEAST_SHARE
-    return margin if is_edge else 0
+    return margin if np.mean(step > _LEAST_STEP) >= _LEAST_SHARE else 0

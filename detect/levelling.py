@@ -48,8 +48,7 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
     )
     by = tilt.pitch, tilt.roll
-    level = replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by)
-    return level.where(down)
+    return replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by).where(down)
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:

@@ -120,15 +120,13 @@ def detect_lines(
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
-        tilt = judged.tilt.pitch_rad, judged.tilt.roll_rad
-        before = Before(tracks, judged.doubtful, tilt)
+        before = Before(tracks, judged.doubtful, (judged.tilt.pitch_rad, judged.tilt.roll_rad))
         tracks = follow_edges(image, strip, window, starts, numbers.tracking, before)
         judged = fit_and_judge(image, strip, tracks, steps, numbers, judged)
     if judged.tilt is not None:
         error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
         judged = judged._replace(tilt=error)
-    lines = lines_of_tracks(strip, tracks, judged, numbers.joining)
-    return LineDetections(lines, tracks, judged)
+    return LineDetections(lines_of_tracks(strip, tracks, judged, numbers.joining), tracks, judged)
 
 
 def carry_ids(

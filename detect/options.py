@@ -25,7 +25,6 @@ from redetect.bounds import (
     MaybeStr,
     NotNegative,
     Positive,
-    demand,
     demand_fields,
     whole,
 )
@@ -66,6 +65,9 @@ class RunFlags:
     camera: MaybePath = None  #: Calibration, if not the one in the run folder.
     force: bool = False  #: Replace existing files.
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
+
+    def __post_init__(self) -> None:
+        demand_fields(self, DetectError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,15 +160,12 @@ class Lines(DetectorFlags):
     #: A .lines file whose IDs are transferred where the match is unambiguous.
     ids_from: MaybePath = None
     #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
-    join_threshold: MaybeFloat = None
+    join_threshold: Annotated[MaybeFloat, NOT_NEGATIVE] = None
     #: Folder for images with lines and their standard deviations drawn in, after detection.
     draw: MaybePath = None
     #: Draw all tracks instead, rejected ones with the reason; repeats the detection.
     rejected: bool = False
     parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
-
-    def __post_init__(self) -> None:
-        demand(self, DetectError, join_threshold=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,9 +276,6 @@ class SomeFramesFlags(RunFlags):
 
     every: Annotated[int, whole(1, MOST_FRAMES)] = 1  #: Only every n-th frame.
 
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Draw(SomeFramesFlags):
@@ -294,7 +290,7 @@ class Draw(SomeFramesFlags):
     """
 
     video: MaybePath = None  #: Write an MP4 file as well, or instead.
-    fps: float = 10.0  #: Frames per second of the video.
+    fps: Positive = 10.0  #: Frames per second of the video.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
@@ -332,7 +328,7 @@ class Report(RunFlags):
         Replace an existing page.
     """
 
-    worst: int = 5  #: Number of worst frames to show.
+    worst: Annotated[int, whole(0)] = 5  #: Number of worst frames to show.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 

@@ -67,8 +67,7 @@ def ros_messages(
         for table in ("circles", "lines"):
             if table in tables:
                 poses = [_pose(make, table, row) for row in tables[table]]
-                identifiers = [row[-1] for row in tables[table]]
-                shapes = _shapes(make, in_robot, table, poses, identifiers)
+                shapes = _shapes(make, in_robot, table, poses, [row[-1] for row in tables[table]])
                 yield time_ns, f"/redetect/{table}", shapes
                 for pose in poses:
                     stamped = make(_POSE, header=in_robot, pose=pose)
@@ -146,8 +145,7 @@ def _shapes(
         "scale": _xyz(make, "Vector3", size),
         "color": _orange(make, 0.8),
     }
-    upright = _quaternion(make, Rotation.identity())
-    nowhere = make("geometry_msgs/msg/Pose", orientation=upright)
+    nowhere = make("geometry_msgs/msg/Pose", orientation=_quaternion(make, Rotation.identity()))
     clear = make(_SHAPE, action=_DELETE_ALL, pose=nowhere, **common)
     found = [
         make(_SHAPE, id=number, pose=pose.pose, text=" ".join(map(str, ids)), **common)

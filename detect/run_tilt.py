@@ -231,11 +231,8 @@ class _Series(NamedTuple):
             )
         difference, of_difference = values[1] - values[0], variance.sum(axis=0)
         both = np.isfinite(difference)
-        return (
-            likelihood + _log_density(difference[both], of_difference[both]),
-            deviation,
-            of_deviation,
-        )
+        likelihood += _log_density(difference[both], of_difference[both])
+        return likelihood, deviation, of_deviation
 
 
 def _log_density(difference: FloatArray, variance: FloatArray) -> float:

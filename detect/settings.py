@@ -91,8 +91,7 @@ class CircleSettings:
     @property
     def tilt_sigma_rad(self) -> float:
         """Standard deviation of an unknown pitch or roll, radians."""
-        sigma_deg = USUAL_TILT_DEG if self.tilt_sigma_deg is None else self.tilt_sigma_deg
-        return math.radians(sigma_deg)
+        return math.radians(USUAL_TILT_DEG if self.tilt_sigma_deg is None else self.tilt_sigma_deg)
 
     @property
     def inner_radius_m(self) -> float:

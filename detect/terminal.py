@@ -28,11 +28,6 @@ def show_announcements() -> None:
     _log.handlers = [logging.StreamHandler()]
 
 
-def announcements_are_shown() -> bool:
-    """Whether announcements go to stderr."""
-    return bool(_log.handlers)
-
-
 @cache
 def say_compiling() -> None:
     """Announce, once, that kernels are compiled."""

@@ -50,7 +50,12 @@ def perform(options: Tune) -> int:
         raise DetectError("--serve and --vary: expected one of them")
     base = CircleSettings() if options.settings is None else read_settings(options.settings).circles
     words = list(chain.from_iterable(options.vary))
-    varied = dict(map(_name_and_values, words))
+    varied = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        if not equals:
+            raise DetectError(f"{word!r}: expected NAME=VALUES, as evidence=-1:3:0.5")
+        varied[name.replace("-", "_")] = text
     if len(varied) < len(words):
         raise DetectError(f"--vary {' '.join(words)}: expected each parameter once")
     grid = () if options.serve else combinations(varied)
@@ -63,8 +68,7 @@ def perform(options: Tune) -> int:
     if options.serve:
         from detect.tuning_page import TuningSession, serve  # nothing else needs a server
 
-        session = TuningSession(run, list(frames), base, output, options.force)
-        return serve(session, options.port)
+        return serve(TuningSession(run, list(frames), base, output, options.force), options.port)
 
     names = "table.json", "curve.png"
     demand_free([output / name for name in names], overwrite=options.force)
@@ -121,13 +125,6 @@ def _with_reference(frames: Iterable[RunFrame], path: Path) -> list[tuple[RunFra
     if not pairs:
         raise DetectError(f"{path}: none of the {len(chosen)} chosen frames: expected some of them")
     return pairs
-
-
-def _name_and_values(word: str) -> tuple[str, str]:
-    name, equals, values = word.partition("=")
-    if not equals:
-        raise DetectError(f"{word!r}: expected NAME=VALUES, as evidence=-1:3:0.5")
-    return name.replace("-", "_"), values
 
 
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:

@@ -31,7 +31,9 @@ _EARLIEST_DATE_S = 1e8
 
 def perform(options: View) -> int:
     """Execute the command; returns the exit code."""
-    rr = _rerun()
+    os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
+    with imported_for("detect view needs the package rerun-sdk", "view"):
+        import rerun as rr
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
     source = open_rows(run, options.files)
@@ -44,13 +46,18 @@ def perform(options: View) -> int:
     failures: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         raw = Path(folder) / "view.rrd"
-        if options.output is None:
-            _show(recording)
-        else:
+        if options.output is not None:
             recording.save(str(raw))
+        else:
+            try:
+                recording.spawn()
+            except RuntimeError:
+                raise DetectError(
+                    "Rerun's viewer cannot be started: expected the program `rerun` of the package "
+                    "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
+                ) from None
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        path = rr.LineStrips3D([poses * [1.0, 1.0, 0.0]])
-        recording.log("world/path", path, static=True)
+        recording.log("world/path", rr.LineStrips3D([poses * [1.0, 1.0, 0.0]]), static=True)
         for name, places in known.items():
             at = rr.Points3D(np.pad(places, ((0, 0), (0, 1))), colors=_MAP)
             recording.log(f"world/map/{name}", at, static=True)
@@ -58,7 +65,8 @@ def perform(options: View) -> int:
             for position, frame in zip(count(step=options.every), frames):
                 recording.set_time("frame", sequence=position)
                 if frame.time_s is not None:
-                    recording.set_time("time", **_clock(frame.time_s))
+                    kind = "timestamp" if frame.time_s >= _EARLIEST_DATE_S else "duration"
+                    recording.set_time("time", **{kind: frame.time_s})
                 rows = source.of(frame.step.prefix)
                 _log_world(rr, recording, rows, poses[position + 1], settings.radius_m)
                 try:
@@ -94,11 +102,6 @@ def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, Floa
     return poses, {"discs": known.discs.xy, "verticals": known.lines.xy}
 
 
-def _clock(time_s: float) -> dict[str, float]:
-    """A frame's time for Rerun: a date if possible, else seconds since a start."""
-    return {"timestamp" if time_s >= _EARLIEST_DATE_S else "duration": time_s}
-
-
 def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius_m: float) -> None:
     x, y, theta = pose.tolist()
     # As a quaternion: with an axis, Rerun 0.23 needs a newer NumPy than it requires.
@@ -114,22 +117,3 @@ def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))
-
-
-def _show(recording: Any) -> None:
-    """Start the viewer."""
-    try:
-        recording.spawn()
-    except RuntimeError:
-        raise DetectError(
-            "Rerun's viewer cannot be started: expected the program `rerun` of the package "
-            "rerun-sdk on the PATH; or write a recording with -o and open it elsewhere"
-        ) from None
-
-
-def _rerun() -> Any:
-    """The package of Rerun, with its telemetry disabled."""
-    os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    with imported_for("detect view needs the package rerun-sdk", "view"):
-        import rerun
-    return rerun

@@ -78,20 +78,16 @@ def _cached(
     build: Callable[..., Table],
     folder: Path | None,
 ) -> Table:
-    path = (folder or cache_folder()) / f"{name}-{_key(*of)}.table"
+    parts = [str(TABLE_VERSION), of[0].content_hash]
+    parts += [float(value).hex() for shape in of[1:] for value in astuple(shape)]
+    key = hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
+    path = (folder or cache_folder()) / f"{name}-{key}.table"
     table = _read(path, kind)
     if table is None:
         _log.info("computing the table of %s, once for this calibration", name)
         table = build(*of)
         _keep(path, table)
     return table
-
-
-def _key(camera: Camera, shape: DiscShape | VoteShape | None = None) -> str:
-    values = () if shape is None else astuple(shape)
-    numbers = [float(value).hex() for value in values]
-    parts = [str(TABLE_VERSION), camera.content_hash, *numbers]
-    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
 def _read(path: Path, kind: type[Table]) -> Table | None:

@@ -247,8 +247,7 @@ def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> B
     u, v = np.arange(width), np.arange(height)
     inside_u = (u >= border) & (u <= width - border)
     inside_v = (v >= border) & (v <= height - border)
-    near = down <= far_limit_m_per_px
-    return np.asarray(near & inside_v[:, None] & inside_u[None, :])
+    return np.asarray((down <= far_limit_m_per_px) & inside_v[:, None] & inside_u[None, :])
 
 
 def _strided(columns: IntArray, step: FloatArray) -> list[int]:

@@ -1,21 +1,16 @@
 """The program ``redetect``, also as ``python -m redetect``.
 
-Worker processes import this module, too, so what only the command line needs is imported where it
-is used.
+Worker processes import this module, too, so the command line is imported when it runs.
 """
 
 import sys
 
+from redetect.interrupts import start
+
 
 def main() -> int:
     """Run the command line; returns the exit code."""
-    try:
-        from redetect.cli import main as command_line
-    except KeyboardInterrupt:
-        from redetect.command_line import say_interrupted
-
-        return say_interrupted()
-    return command_line()
+    return start("redetect.cli")
 
 
 if __name__ == "__main__":

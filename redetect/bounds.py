@@ -104,15 +104,12 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
 
 @cache
 def _annotated(kind: type) -> dict[str, Bounds]:
-    hints = get_type_hints(kind, include_extras=True)
-    choices = {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
-    words = {
-        name: Bounds(f"one of {', '.join(map(str, known))}", known.__contains__)
-        for name, known in choices.items()
-    }
-    return words | {
-        name: bounds
-        for name, hint in hints.items()
-        for bounds in getattr(hint, "__metadata__", ())
-        if isinstance(bounds, Bounds)
-    }
+    found: dict[str, Bounds] = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if get_origin(hint) is Literal:
+            known = get_args(hint)
+            found[name] = Bounds(f"one of {', '.join(map(str, known))}", known.__contains__)
+        for mark in getattr(hint, "__metadata__", ()):
+            if isinstance(mark, Bounds):
+                found[name] = mark
+    return found

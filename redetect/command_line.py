@@ -28,15 +28,13 @@ import tyro
 from tyro.conf import Suppress, arg, subcommand
 
 from redetect import __version__
-from redetect.interrupts import interrupts_noted
+from redetect.interrupts import interrupts_noted, say_interrupted
 from redetect.messages import QUIET, OneLineError, excerpt, one_line
 
 #: The command failed.
 EXIT_ERROR = 1
 #: The command line was wrong.
 EXIT_WRONG_COMMAND_LINE = 2
-#: Interrupted from the keyboard.
-EXIT_INTERRUPTED = 130
 #: The reader of the output has closed it (``| head``); the code of system tools in this case.
 EXIT_UNREAD = 141
 
@@ -78,12 +76,6 @@ def exit_code_of(work: Callable[[], int]) -> int:
             raise
         print(f"error: {one_line(_message(error))}", file=sys.stderr)
         return EXIT_ERROR
-
-
-def say_interrupted() -> int:
-    """Report an interrupt; returns the exit code."""
-    print("interrupted", file=sys.stderr, flush=True)
-    return EXIT_INTERRUPTED
 
 
 def _is_unread() -> bool:
@@ -148,8 +140,7 @@ class Program:
 
     def main(self, arguments: list[str] | None = None) -> int:
         """Run the command line, quietly if requested; returns the exit code."""
-        given = sys.argv[1:] if arguments is None else arguments
-        return exit_code_of(lambda: self._run(given))
+        return exit_code_of(lambda: self._run(sys.argv[1:] if arguments is None else arguments))
 
     def _run(self, arguments: Sequence[str]) -> int:
         # Matrices are small or sparse here: BLAS threads would cost more time than they save.
@@ -157,7 +148,14 @@ class Program:
         words = [word for word in arguments if word not in _QUIET]
         command = self.parsed(words)
         if getattr(command, "json", None) == _STANDARD_OUTPUT:
-            return _with_json_alone(command, self.carry_out)
+            # Only the content of the JSON file is written to standard output.
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / "result.json"
+                with _quietly():
+                    code = self.carry_out(replace(command, json=path))
+                if path.exists():
+                    sys.stdout.write(path.read_text("utf-8"))
+            return code
         if len(words) == len(arguments):
             return self.carry_out(command)
         with _quietly():
@@ -250,17 +248,6 @@ def _quietly() -> Iterator[None]:
             yield
     finally:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
-
-
-def _with_json_alone(command: Any, carry_out: Callable[[Any], int]) -> int:
-    """Execute a command with only the content of its JSON file on standard output."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "result.json"
-        with _quietly():
-            code = carry_out(replace(command, json=path))
-        if path.exists():
-            sys.stdout.write(path.read_text("utf-8"))
-    return code
 
 
 def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:

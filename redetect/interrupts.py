@@ -18,10 +18,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from types import FrameType
 from typing import Any, NoReturn
 
 Handler = Callable[[int, FrameType | None], Any]
+
+#: Exit code of a program that was interrupted from the keyboard.
+EXIT_INTERRUPTED = 130
 
 #: Functions that compiled code calls to hand over its results, and the ends of their files' names:
 #: Numba's own, and the one that makes a named tuple.
@@ -128,3 +132,18 @@ def raise_if_interrupt_waits() -> None:
     """Raise a deferred interrupt, if there is one."""
     if _waiting.is_set() or signal.SIGINT in signal.sigpending():
         raise KeyboardInterrupt
+
+
+def say_interrupted() -> int:
+    """Report an interrupt; returns the exit code."""
+    print("interrupted", file=sys.stderr, flush=True)
+    return EXIT_INTERRUPTED
+
+
+def start(module: str) -> int:
+    """Run the `main` of a module, whose import may be interrupted, too; returns the exit code."""
+    try:
+        command_line = import_module(module).main
+    except KeyboardInterrupt:
+        return say_interrupted()
+    return int(command_line())

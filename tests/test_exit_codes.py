@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from redetect.command_line import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_UNREAD, exit_code_of
+from redetect.command_line import EXIT_ERROR, EXIT_UNREAD, exit_code_of
+from redetect.interrupts import EXIT_INTERRUPTED
 from redetect.messages import OneLineError
 
 

@@ -157,8 +157,7 @@ def compare_frames(
         circle_arrays([row for match in matches for row in getattr(match, side)])
         for side in ("wanted", "matched", "missed", "extra")
     )
-    alike = [_alike_xy(match.wanted, match.view) for match in matches]
-    alike_xy = np.concatenate([np.zeros((0, 2)), *alike])
+    alike_xy = np.concatenate([np.zeros((0, 2)), *(_alike_xy(m.wanted, m.view) for m in matches)])
     away = first.xy - (np.zeros(2) if sight is None else sight.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     pairs = DiscPairs(first.xy, second.xy - first.xy, second.xy - alike_xy, second.covariance, away)
@@ -360,8 +359,7 @@ def match_frame(
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
         joined = np.zeros(len(left), dtype=np.bool_)
-        apart = circle_arrays(second).xy - _alike_xy(first, view)
-        errors = np.linalg.norm(apart, axis=1)
+        errors = np.linalg.norm(circle_arrays(second).xy - _alike_xy(first, view), axis=1)
     return FrameMatch(
         name,
         view,

@@ -57,8 +57,8 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     sight = None
     if not command.lines:
         if camera is None:
-            at = command.camera
-            camera = camera_in(command.run) if at is None else read_camera(at)
+            named = command.camera
+            camera = camera_in(command.run) if named is None else read_camera(named)
         settings, level = read_head(detected).circle_settings, read_head(reference).level
         sight = None if camera is None else Sight.by(camera, settings, level)
     return compare_with_file(
@@ -165,8 +165,7 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
         )
         for match in c.worst_frames(most)
     )
-    head = ("image", *c.counts, f"largest error {c.unit}")
-    return FigureTable("Worst frames", head, rows)
+    return FigureTable("Worst frames", ("image", *c.counts, f"largest error {c.unit}"), rows)
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -87,8 +87,6 @@ _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
 _MOST_GROWTH, _MOST_GROWTH_PX = 1.5, 1.0
 #: Prior of the blur, pixels, and the standard deviation of its logarithm.
 _BLUR_PX, _BLUR_SIGMA = 0.6, 0.7
-#: Lower bound of the noise, since grey values are rounded.
-_LEAST_NOISE = 0.3
 #: Lower bounds of a sector: pixels, spread of its shares, contrast relative to the median.
 _LEAST_PIXELS, _LEAST_SPREAD, _LEAST_CONTRAST = 6.0, 0.15, 0.4
 #: Standard deviation of the ramp of the light across the edge, relative, per radius.
@@ -617,8 +615,3 @@ def working_space() -> NDArray[Any]:
         space = np.zeros(1, WORK)
         _kept.space = space
     return space
-
-
-def least_noise(noise: float) -> float:
-    """Noise of a scene, at least that of rounded grey values."""
-    return max(noise, _LEAST_NOISE)

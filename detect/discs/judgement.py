@@ -218,10 +218,8 @@ def glance(
         du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
         scale[k] = math.sqrt(du * du + dv * dv)
         for m in range(len(GLANCED_AT)):
-            u, v = (
-                math.floor(u0 + GLANCED_AT[m] * du + 0.5),
-                math.floor(v0 + GLANCED_AT[m] * dv + 0.5),
-            )
+            u = math.floor(u0 + GLANCED_AT[m] * du + 0.5)
+            v = math.floor(v0 + GLANCED_AT[m] * dv + 0.5)
             inside = 0 <= u < width and 0 <= v < height
             grey[k, m] = image[v, u] if inside else math.nan
     return grey, scale

@@ -77,10 +77,9 @@ class Candidate(NamedTuple):
 
     def record(self) -> dict[str, Any]:
         """All fields and the reason, for JSON; non-finite values become null."""
-        values = self._asdict().items()
         known = {
             name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values
+            for name, value in self._asdict().items()
         }
         return {**known, "reason": self.reason()}
 
@@ -231,8 +230,7 @@ def _place(at: tuple[float, float], scene: _Scene) -> str:
     if not math.isfinite(x):
         return f"({u:g}, {v:g}) does not see the floor: it is above the horizon of the calibration."
     words = f"({u:g}, {v:g}) sees the floor {-y:.2f} m in front and {x:.2f} m to the left"
-    rows = np.abs(camera.floor_jacobian(at)[:, 1])
-    per_row = float(np.hypot(*rows))
+    per_row = float(np.hypot(*camera.floor_jacobian(at)[:, 1]))
     if per_row > settings.far_limit_m_per_px:
         return (
             f"{words}, where the floor moves {per_row:.3f} m per image row: too far for discs of "

@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 
 import cv2
@@ -33,8 +32,6 @@ def perform(options: Draw) -> int:
     """Execute the command; returns the exit code."""
     if options.output is None and options.video is None:
         raise DetectError("no output: expected a folder (-o) or a file (--video)")
-    if not (isfinite(options.fps) and options.fps > 0.0):
-        raise DetectError(f"fps is {options.fps:g}: expected above 0")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     run = replace(run, frames=SomeFrames(run.frames, every=options.every))

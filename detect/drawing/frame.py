@@ -73,8 +73,7 @@ def draw_rows(
     words = [title] if title else []
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
-        lines = rows.reference_lines, rows.lines, None
-        match = match_frame("lines", title, lines, options)
+        match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
         _draw_lines(canvas, sight.camera, match, compared)
         words.append(_count("verticals", match, compared))
@@ -152,8 +151,7 @@ def _draw_discs(
             outline = view.detected_px(circle_on_floor(centre_xy, radius_m))
             draw_curve(canvas, outline, colour, closed=True)
         top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
-        label = f"{row.quality:.2f}{text}"
-        draw_text(canvas, label, top, _TEXT_COLOUR, shift=(-14, -3))
+        draw_text(canvas, f"{row.quality:.2f}{text}", top, _TEXT_COLOUR, shift=(-14, -3))
 
 
 def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
@@ -168,9 +166,11 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
     rows = [row for row, _, _ in drawn]
     curves = line_curves(camera, ends_of(rows))
     bars = sigma_bars(camera, ends_of(rows), numbers(rows, "sigma"))
+    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas, curve, colour)
-        draw_bar(canvas, bar, SIGMA_COLOUR)
+        for points in (bar, bar[0] + tick, bar[1] + tick):
+            draw_curve(canvas, points, SIGMA_COLOUR)
         draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
@@ -234,13 +234,6 @@ def draw_curve(
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
         width = enlargement(canvas)
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def draw_bar(canvas: ByteArray, ends: FloatArray, colour: Colour) -> None:
-    """Draw an error bar between two points (2, 2) u, v, with a tick at each."""
-    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
-    for points in (ends, ends[0] + tick, ends[1] + tick):
-        draw_curve(canvas, points, colour)
 
 
 def draw_text(

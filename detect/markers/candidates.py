@@ -196,8 +196,7 @@ def _marker_regions(
         if bright / area > most_white:
             yield WHITE_SHARE
             continue
-        pixels = scale * hull + 0.5 * (scale - 1)
-        yield Region(scale, np.asarray(pixels, np.float64))
+        yield Region(scale, np.asarray(scale * hull + 0.5 * (scale - 1), np.float64))
 
 
 def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:

@@ -264,8 +264,7 @@ def _marker_at(
     first, template = max(possible, key=lambda look: look[0].explained)
     if first.explained < settings.least_explained - _FIRST_LOOK_SLACK:
         return UNEXPLAINED
-    start = refined._replace(corners=first.corners)
-    fit = fit_marker(picture, start, templates, template)
+    fit = fit_marker(picture, refined._replace(corners=first.corners), templates, template)
     if fit is None:
         return NOT_FITTED
     quality = verified_quality(fit, template, templates, settings)

@@ -124,7 +124,6 @@ def fit_marker(
     outside[templates.grid, templates.grid] = False
     contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
     unexplained = float(np.mean(left.residual**2)) - picture.noise**2
-    total = max(float(np.var(samples.grey)), 1e-9)
     return PatternFit(
         corners=corners_of(homography) + centre,
         covariance=np.einsum("kikj->kij", whole.reshape(4, 2, 4, 2)),
@@ -132,7 +131,7 @@ def fit_marker(
         cell_sigma=sigma[templates.grid, templates.grid].ravel(),
         border=cells[outside],
         misfit=math.sqrt(variance - noise**2) / contrast,
-        explained=1.0 - max(0.0, unexplained) / total,
+        explained=1.0 - max(0.0, unexplained) / max(float(np.var(samples.grey)), 1e-9),
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
         blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
     )
@@ -182,7 +181,11 @@ def _solved(
         if not np.hypot(*off.T).max() <= reach_px:
             return None
         p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
-        p[BLUR] = _confined(p[BLUR], min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE))
+        # The blur's variances are clamped in all directions.
+        values, vectors = np.linalg.eigh(p[BLUR][[0, 1, 1, 2]].reshape(2, 2))
+        largest = min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE)
+        confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
+        p[BLUR] = confined.flat[[0, 1, 3]]
     return p, left, inverse
 
 
@@ -201,13 +204,6 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 def _homography_of(p: FloatArray) -> FloatArray:
     return np.append(p[HOMOGRAPHY], 1.0).reshape(3, 3)
-
-
-def _confined(blur: FloatArray, largest: float) -> FloatArray:
-    """A covariance uu, uv, vv with its variances clamped in all directions."""
-    values, vectors = np.linalg.eigh(blur[[0, 1, 1, 2]].reshape(2, 2))
-    confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
-    return np.asarray(confined.flat[[0, 1, 3]])
 
 
 def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:

@@ -24,7 +24,6 @@ DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e"
 
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
-_HISTOGRAM_REACH = 5.0
 _MOST_DOTS = 4000
 
 #: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
@@ -49,7 +48,7 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
     """Histogram of whitened residuals beside the standard normal density."""
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
-        reach = _HISTOGRAM_REACH
+        reach = 5.0
         edges = np.linspace(-reach, reach, 51)
         counts, _ = np.histogram(residuals, edges)
         density = counts / (len(residuals) * (edges[1] - edges[0]))
@@ -190,8 +189,7 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
     with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
-        path = ahead * poses[:, :2]
-        axes.plot(*path.T, color=REFERENCE, lw=1.0, label="path by the odometry")
+        axes.plot(*(ahead * poses[:, :2]).T, color=REFERENCE, lw=1.0, label="path by the odometry")
         if len(marks):
             axes.plot(*(ahead * marks).T, "+", color=MARK, ms=6, mew=0.7, label="reference")
         closed = outline[:, [*range(_CORNERS), 0]]

@@ -24,12 +24,10 @@ from redetect import __version__
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
-_JPEG_QUALITY = 88
 _NAMES = {
     "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
 }  # fmt: skip
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
-_CURVE_POINTS = 41
 
 
 @dataclass(frozen=True)
@@ -88,21 +86,18 @@ def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
         return Part("note", f"{words}: {error}")
     rows, settings = inputs.files.of(frame.step.prefix), inputs.files.circle_settings
     picture = draw_rows(image, inputs.sight, rows, settings)
-    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
 
 def perform(options: Report) -> int:
     """Execute the command; returns the exit code."""
-    if options.worst < 0:
-        raise DetectError(f"worst is {options.worst}: expected 0 or more")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
     demand_place(output, overwrite=options.force)
     inputs = gather(run, options.files)
-    page = report_page(inputs, options.worst)
-    write_bytes(output, page, overwrite=options.force)
+    write_bytes(output, report_page(inputs, options.worst), overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
@@ -152,7 +147,7 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     parts = [*_summary_of(result)]
     quality = [row.quality for match in result.frames for row in match.detected]
     if len(set(quality)) > 1:
-        levels = np.linspace(min(quality), max(quality), _CURVE_POINTS)
+        levels = np.linspace(min(quality), max(quality), 41)
         parts.append(figures.rates_figure(levels, *figures.rates_over(result, levels)))
     if result.matched:
         parts.append(figures.floor_figure(result.pairs))

@@ -14,7 +14,7 @@ from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Ma
 from detect.row_files import KINDS, RunRows, read_head
 from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
-from detect.runs.stream import detect_run, make_folder
+from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
@@ -48,7 +48,7 @@ def perform(command: DetectorFlags) -> int:
     pictures = getattr(command, "draw", None)
     if pictures is not None:
         demand_recording(command.run)
-        make_folder(pictures)
+        pictures.mkdir(parents=True, exist_ok=True)
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:
@@ -84,32 +84,28 @@ def _circles(command: Circles, run: Run) -> Job:
     settings = _with_radius(command.parameters, run) if command.find_radius else command.parameters
     plan = FramePlan(run.camera, circles=settings)
     tilts = None if command.tilt is None else read_tilts(command.tilt)
-    known = replace(_known_discs(command.ids), tilts=tilts)
-    return Job(run, plan, places, known)
+    return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
 
 
 def _lines(command: Lines, run: Run) -> Job:
-    output = _output(command, run, "lines")
-    settings = command.parameters
+    output, settings = _output(command, run, "lines"), command.parameters
     if command.join_threshold is not None:
         # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
         settings = replace(settings, join_px=command.join_threshold * run.camera.scale_x)
     plan = FramePlan(run.camera, lines=settings)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
-    known = Known(lines=_frames(command.ids_from))
-    return Job(run, plan, places, known)
+    return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
 
 
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
-    camera = run.camera if isinstance(run, Run) else None
-    plan = FramePlan(camera, markers=command.parameters)
+    plan = FramePlan(run.camera if isinstance(run, Run) else None, markers=command.parameters)
     return Job(run, plan, {"markers": _output(command, run, "markers")})
 
 
 def _all(command: All, run: Run) -> Job:
     if command.output is not None:
-        make_folder(command.output)
+        command.output.mkdir(parents=True, exist_ok=True)
     places = {
         kind: run.output(kind) if command.output is None else command.output / f"detected.{kind}"
         for kind in ("lines", "tilt", "circles")
@@ -192,8 +188,8 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     if "lines" in places:
         print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
     if "tilt" in places and tilt is not None:
-        frames_tilt = frames_tilt_place(places["tilt"])
-        print(f"{frames_tilt}: the separate tilts of {found['tilts']} frames")
+        place = frames_tilt_place(places["tilt"])
+        print(f"{place}: the separate tilts of {found['tilts']} frames")
         print(f"{places['tilt']}: {tilt.sentence()}")
     elif "tilt" in places:
         others = _other_frames(job.plan, summary)
@@ -253,27 +249,23 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
     seen = summary.frames - summary.failed
-    hardly_any = seen >= _FEWEST_FRAMES and 3 * found["discs"] < seen
-    none = not found["discs"] and seen > 0
+    hardly_any = 3 * found["discs"] < seen and (seen >= _FEWEST_FRAMES or not found["discs"])
     run, settings = job.run, plan.circles
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
-    if hardly_any or none:
+    if hardly_any:
         yield from _hints_on_discs(run, settings, summary)
     elif found["discs"] >= seen >= _FEWEST_FRAMES:
-        yield from _hint_on_height(run, settings)
+        from detect.discs.radius import ratio_of_radii
 
-
-def _hint_on_height(run: Run, settings: CircleSettings) -> Iterator[str]:
-    from detect.discs.radius import ratio_of_radii
-
-    ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), run.camera, settings)
-    if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
-        yield (
-            f"the discs look {ratio:.2f} times as large as with a radius of {settings.radius_m:g} "
-            "m: if that is right, the camera is not as high as calibrated, or leans, and positions "
-            "are wrong by as much; measure the discs and its height"
-        )
+        ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), run.camera, settings)
+        if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
+            yield (
+                f"the discs look {ratio:.2f} times as large as with a radius of "
+                f"{settings.radius_m:g} m: if that is right, the camera is not as high as "
+                "calibrated, or leans, and positions are wrong by as much; measure the discs and "
+                "its height"
+            )
 
 
 def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:

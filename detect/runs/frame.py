@@ -8,7 +8,6 @@ compiler, and does not load them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_table
-from detect.discs.identity import ids_of_rows
+from detect.circles import CircleDetections, detect_circles, disc_table, ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (
@@ -159,17 +157,15 @@ def _path(
             by_frame = found.tilt if plan.levelling == "frame" else None
             settings = plan.circles
             if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
-                settings = _of_known_tilt(settings)
+                settings = replace(settings, tilt_sigma_deg=0.0)
             seen = _discs(image, camera, settings, search_of(camera, plan.circles, plan.lean))
             if plan.lean is None and by_frame is not None and settings.refine:
                 lean = lean_of_frame(by_frame)
                 if lean is not None:
-                    search = search_of(camera, plan.circles, lean)
-                    leaning = _discs(image, camera, settings, search)
+                    leaning = _discs(image, camera, settings, search_of(camera, plan.circles, lean))
                     seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
-            found.seen = found.discs = seen
-            if by_frame is not None:
-                found.discs = levelled(found.seen, camera, by_frame)
+            found.seen = seen
+            found.discs = seen if by_frame is None else levelled(seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run does so later
                 discs, by_verticals = found.discs, by_frame is not None
                 covariance = discs.covariance + common_covariance(
@@ -196,11 +192,6 @@ def _discs(
     leaning, table = search
     found = detect_circles(image, leaning, table, settings)
     return found if leaning == camera else as_calibrated(found, leaning, camera)
-
-
-@lru_cache(maxsize=4)
-def _of_known_tilt(settings: CircleSettings) -> CircleSettings:
-    return replace(settings, tilt_sigma_deg=0.0)
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
@@ -239,10 +230,9 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
     if found.error is not None:
         return rows_of_failure(task, found.error)
     try:
-        rows = _rows_by_kind(task, found, plan)
         return FrameRows(
             task.frame.step.prefix,
-            rows,
+            _rows_by_kind(task, found, plan),
             {
                 "discs": len(found.discs or ()),
                 "lines": len(found.lines or ()),
@@ -250,6 +240,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
                 "markers": len(found.markers or ()),
             },
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
+            evidence=0.0 if found.discs is None else float(np.nansum(found.discs.evidence)),
         )
     except COSTS_THE_FRAME as error:
         return rows_of_failure(task, reason_of(error, task))
@@ -275,7 +266,18 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
         discs = _disc_rows(found.discs, found.seen, task.known)
         rows["circles"] = head + note + _text(discs)
         if plan.json:
-            records = _disc_records(found.discs, discs)
+            seen = zip(discs, found.discs.pixels.tolist(), found.discs.evidence.tolist())
+            records = [
+                {
+                    "pixel": pixel,
+                    "x_m": row.px,
+                    "y_m": row.py,
+                    "quality": row.quality,
+                    "evidence": evidence if math.isfinite(evidence) else None,
+                    "covariance_m2": [row.cxx, row.cxy, row.cyy],
+                }
+                for row, pixel, evidence in seen
+            ]
             rows["json"] = json_record({"frame": step.prefix, "discs": records})
     if found.markers is not None:
         rows["markers"] = head + _text(found.markers.landmarks())
@@ -310,31 +312,9 @@ def _disc_rows(
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
 
 
-def _disc_records(
-    found: CircleDetections, rows: Sequence[CircleLandmark]
-) -> list[dict[str, object]]:
-    return [
-        {
-            "pixel": pixel,
-            "x_m": row.px,
-            "y_m": row.py,
-            "quality": row.quality,
-            "evidence": evidence if math.isfinite(evidence) else None,
-            "covariance_m2": [row.cxx, row.cxy, row.cyy],
-        }
-        for pixel, evidence, row in zip(found.pixels.tolist(), found.evidence.tolist(), rows)
-    ]
-
-
 def pays(leaning: float, evidence: float) -> bool:
     """Whether a search with the camera's lean finds clearly more evidence of discs."""
     return leaning > _MORE_EVIDENCE * evidence
-
-
-def evidence_of(frames: Iterable[FrameRows]) -> float:
-    """Total evidence of the discs in the rows of frames, which must include JSON."""
-    discs = [disc for rows in frames for disc in json.loads(rows.rows["json"]).get("discs", ())]
-    return sum(disc["evidence"] or 0.0 for disc in discs)
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:

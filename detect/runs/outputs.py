@@ -112,13 +112,12 @@ def _circles_text(job: Job) -> list[str]:
         "fitted to the grey values" if plan.circles.refine else "that of the pixel in the middle"
     )
     levelled = plan.levelling != "none" and (plan.lines or job.known.tilts is not None)
-    level = f"  positions are {LEVELLED}: # levelled <pitch> <roll>"
     return [
         f"Discs on the floor, detected by redetect {__version__}.",
         *(_ROBOT, _STEP, _odometry(job.run)),
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
-        *([level] if levelled else []),
+        *([f"  positions are {LEVELLED}: # levelled <pitch> <roll>"] if levelled else []),
         *([f"  {lean_sentence(plan.lean)}"] if plan.lean else []),
         *_calibration_text(plan.camera, plan.circles),
         *_made_with(plan, plan.circles),

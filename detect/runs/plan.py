@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import indent
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -40,19 +40,11 @@ from redetect.plane import rotation
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
 
-T_co = TypeVar("T_co", covariant=True)
-
 #: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
 Lean = tuple[float, float]
 
 #: Largest distance from the robot at which discs of a map are matched, metres.
 _REACH_M = 20.0
-
-
-class ByPrefix(Protocol[T_co]):
-    """Data on frames by the prefixes of their images: a dict, or a file that is read on demand."""
-
-    def get(self, prefix: str, /) -> T_co | None: ...
 
 
 class KnownOfFrame(NamedTuple):
@@ -69,12 +61,12 @@ class KnownOfFrame(NamedTuple):
 class Known:
     """Prior data on the frames of a run, by the prefixes of their images."""
 
-    tilts: ByPrefix[FrameTilt] | None = None  # of frames whose verticals are not detected
-    lines: ByPrefix[Frame] | None = None  # with IDs, transferred to rows of the same lines
-    discs: ByPrefix[Frame] | None = None  # the same for discs
+    tilts: Mapping[str, FrameTilt] | None = None  # of frames whose verticals are not detected
+    lines: FramesByImage | None = None  # with IDs, transferred to rows of the same lines
+    discs: FramesByImage | None = None  # the same for discs
     discs_level: bool = False  # whether these are corrected for the tilt
     #: Discs of a map: rows without an ID from `discs` get the ID of the one at their position.
-    mapped: ByPrefix[tuple[CircleLandmark, ...]] | None = None
+    mapped: MapByImage | None = None
 
     def of(self, prefix: str) -> KnownOfFrame:
         """Prior data on a frame."""
@@ -206,6 +198,7 @@ class FrameRows(NamedTuple):
     found: Mapping[str, int] = {}  # numbers of "discs", "lines", "tilts" and "markers"
     rejected: Mapping[str, int] = {}  # numbers of rejected candidates for markers, by cause
     error: str | None = None  # why there are no landmarks
+    evidence: float = 0.0  # sum over the discs
 
 
 @dataclass

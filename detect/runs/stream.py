@@ -51,7 +51,7 @@ from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
-_JOURNAL_VERSION = 7
+_JOURNAL_VERSION = 8
 
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
@@ -206,8 +206,7 @@ def detect_run(
         files = stack.enter_context(RunFiles(job))
         source = stack.enter_context(closing(iter(job.run.frames)))
         every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
-        tasks = files.take_over(every, count)
-        for frames in pool.detect_chunks(tasks, plan):
+        for frames in pool.detect_chunks(files.take_over(every, count), plan):
             files.add(frames)
             for _, rows in frames:
                 count(rows)
@@ -234,12 +233,7 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
         return plan
     if expected < LEAST_FRAMES:
         return plan
-    from detect.runs.frame import (  # loads the compiler
-        evidence_of,
-        pays,
-        searched_lean,
-        tilt_of_some,
-    )
+    from detect.runs.frame import pays, searched_lean, tilt_of_some  # loads the compiler
 
     step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
     tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]
@@ -247,7 +241,7 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
 
-    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run", json=True)
+    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
     rows = rows_by(level)
     tilt = tilt_of_some(camera, rows)
     if tilt is None:
@@ -256,19 +250,10 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(tilt.usual_rad), 2))
         plan = replace(plan, circles=circles)
     lean = searched_lean(tilt)
-    if lean is None or not pays(evidence_of(rows_by(replace(level, lean=lean))), evidence_of(rows)):
+    if lean is None:
         return plan
-    return replace(plan, lean=lean)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results, if there is none yet."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise DetectError(
-            f"{folder}: is not a folder: expected one, or the name of a new one"
-        ) from None
+    leaning = sum(each.evidence for each in rows_by(replace(level, lean=lean)))
+    return replace(plan, lean=lean) if pays(leaning, sum(each.evidence for each in rows)) else plan
 
 
 class RunFiles:
@@ -311,7 +296,13 @@ class RunFiles:
         self._resumes = self._job.resume and journal.is_by(self._made_by)
         complete = journal.complete()
         if complete is not None:
-            self._complete(*complete)
+            _log.info("renaming the files of a run that was killed at its very end")
+            numbers, overwrite = complete
+            for path, number in zip(self._paths, numbers):
+                part = left_part(path, number=number)
+                if part is not None:
+                    with part:
+                        part.replace(path, overwrite=overwrite)
         if self._resumes:
             self._journal = journal
             self._overwrite |= complete is not None  # the files are its own
@@ -324,15 +315,6 @@ class RunFiles:
             )
         else:
             _log.info("removing the journal of an unfinished run (--resume would continue it)")
-
-    def _complete(self, numbers: Sequence[int], overwrite: bool) -> None:
-        """Complete a run that was killed while its files were renamed."""
-        _log.info("renaming the files of a run that was killed at its very end")
-        for path, number in zip(self._paths, numbers):
-            part = left_part(path, number=number)
-            if part is not None:
-                with part:
-                    part.replace(path, overwrite=overwrite)
 
     def _begin(self) -> None:
         file = new_part(self._base, "journal", named=self._paths[0])

@@ -12,6 +12,7 @@ image that cannot be read.
 from __future__ import annotations
 
 import concurrent.futures
+import logging
 import multiprocessing
 import os
 import re
@@ -31,12 +32,7 @@ import cv2
 
 from detect.errors import WorkerError, imported_for
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
-from detect.terminal import (
-    announcements_are_shown,
-    on_compilation,
-    say_compiling,
-    show_announcements,
-)
+from detect.terminal import on_compilation, say_compiling, show_announcements
 from redetect.interrupts import interrupts_deferred, raise_if_interrupt_waits
 from redetect.messages import excerpt
 
@@ -209,7 +205,7 @@ def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Wo
     if jobs == 1:
         return Workers(lambda plan: _InProcess(plan, shared=shared), chunk, window=lambda: 1)
     window = 2 + _WINDOW_PER_WORKER * jobs
-    show = announcements_are_shown()
+    show = bool(logging.getLogger("redetect").handlers)
     return Workers(lambda plan: _ProcessPool(jobs, plan, show=show), chunk, lambda: window)
 
 

@@ -86,8 +86,7 @@ def messages(reader: AnyReader, path: Path, topic: str) -> Iterator[tuple[float,
     try:
         connections = [c for c in reader.connections if c.topic == topic]
         for connection, recorded_ns, content in reader.messages(connections):
-            message = reader.deserialize(content, connection.msgtype)
-            yield recorded_ns / 1e9, message
+            yield recorded_ns / 1e9, reader.deserialize(content, connection.msgtype)
             number += 1
     except Exception as error:  # as above
         raise DetectError(
@@ -222,7 +221,20 @@ class Bag(Source):
         beside = super().calibration(posed=posed)
         if beside is not None or posed:
             return beside
-        return _recorded_calibration(self.path, self.topic)
+        with opened_bag(self.path) as reader:
+            topics = sorted({c.topic for c in reader.connections if c.msgtype == _INFO})
+            # That of the images' namespace, or the only one.
+            own = self.topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+            if own not in topics and len(topics) != 1:
+                return None
+            topic = own if own in topics else topics[0]
+            found = next(messages(reader, self.path, topic), None)
+        name = f"{self.path}: {one_line(topic, LONGEST_NAME)}"
+        with understood(name):
+            # Drivers that are not calibrated publish a matrix of zeros.
+            if found is None or not np.any(_field(found[1], "k")):
+                return None
+            return _camera_of_info(found[1], name)
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
@@ -278,33 +290,6 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
             total = carried(total, before, pose) + grown
         yield replace(pose, covariance=total)
         before = pose
-
-
-def _recorded_calibration(path: Path, image_topic: str) -> Camera | None:
-    """The calibration in a bag for the camera of an image topic; None if there is none.
-
-    It has no pose.
-    """
-    with opened_bag(path) as reader:
-        topic = _info_topic(reader, image_topic)
-        if topic is None:
-            return None
-        name = f"{path}: {one_line(topic, LONGEST_NAME)}"
-        found = next(messages(reader, path, topic), None)
-    with understood(name):
-        # Drivers that are not calibrated publish a matrix of zeros.
-        if found is None or not np.any(_field(found[1], "k")):
-            return None
-        return _camera_of_info(found[1], name)
-
-
-def _info_topic(reader: AnyReader, image_topic: str) -> str | None:
-    """The camera_info of an image topic: that of its namespace, or the only one."""
-    topics = sorted({c.topic for c in reader.connections if c.msgtype == _INFO})
-    own = image_topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    if own in topics:
-        return own
-    return topics[0] if len(topics) == 1 else None
 
 
 def _camera_of_info(message: Any, name: str) -> Camera:

@@ -12,7 +12,6 @@ import re
 from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
@@ -115,14 +114,8 @@ class RunFrames(Frames):
     ships_images = False
     why_left_out = "images are not named by a STEP row: left out"
 
-    def __init__(
-        self,
-        images: ImageNames,
-        odometry: Path,
-        times: Mapping[str, float] = MappingProxyType({}),
-    ) -> None:
-        self._images, self._odometry = images, odometry
-        self._times = times
+    def __init__(self, images: ImageNames, odometry: Path, times: Mapping[str, float]) -> None:
+        self._images, self._odometry, self._times = images, odometry, times
         # Errors in the odometry are raised here, before any work is done.
         named = set()
         self.expected = 0

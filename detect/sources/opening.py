@@ -65,8 +65,11 @@ def open_source(
     camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
     frames: Frames
     odometry: Path | None
-    own = None if options.odometry or options.times else _own_odometry(name)
-    if own is not None and isinstance(source, ImageFiles):
+    # The odometry of a run folder in the data set's layout.
+    usual = name / f"{name.resolve().name}.txt", name / "map.circles"
+    own = next((path for path in usual if path.is_file()), None)
+    named = options.odometry or options.times
+    if own is not None and not named and isinstance(source, ImageFiles):
         frames, odometry, has_times = source.along(own), own, False
     else:
         frames, odometry = _frames(source, options)
@@ -84,12 +87,6 @@ def demand_recording(name: Path) -> None:
             f"{name}: its images are not those of the rows any more: expected a recording: a "
             "folder or pattern of images, a video or a bag"
         )
-
-
-def _own_odometry(folder: Path) -> Path | None:
-    """The odometry of a run folder in the data set's layout."""
-    usual = folder / f"{folder.resolve().name}.txt", folder / "map.circles"
-    return next((path for path in usual if path.is_file()), None)
 
 
 def _source(name: Path, options: SourceOptions) -> Source:

@@ -116,8 +116,7 @@ class LiveCamera(Source):
                         _log.info("the camera yields no more images: writing the results so far")
                         return
                     prefix = numbered_prefix(f"camera{self._index}", number)
-                    gray = gray_of_pixels(pixels, prefix)
-                    yield RunFrame(still(prefix), None, gray, time_s)
+                    yield RunFrame(still(prefix), None, gray_of_pixels(pixels, prefix), time_s)
         finally:
             capture.release()
 

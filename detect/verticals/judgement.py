@@ -94,8 +94,8 @@ def fit_and_judge(
     evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = Fate.NOT_VERTICAL
-    found = tilt if tilt.lines > 0 else None
-    return Judgement(fits, evidence, fate, doubtful, found, lines, edge)
+    consensus = tilt if tilt.lines > 0 else None
+    return Judgement(fits, evidence, fate, doubtful, consensus, lines, edge)
 
 
 # Kernels that are launched one after the other compile faster than nested ones.

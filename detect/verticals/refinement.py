@@ -72,8 +72,7 @@ def step_filters(settings: LineSettings) -> StepFilters:
     """Filters of the settings' steps and of the two contrasts."""
     sigmas = [sigma for sigma, _ in settings.refine_steps_px]
     half = [_half(sigma) for sigma in sigmas]
-    widest = 2 * max(half, default=0)
-    weights = np.zeros((len(sigmas), 2, SUBPIXELS, widest))
+    weights = np.zeros((len(sigmas), 2, SUBPIXELS, 2 * max(half, default=0)))
     for own, sigma, h in zip(weights, sigmas, half):
         own[..., : 2 * h] = gaussian_steps(sigma, h)[1:]
     # Both contrasts use the same pixels, some with weight 0.
@@ -97,8 +96,7 @@ def _half(sigma: float) -> int:
 
 def gaussian_steps(sigma: float, half: int) -> FloatArray:
     """(3, SUBPIXELS, 2 half) weights of a step's height, and of its derivatives times sigma^2."""
-    position = (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
-    d = np.arange(-half + 1, half + 1) - position
+    d = np.arange(-half + 1, half + 1) - (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
     q = (d / sigma) ** 2
     gaussian = np.exp(-0.5 * q)
     weights = np.stack(

@@ -194,12 +194,8 @@ def _take_chain(
     strip: Strip, starts: LineStarts, start: int, column: FloatArray, score: Float32Array
 ) -> float:
     """Points on the straight lines between the maxima of a chain; returns the chain's lean."""
-    row, place, value, rise = (
-        starts.row,
-        starts.column,
-        starts.value,
-        strip.rise[int(starts.column[start])],
-    )
+    row, place, value = starts.row, starts.column, starts.value
+    rise = strip.rise[int(place[start])]
     v, k = row[start], start
     column[v], score[v] = place[k], abs(value[k])
     n, x, y, xx, xy = 1.0, 0.0, 0.0, 0.0, 0.0

@@ -278,10 +278,8 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
 
 def _bmp_size(content: bytes) -> tuple[int, int]:
     (header_bytes,) = struct.unpack_from("<I", content, 14)
-    if header_bytes == 12:  # that of OS/2
-        width, height = struct.unpack_from("<HH", content, 18)
-    else:
-        width, height = struct.unpack_from("<ii", content, 18)
+    numbers = "<HH" if header_bytes == 12 else "<ii"  # the former of OS/2
+    width, height = struct.unpack_from(numbers, content, 18)
     return abs(width), abs(height)  # a negative height: rows from the top
 
 

@@ -61,11 +61,10 @@ def demand_writable(path: Path) -> None:
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
     """Reject outputs that could not be written later; folders may be created later."""
     for path in paths:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if path.exists() and not overwrite:
-            raise OutputExistsError(path)
-        demand_writable(path)
+        if path.parent.is_dir():
+            demand_place(path, overwrite=overwrite)
+        else:
+            demand_writable(path)
 
 
 class PartFile(AbstractContextManager["PartFile"]):

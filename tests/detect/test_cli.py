@@ -192,7 +192,7 @@ def test_outputs_into_no_folder(small_run: Path, capsys: Captured, flag: str) ->
         (["lines", "RUN", "-o", "."], "is a folder: expected an output file"),
         (["all", "RUN", "-o", "RUN/s.cam"], "s.cam: is not a folder"),
         (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam"], "s.cam: is not a folder"),
-        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "x: is not a folder"),
+        (["circles", "RUN", "-o", "X/rows", "--draw", "RUN/s.cam/x"], "s.cam: is not a folder"),
     ],
 )
 @pytest.mark.parametrize("force", [(), ("--force",)])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.discs.identity import ids_of_rows, matched
+from detect.circles import ids_of_rows
 from redetect.landmarks import CircleLandmark
 
 #: Two standard deviations of which 99.9 % of two-dimensional errors are nearer.
@@ -33,25 +33,19 @@ def test_shuffled_discs_keep_their_ids(seed: int, count: int, dropped: int) -> N
 
 
 @given(seed=st.integers(0, 2**31))
-def test_one_disc_gives_its_id_to_one(seed: int) -> None:
+def test_one_disc_gives_its_id_to_one_within_the_gate(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    xy, known = rng.uniform(0.0, 0.3, (8, 2)), rng.uniform(0.0, 0.3, (6, 2))
-    spread = np.tile(0.05**2 * np.eye(2), (8, 1, 1))
+    xy, known = rng.uniform(0.0, 0.1, (8, 2)), rng.uniform(0.0, 0.1, (6, 2))
 
-    found = matched(xy, spread, known, spread[:6])
+    ids = ids_of_rows(xy, [row(x, y, k) for k, (x, y) in enumerate(known.tolist())])
 
-    own = found[found >= 0]
-    assert len(set(own.tolist())) == len(own)
-    # No two that are left over are within the gate, and no pair would rather have each other.
-    distance = np.linalg.norm(xy[:, None] - known, axis=-1) / (0.05 * math.sqrt(2.0))
-    partner = np.full(6, -1)
-    partner[own] = np.flatnonzero(found >= 0)
-    for n in range(8):
-        for m in range(6):
-            if distance[n, m] < GATE:
-                mine = distance[n, found[n]] if found[n] >= 0 else GATE
-                theirs = distance[partner[m], m] if partner[m] >= 0 else GATE
-                assert distance[n, m] >= min(mine, theirs)
+    given_to = {own[0]: n for n, own in enumerate(ids) if own}
+    assert len(given_to) == sum(map(bool, ids))
+    near = np.linalg.norm(xy[:, None] - known, axis=-1) < 0.01 * GATE
+    assert all(near[n, k] for k, n in given_to.items())
+    # No two that are left over are within the gate.
+    alone = [n for n in range(8) if not ids[n]], [k for k in range(6) if k not in given_to]
+    assert not near[np.ix_(*alone)].any()
 
 
 @pytest.mark.parametrize(("off", "expected"), [(GATE - 0.01, (5,)), (GATE + 0.01, ())])
@@ -63,6 +57,11 @@ def test_the_gate_counts_all_that_is_stated(off: float, expected: tuple[int, ...
     ids = ids_of_rows(floor_xy, [disc], np.array([0.03**2 * np.eye(2)]), 0.12)
 
     assert ids == [expected]
+
+
+def test_a_row_without_a_usable_covariance_matches_nothing() -> None:
+    disc = CircleLandmark(0.0, -2.0, 0.0, 1.0, 2.0, 1.0, (5,))
+    assert ids_of_rows(np.array([[0.01, -2.01]]), [disc]) == [()]
 
 
 def test_nothing_is_known_of_nothing() -> None:

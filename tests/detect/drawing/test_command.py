@@ -207,10 +207,10 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     (small_run / "detected.circles").write_text("STEP s.0000 0 0 0 0 0 0 0 0 0\n")
     assert_refused(["draw", run], small_run, "--video", capsys)
     assert_refused(["draw", run, "-o", out, "--rows", "no"], small_run, "no/detected", capsys)
-    assert_refused(["draw", run, "-o", out, "--fps", "0"], small_run, "fps", capsys)
-    with pytest.raises(SystemExit):
-        main(["draw", run, "-o", out, "--every", "0"])
-    assert "every is 0: expected a whole number" in " ".join(capsys.readouterr().err.split())
+    for flag, expected in (("every", "a whole number"), ("fps", "above 0")):
+        with pytest.raises(SystemExit):
+            main(["draw", run, "-o", out, f"--{flag}", "0"])
+        assert f"{flag} is 0: expected {expected}" in " ".join(capsys.readouterr().err.split())
     video = tmp_path / "v.mp4"
     fast = ["draw", run, "--video", str(video), "--fps", "1e9"]
     assert_refused(fast, small_run, "expected another --fps", capsys)

@@ -354,7 +354,9 @@ def test_refusals(judged_run: Path, tmp_path: Path, capsys: Captured) -> None:
     run, page = str(judged_run), tmp_path / "r.html"
     report = ["report", run, "-o", str(page)]
     capsys.readouterr()
-    assert_refused([*report, "--worst", "-1"], judged_run, "worst", capsys)
+    with pytest.raises(SystemExit):
+        main([*report, "--worst", "-1"])
+    assert "worst is -1: expected a whole number" in capsys.readouterr().err
     assert_refused([*report, "--reference", "no.circles"], judged_run, "no.circles", capsys)
     assert_refused([*report, "--rows", str(tmp_path)], judged_run, "detect all", capsys)
     page.write_bytes(b"mine")
