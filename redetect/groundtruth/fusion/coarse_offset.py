@@ -189,7 +189,7 @@ class _Compared:
         return np.asarray(np.where(known, np.square(apart) @ self.weights, np.inf))
 
     def errors(self, steps: IntArray) -> FloatArray:
-        """(K,) mean squared normalised errors at offsets of so many steps (K,); infinite where
+        """(K,) mean squared normalised errors at offsets `steps` (K,) of the grid; infinite where
         too few movements are compared.
         """
         single = self.single_errors(steps)
