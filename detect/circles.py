@@ -11,7 +11,6 @@ position.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -28,8 +27,8 @@ from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
 from detect.discs.rim_network import Networks, trained_networks
-from detect.errors import DetectError, FrameError
-from detect.grey_values import blank_margins, estimate_noise, steep_gradient
+from detect.errors import DetectError
+from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
 from detect.settings import CircleSettings, Polarity
 from lut import (
     DiscShape,
@@ -41,7 +40,6 @@ from lut import (
 )
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
-from redetect.landmarks import CircleLandmark, associate, circle_arrays, squared_mahalanobis
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -54,8 +52,6 @@ _NOISE_ROWS = 16
 #: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
 _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 
-#: Gate of IDs: chi-squared of two degrees of freedom exceeds this once in a thousand.
-_GATE = 2.0 * math.log(1000.0)
 
 #: A camera in the form that kernels take.
 _numbers = lru_cache(maxsize=4)(camera_numbers)
@@ -105,18 +101,14 @@ def detect_circles(
     Raises
     ------
     FrameError
-        If the image does not have the camera's size.
+        If the image is not an 8-bit grey image of the camera's size.
     DetectError
         If the table belongs to the other detector.
     """
     if isinstance(table, DiscTable) == settings.refine:
         owner = "the published detector" if settings.refine else "the default detector"
         raise DetectError(f"the table is for {owner}: expected disc_table(camera, settings)")
-    if image.shape != (camera.height, camera.width):
-        raise FrameError(
-            f"the image is {image.shape[1]}x{image.shape[0]} px: "
-            f"the calibration is for {camera.width}x{camera.height}"
-        )
+    image = plain_image(image, (camera.height, camera.width))
     if isinstance(table, DiscTable):
         return _by_quality(image, camera, table, settings)
     left, right = blank_margins(image)
@@ -303,28 +295,3 @@ def refined_covariance(
             tilt_sigma_rad**2,
         )
     )
-
-
-def ids_of_rows(
-    xy: FloatArray,
-    rows: Sequence[CircleLandmark],
-    covariance: FloatArray | None = None,
-    slack_m: float = 0.0,
-) -> list[tuple[int, ...]]:
-    """IDs of discs, from rows of the same discs in the same frame; () for discs without a row.
-
-    If the rows are not corrected for the tilt, the discs (N, 2) must not be either: then both refer
-    to the same pixels, whatever the tilt, and the discs' own covariance is not used. `slack_m` is
-    the standard deviation, per axis, of errors that no covariance includes.
-    """
-    known = circle_arrays(rows)
-    spread = known.covariance + slack_m**2 * np.eye(2)
-    if covariance is not None:
-        spread = spread + covariance[:, None]
-    distance = squared_mahalanobis(xy[:, None] - known.xy, spread)
-    # Below 0 where a covariance is not positive definite.
-    pairs = associate(distance, (distance >= 0.0) & (distance <= _GATE))
-    ids: list[tuple[int, ...]] = [()] * len(xy)
-    for disc, row in zip(pairs.first, pairs.second):
-        ids[disc] = rows[row].ids
-    return ids

@@ -1,9 +1,10 @@
-"""Properties of an image from grey values alone: its noise, and blank columns at its sides."""
+"""Grey values of an image: its form for kernels, its noise, and blank columns at its sides."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from detect.errors import FrameError
 from redetect.array_types import GreyImage, IntArray
 from redetect.compiled import kernel
 
@@ -23,6 +24,25 @@ _COLUMNS = 8
 _LARGEST_SHARE = 0.05
 #: Spacing of the rows in which margins are searched for.
 _ROWS_APART = 4
+
+
+def plain_image(image: GreyImage, shape: tuple[int, int] | None = None) -> GreyImage:
+    """The image in the form for which kernels are compiled: row by row, and writeable.
+
+    It is copied if it is not; for a read-only one, Numba would compile every kernel once more.
+    Raises `FrameError` if it is not (H, W) uint8, or not of a calibration's `shape`.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise FrameError(
+            f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 of "
+            "shape (H, W)"
+        )
+    if shape is not None and image.shape != shape:
+        raise FrameError(
+            f"the image is {image.shape[1]}x{image.shape[0]} px: "
+            f"the calibration is for {shape[1]}x{shape[0]}"
+        )
+    return np.require(image, requirements=["C", "W"])
 
 
 def estimate_noise(image: GreyImage, most_rows: int | None = None) -> float:

@@ -21,7 +21,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from detect.errors import FrameError
+from detect.grey_values import plain_image
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.joining import Lines, lines_of_tracks
@@ -103,14 +103,10 @@ def detect_lines(
     Raises
     ------
     FrameError
-        If the image does not have the table's size or 8 bit grey values.
+        If the image is not an 8-bit grey image of the table's size.
     """
-    if image.shape != table.column.shape or image.dtype != np.uint8:
-        raise FrameError(
-            f"image is {image.dtype} of shape {image.shape}: expected uint8 of the table's shape "
-            f"{table.column.shape}"
-        )
-    image = np.ascontiguousarray(image)
+    height, width = table.column.shape
+    image = plain_image(image, (height, width))
     strip, window, band, steps, numbers = _prepared(table, settings)
     response = band_response(image, band, settings.regulariser)
     starts = line_starts(response, band, settings.threshold)

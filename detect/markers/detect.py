@@ -169,7 +169,7 @@ def detect_markers(
     DetectError
         If there is no such dictionary, or it lacks an expected ID.
     FrameError
-        If the image's size differs from the camera's.
+        If the image is not an 8-bit grey image of the camera's size.
     """
     templates = templates_of(settings.dictionary, settings.ids)
     picture = picture_of(image, camera)

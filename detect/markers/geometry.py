@@ -20,7 +20,7 @@ import numpy as np
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.grey_values import estimate_noise
+from detect.grey_values import estimate_noise, plain_image
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
@@ -67,16 +67,11 @@ class Picture:
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
     """An image (H, W) with its noise and the distortion of its lens.
 
-    Raises FrameError if the image's size differs from the camera's, or the calibration has no
-    direction for some of its pixels.
+    Raises FrameError if the image is not an 8-bit grey image of the camera's size, or the
+    calibration has no direction for some of its pixels.
     """
-    if camera is not None and image.shape != (camera.height, camera.width):
-        raise FrameError(
-            f"the image is {image.shape[1]}x{image.shape[0]} px: "
-            f"the calibration is for {camera.width}x{camera.height}"
-        )
-    height, width = image.shape
-    grey = np.ascontiguousarray(image)
+    grey = plain_image(image, None if camera is None else (camera.height, camera.width))
+    height, width = grey.shape
     noise = estimate_noise(grey, _NOISE_ROWS)
     return Picture(grey, noise, camera, _straight_positions(camera, width, height))
 

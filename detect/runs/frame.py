@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_table, ids_of_rows
+from detect.circles import CircleDetections, detect_circles, disc_table
+from detect.discs.identity import ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
 from detect.levelling import (

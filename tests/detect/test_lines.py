@@ -308,12 +308,9 @@ def test_blank_images_give_nothing(value: int) -> None:
     assert (len(found), found.tilt, found.landmarks(), found.fate) == (0, None, (), ())
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((160, 241), np.uint8), np.zeros((160, 240), np.float64)]
-)
-def test_wrong_images_are_refused(image: np.ndarray) -> None:
-    with pytest.raises(FrameError, match=r"image is .* expected uint8 of the table's shape"):
-        detect_lines(image, TABLE)
+def test_wrong_images_are_refused() -> None:
+    with pytest.raises(FrameError, match="is 241x160 px: the calibration is for 240x160"):
+        detect_lines(np.zeros((160, 241), np.uint8), TABLE)
 
 
 # -- drawings ---------------------------------------------------------------------------------

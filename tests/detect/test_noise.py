@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import typeof
 from numpy.typing import NDArray
 
-from detect.grey_values import estimate_noise
+from detect.errors import FrameError
+from detect.grey_values import estimate_noise, plain_image
 
 SHAPE = (288, 768)
 
@@ -97,3 +101,30 @@ def test_some_rows_tell_nearly_as_much_as_all() -> None:
     assert estimate_noise(image, 96) == pytest.approx(estimate_noise(image), rel=0.05)
     # Of an image that has no more rows, all are looked at.
     assert estimate_noise(image[:60], 96) == estimate_noise(image[:60])
+
+
+def read_only(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    image = image.copy()
+    image.flags.writeable = False
+    return image
+
+
+@pytest.mark.parametrize(
+    "seen", [read_only, np.asfortranarray, lambda image: np.repeat(image, 2, axis=1)[:, ::2]]
+)
+def test_kernels_get_one_kind_of_image(
+    seen: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
+) -> None:
+    image = noisy(plane(), 2.0)
+    plain = plain_image(seen(image), SHAPE)
+    assert typeof(plain) == typeof(image)
+    np.testing.assert_array_equal(plain, image)
+    assert plain_image(image) is image
+
+
+@pytest.mark.parametrize("image", [np.zeros(9), np.zeros(SHAPE), np.zeros((*SHAPE, 3), np.uint8)])
+def test_other_arrays_are_no_images(image: NDArray[np.uint8]) -> None:
+    with pytest.raises(
+        FrameError, match=r"the image is \w+ of shape .*: expected grey values, uint8"
+    ):
+        plain_image(image)
