@@ -111,11 +111,9 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
             f"{np.degrees(segment.aligned_heading_rms_rad):.2f} degrees"
         )
     if fusion.pauses_s:
-        begin, end = max(fusion.pauses_s, key=lambda pause: pause[1] - pause[0])
         warn(
-            f"{options.odometry}: {len(fusion.pauses_s)} pauses, the longest from "
-            f"{begin:.3f} s to {end:.3f} s on the ground truth's clock: the robot's path there is "
-            "unknown, and covariances are increased"
+            f"{options.odometry}: {len(fusion.pauses_s)} pauses, {_longest(fusion.pauses_s)}: the "
+            "robot's path there is unknown, and covariances are increased"
         )
 
 
@@ -135,9 +133,13 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
                 f"and {options.odometry}: the clock, or the poses, may be wrong"
             )
     if fusion.slips_s:
-        begin, end = max(fusion.slips_s, key=lambda slip: slip[1] - slip[0])
         warn(
-            f"{options.odometry}: contradicts the measured poses {len(fusion.slips_s)} "
-            f"times, as after a slip of the wheels, the longest from {begin:.3f} s to {end:.3f} s "
-            "on the ground truth's clock"
+            f"{options.odometry}: contradicts the measured poses {len(fusion.slips_s)} times, as "
+            f"after a slip of the wheels, {_longest(fusion.slips_s)}"
         )
+
+
+def _longest(intervals: Sequence[tuple[float, float]]) -> str:
+    """The longest of some intervals (s), in words."""
+    begin, end = max(intervals, key=lambda interval: interval[1] - interval[0])
+    return f"the longest from {begin:.3f} s to {end:.3f} s on the ground truth's clock"
