@@ -31,7 +31,6 @@ copyright = "the authors of redetect, BSD-3-Clause"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 
 # --- Pages in Markdown ---------------------------------------------------------------------------
-exclude_patterns = ["benchmark/table.md"]  # a part of speed.md
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 #: Headings that links may name, as GitHub names them.
 myst_heading_anchors = 4

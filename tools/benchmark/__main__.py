@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numba
@@ -39,7 +40,7 @@ from tools.benchmark.material import (
     scaled_picture,
     wall_with_edges,
 )
-from tools.benchmark.timing import decodings, measure_in_turn, number, spread
+from tools.benchmark.timing import decodings, measure_in_turn, number, quartiles, spread
 from tools.evaluation.figures import Figures, Study, run_quietly, study_main
 from tools.evaluation.tables import Table
 
@@ -86,32 +87,33 @@ class Benchmark(Study):
             for name, value in given.items()
         )
         print(f"- {this_machine()}\n- settings: {', '.join(settings)}\n")
-        print("Median processor time per image, relative to decoding the same image "
-              "(quartiles; milliseconds):\n")  # fmt: skip
-        self._print_table(self._kinds(run))
-        print("\nBy size of the image, Mpixel:\n")
-        self._print_table(self._sizes(run))
         seeds = range(self.seed, self.seed + _GROWTH_PICTURES)
         places = disc_places(run.camera, max(self.landmarks, default=0), self.seed)
+        print("Median processor time per image, relative to decoding the same image "
+              "(quartiles; milliseconds):\n")  # fmt: skip
+        kinds = self._times(self._kinds(run))
+        print("\nBy size of the image, Mpixel:\n")
+        sizes = self._times(self._sizes(run))
         print("\nBy number of discs in the image:\n")
-        self._print_table(
+        discs = self._times(
             (str(n), [jpeg_picture(floor_with_discs(run.camera, places[:n], s)) for s in seeds],
              detectors)
             for n in self.landmarks
         )  # fmt: skip
         print("\nBy number of vertical edges in the image:\n")
-        self._print_table(
+        edges = self._times(
             (str(n), [jpeg_picture(wall_with_edges(run.camera, n, s)) for s in seeds], detectors)
             for n in self.landmarks
         )
         print("\nWhole runs, from files to files, by wall clock; for comparison, one core that "
               "only decodes the same files, or reads and decodes them:\n")  # fmt: skip
-        head = ("command", "frames", "jobs", "images/s", "of decoding", "of reading and decoding",
-                "times one job", "decoding alone", "with reading")  # fmt: skip
-        table = Table(dict.fromkeys(head, "<"), keys=3)
+        table = Table(dict.fromkeys(RunSpeed._fields, "<"))
+        runs = []
         for row in self._runs(run):
-            table.row(*row)
-        return table.figures
+            table.row(*row.cells())
+            runs.append(row._asdict())
+        return {"machine": this_machine(), "kinds": kinds, "sizes": sizes,
+                "discs": discs, "edges": edges, "runs": runs}  # fmt: skip
 
     def _kinds(self, run: Run) -> Cases:
         everything = {**f.all_detectors(run.camera), **f.peers()}
@@ -128,8 +130,8 @@ class Benchmark(Study):
             scaled = [scaled_picture(picture, camera, self.seed) for picture in frames]
             yield f"{camera.width * camera.height / 1e6:.6g}", scaled, f.whole_detectors(camera)
 
-    def _print_table(self, cases: Cases) -> None:
-        """Times of functions, alternating with decoding, a column per case."""
+    def _times(self, cases: Cases) -> Figures:
+        """Print the times of functions, alternating with decoding, and return them by case."""
         columns = {}
         for case, pictures, functions in cases:
             print(f"{case}: {len(pictures)} pictures", file=sys.stderr, flush=True)
@@ -139,9 +141,11 @@ class Benchmark(Study):
             columns[case] = decodings(seconds, f.DECODING)
         table = Table(dict.fromkeys(["", *columns], "<"))
         for name in next(iter(columns.values()), {}):
-            table.row(name, *(column[name] for column in columns.values()))
+            each = [column[name] for column in columns.values()]
+            table.row(name, *(f"{spread(times)}; {number(times['ms'])} ms" for times in each))
+        return columns
 
-    def _runs(self, run: Run) -> Iterator[list[str]]:
+    def _runs(self, run: Run) -> Iterator[RunSpeed]:
         """Whole runs: all commands once, and `detect all` over growing lengths and jobs."""
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
@@ -156,6 +160,31 @@ class Benchmark(Study):
                 yield from measure_runs(growing, by_jobs, folder, self.run_rounds)
 
 
+class RunSpeed(NamedTuple):
+    """The speed of a command on a run: images per second, and times relative to decoding alone.
+
+    Quartiles are those of `tools.benchmark.timing.quartiles`, per job, within the same round.
+    """
+
+    command: str
+    frames: int
+    jobs: int
+    per_s: float
+    of_decoding: dict[str, float]
+    of_reading: dict[str, float]  #: of reading and decoding
+    times_one_job: float | None
+    decoding_per_s: float
+    reading_per_s: float
+
+    def cells(self) -> list[object]:
+        """Numbers as texts."""
+        return [
+            spread(value) if isinstance(value, dict)
+            else number(value) if isinstance(value, float) else value
+            for value in self
+        ]  # fmt: skip
+
+
 def perform(command: f.Command) -> None:
     """Execute a command like ``detect``, but silently."""
     run_quietly("detect", lambda: PROGRAM.carry_out(command))
@@ -167,11 +196,8 @@ def _on_each(function: f.Function, pictures: Sequence[Picture]) -> Callable[[int
 
 def measure_runs(
     run: Path, chosen: Sequence[tuple[str, int]], folder: Path, rounds: int
-) -> Iterator[list[str]]:
-    """Rows of the table of whole runs: commands by name and jobs, alternating with decoding.
-
-    Shares of decoding are per job, within the same round.
-    """
+) -> Iterator[RunSpeed]:
+    """Speeds of whole runs: commands by name and jobs, alternating with decoding."""
     print(f"whole runs: {run}", file=sys.stderr, flush=True)
     paths = [frame.image for frame in open_run(run).frames if frame.image is not None]
     files = contents_of(paths)
@@ -195,10 +221,10 @@ def measure_runs(
     alone = [seconds["decoding"], seconds["reading"]]
     for name, jobs in chosen:
         taken, one_job = seconds[f"{name} {jobs}"], seconds.get(f"{name} 1")
-        rates = [number(len(paths) / float(np.nanmedian(of))) for of in (taken, *alone)]
-        gain = "" if one_job is None else number(float(np.nanmedian(one_job / taken)))
-        shares = [spread(of / taken / jobs) for of in alone]
-        yield [f"`{name}`", f"{len(paths)}", f"{jobs}", rates[0], *shares, gain, *rates[1:]]
+        per_s, decoded, read = (len(paths) / float(np.nanmedian(of)) for of in (taken, *alone))
+        of_decoding, of_reading = (quartiles(of / taken / jobs) for of in alone)
+        gain = None if one_job is None else float(np.nanmedian(one_job / taken))
+        yield RunSpeed(name, len(paths), jobs, per_s, of_decoding, of_reading, gain, decoded, read)
 
 
 def this_machine() -> str:

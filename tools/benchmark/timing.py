@@ -56,21 +56,26 @@ def measure_in_turn(
     return seconds
 
 
-def decodings(seconds: Mapping[str, FloatArray], reference: str) -> dict[str, str]:
+def decodings(seconds: Mapping[str, FloatArray], reference: str) -> dict[str, dict[str, float]]:
     """By function: its time over that of a reference on the same image in the same round.
 
-    Median (quartiles) of these ratios, and the median time in milliseconds.
+    Quartiles of these ratios, and the median time in milliseconds (`ms`).
     """
     return {
-        name: f"{spread(taken / seconds[reference])}; {number(1e3 * float(np.nanmedian(taken)))} ms"
+        name: {**quartiles(taken / seconds[reference]), "ms": 1e3 * float(np.nanmedian(taken))}
         for name, taken in seconds.items()
     }
 
 
-def spread(values: FloatArray) -> str:
-    """Median and quartiles of some values; NaN are ignored."""
-    lower, median, upper = map(number, np.nanpercentile(values, [25.0, 50.0, 75.0]).tolist())
-    return f"{median} ({lower} - {upper})"
+def quartiles(values: FloatArray) -> dict[str, float]:
+    """The quartiles `lower`, `median` and `upper` of some values; NaN are ignored."""
+    found = np.nanpercentile(values, [25.0, 50.0, 75.0]).tolist()
+    return dict(zip(("lower", "median", "upper"), found))
+
+
+def spread(found: Mapping[str, float]) -> str:
+    """Quartiles as text: the median, and the others in brackets."""
+    return f"{number(found['median'])} ({number(found['lower'])} - {number(found['upper'])})"
 
 
 def number(value: float) -> str:

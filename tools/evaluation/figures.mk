@@ -9,15 +9,15 @@ BIN ?= .venv/bin
 DATA ?= ../shared/data
 RUN_E ?= $(DATA)/dlr/e
 SHIPPED ?= $(DATA)/dlr/map.circles
-EVALUATE := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tools.evaluation
+PYTHON := OPENBLAS_NUM_THREADS=1 $(BIN)/python
 MADE := build/figures
 CODE := $(shell git ls-files 'camera/*.py' 'detect/*.py' 'detect/*.npz' 'lut/*.py' 'redetect/*.py' 'tools/*.py')
 
-# The studies: half an hour on two busy cores, of which fusion and markers-frames take six minutes each, poses four, tilt-tilted and
+# The studies: half an hour on two busy cores, of which speed, fusion and markers-frames take six minutes each, poses four, tilt-tilted and
 # markers more than two, association, markers-photographs and real-run one to two.
 FIGURES ?= accuracy photographs buildings buildings-published buildings-report rendered-r1 rendered-r2 disturbed \
     demo sight-r1 sight-r2 tutorial real-run tilt-of-discs tilt-demo tilt-tilted tilt-room tilt-down soft \
-    markers markers-frames markers-photographs markers-timing poses fusion association map-speed
+    markers markers-frames markers-photographs markers-timing poses fusion association map-speed speed
 
 accuracy = accuracy
 photographs = photographs $(DATA)/discs
@@ -68,16 +68,18 @@ poses = programs 'tools.simulator marker-session @/session --session.steps 40 --
 fusion = fusion --seeds 20
 association = association $(SHIPPED) --sigma-scale 1.4
 map-speed = map-speed $(SHIPPED)
+speed = --photographs $(DATA)/discs --frames 80 1600 16000 --factors 1 2 3 5 --landmarks 0 10 30 --pictures 8 --rounds 5 --budget-s 1
 
+command = $(if $(filter speed,$*),benchmark,evaluation) $($*)
 needs = $(firstword $(filter $(DATA)% $(RUN_E)% $(SHIPPED),$(subst ', ,$($*))))
 
 .PHONY: figures
 figures: $(FIGURES:%=$(MADE)/%.json)
-	$(EVALUATE) documents
+	$(PYTHON) -m tools.evaluation documents
 
 $(MADE)/%.json: $(CODE)
 	@mkdir -p $(MADE)
-	@if test -e $(or $(needs),.); then echo "$*: $(subst ','\'',$($*))"; begin=$$(date +%s); \
-	    $(EVALUATE) $($*) --figures $@ > $(MADE)/$*.log || { cat $(MADE)/$*.log; exit 1; }; \
+	@if test -e $(or $(needs),.); then echo "$*: $(subst ','\'',$(command))"; begin=$$(date +%s); \
+	    $(PYTHON) -m tools.$(command) --figures $@ > $(MADE)/$*.log || { cat $(MADE)/$*.log; exit 1; }; \
 	    cp $@ docs/figures/; echo "$*: $$(($$(date +%s) - begin)) s"; \
 	else echo "$*: left as it is: there is no $(needs)"; fi

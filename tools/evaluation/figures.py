@@ -25,6 +25,7 @@ from redetect.command_line import exit_code_of
 from redetect.groundtruth.files import write_json
 from redetect.interface.tables import plain
 from redetect.storage import write_bytes
+from tools.benchmark.timing import number
 
 #: Figures by name, or further figures by theirs.
 Figures = Mapping[str, Any]
@@ -126,7 +127,7 @@ def documents(root: Path) -> dict[Path, str]:
     environment = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
-    environment.filters.update(to=_formatted, degrees=math.degrees)
+    environment.filters.update(to=_formatted, degrees=math.degrees, number=number)
     files = sorted((root / "docs/figures").glob("*.json"))
     figures = {f.stem.replace("-", "_"): json.loads(f.read_text("utf-8"))["figures"] for f in files}
     templates = [root / "README.md.jinja", *sorted((root / "docs").rglob("*.md.jinja"))]

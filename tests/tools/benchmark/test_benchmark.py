@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from detect.sources.opening import open_run
 from tools.benchmark.__main__ import main, measure_runs, perform
 from tools.benchmark.functions import ALL, CIRCLES, DECODING, KERNEL, LINES, RESPONSE, commands
 from tools.benchmark.material import repeated_run, run_pictures, scaled_camera, scaled_picture
+from tools.benchmark.timing import number
 from tools.evaluation.figures import StudyError
 
 
@@ -26,8 +28,8 @@ def test_a_pass_over_a_run_writes_what_the_command_writes(short_run: Path, tmp_p
     output.mkdir()
     every = [(name, 1) for name in commands(short_run, output)]
     rows = list(measure_runs(short_run, every, output, 1))
-    assert [row[:3] for row in rows] == [[f"`{name}`", "2", "1"] for name, _ in every]
-    assert all(float(row[3].replace(",", "")) > 0.0 for row in rows)
+    assert [row[:3] for row in rows] == [(name, 2, 1) for name, _ in every]
+    assert all(row.per_s > 0.0 for row in rows)
     written = {path.name for path in output.iterdir()}
     assert {"published.circles", "detected.circles", "detected.lines", "detected.tilt"} <= written
 
@@ -53,8 +55,8 @@ def reduced_run(project_root: Path, tmp_path: Path) -> Path:
     camera = scaled_camera(run.camera, 0.5)
     (tmp_path / "images").mkdir()
     write_camera(camera, tmp_path / "reduced.cam")
-    for number, picture in enumerate(run_pictures(run, 2)):
-        scaled_picture(picture, camera, 0).encoded.tofile(tmp_path / "images" / f"{number}.jpg")
+    for k, picture in enumerate(run_pictures(run, 2)):
+        scaled_picture(picture, camera, 0).encoded.tofile(tmp_path / "images" / f"{k}.jpg")
     return tmp_path
 
 
@@ -67,7 +69,8 @@ def test_the_command_measures_everything(
         "--pictures", "1", "--rounds", "1", "--run-rounds", "1", "--run-frames", "3",
         "--factors", "0.5", "1", "--landmarks", "0", "3", "--frames", "1", "2", "--jobs", "1",
     ]  # fmt: skip
-    assert main(arguments) == 0
+    figures = reduced_run / "speed.json"
+    assert main([*arguments, "--figures", str(figures)]) == 0
     out = capsys.readouterr().out
     assert f"numpy {np.__version__}" in out
     tables = [
@@ -86,8 +89,13 @@ def test_the_command_measures_everything(
         [192 * 72 / 1e6, 384 * 144 / 1e6]
     )
     assert discs[0] == verticals[0] == ["", "0", "3"]
-    whole = [f"`{name}`" for name in commands(reduced_run, reduced_run)]
+    whole = list(commands(reduced_run, reduced_run))
     assert [row[:3] for row in runs[2:]] == [
-        *([name, "3", "1"] for name in whole), ["`detect all`", "1", "1"],
-        ["`detect all`", "2", "1"],
+        *([name, "3", "1"] for name in whole), ["detect all", "1", "1"], ["detect all", "2", "1"],
     ]  # fmt: skip
+    found = json.loads(figures.read_text())["figures"]
+    for case, name in (("demo", ALL), ("noise", LINES)):
+        times = found["kinds"][case][name]
+        assert 0.0 < times["lower"] <= times["median"] <= times["upper"]
+        assert f"{number(times['median'])} (" in out
+    assert [row["frames"] for row in found["runs"]] == [3] * len(whole) + [1, 2]
