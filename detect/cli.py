@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 from argparse import ArgumentParser
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,16 @@ EXPERT: dict[type, frozenset[str]] = {
 }  # fmt: skip
 
 
+_QUALITY, _RESPONSE = "--quality-threshold", "--response-threshold"
+#: Former spellings of flags by command. In `detect all`, flags had the detector's name in front.
+_RENAMED = {
+    "circles": {"--threshold": _QUALITY},
+    "explain": {"--threshold": _QUALITY},
+    "lines": {"--threshold": _RESPONSE},
+    "all": {"--circles.threshold": _QUALITY, "--lines.threshold": _RESPONSE},
+}
+
+
 class DetectProgram(Program):
     """The program: presets and settings files decide the defaults of flags."""
 
@@ -75,9 +86,9 @@ class DetectProgram(Program):
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help` and on errors."""
+        arguments = [*_in_present_spelling(arguments)]
         radius = ArgumentParser(add_help=False, allow_abbrev=False)
-        flags = "--radius-m", "--circles.radius-m"
-        radius.add_argument(*flags, dest="given", nargs="?", action="append", default=[])
+        radius.add_argument("--radius-m", dest="given", nargs="?", action="append", default=[])
         found, rest = radius.parse_known_args(arguments)
         if "auto" in found.given:
             arguments = [*rest, "--find-radius"]
@@ -101,6 +112,14 @@ class DetectProgram(Program):
             Explain(image=MISSING, parameters=values.circles),
         )
         return super().parsed(arguments, (*known, *defaults))
+
+
+def _in_present_spelling(arguments: Sequence[str]) -> Iterator[str]:
+    """Replace former spellings of flags, which are still accepted."""
+    renamed = _RENAMED.get(next(iter(arguments), ""), {})
+    for word in arguments:
+        flag, equals, value = word.partition("=")
+        yield renamed.get(flag, re.sub(r"^--(circles|lines)\.", "--", flag)) + equals + value
 
 
 PROGRAM = DetectProgram(

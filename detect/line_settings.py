@@ -7,6 +7,8 @@ from collections import namedtuple
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal, NamedTuple, get_type_hints
 
+from tyro.conf import arg
+
 from detect.errors import DetectError
 from redetect.bounds import (
     Bounds,
@@ -40,7 +42,8 @@ class LineSettings:
     #: Added to the variance in the window, grey values squared: suppresses steps much smaller than
     #: its square root.
     regulariser: Positive = 40.0
-    threshold: ShareAbove0 = 0.12  #: Least response of a point, 0 to 1; an ideal step has 2/pi.
+    #: Least response of a point, 0 to 1; an ideal step has 2/pi.
+    threshold: Annotated[ShareAbove0, arg(name="response-threshold")] = 0.12
     #: Number of rows to ignore at the upper and lower border.
     border_rows: Annotated[int, whole(0)] = 2
     #: Tracks start on the horizon and on rows up to this far from it.

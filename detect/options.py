@@ -188,7 +188,7 @@ class Markers(DetectorFlags):
 class All(DetectorFlags):
     """Detect verticals, tilt and discs of a run, and correct the discs for the tilt.
 
-    Example: detect all images/e --circles.polarity light, or:
+    Example: detect all images/e --polarity light, or:
     detect all 'drive/*.png' --camera front.cam --times drive.times --odometry drive.tum
 
     Parameters
@@ -205,10 +205,12 @@ class All(DetectorFlags):
     #: Tilt for which discs are corrected: `none`, that of the single `frame`, or that of the `run`
     #: (a constant lean, and the estimated deviation of each frame from it).
     tilt: Levelling = "run"
-    #: Estimate the radius of the discs from some images first, like --circles.radius-m auto.
+    #: Estimate the radius of the discs from some images first, the same as --radius-m auto.
     find_radius: bool = False
-    circles: CircleSettings = field(default_factory=CircleSettings)
-    lines: LineSettings = field(default_factory=LineSettings)
+    #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
+    join_threshold: Annotated[MaybeFloat, NOT_NEGATIVE] = None
+    circles: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+    lines: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

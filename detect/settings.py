@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from tyro.conf import arg
+
 from detect.errors import DetectError
 from redetect.bounds import (
     FINITE,
@@ -55,7 +57,7 @@ class CircleSettings:
     #: in image rows' length on the floor, rounded up to pixels; 0: every pixel is a centre.
     stride: NotNegative = 0.0
     #: Without a fit: least quality (between-class / total variance), 0 to 1.
-    threshold: ShareAbove0 = 0.5
+    threshold: Annotated[ShareAbove0, arg(name="quality-threshold")] = 0.5
     #: Least distance of a centre from the image border, pixels.
     border_px: Annotated[int, whole(0)] = 6
     #: Limit of the distance: the floor moves at most this share of the radius per image row;

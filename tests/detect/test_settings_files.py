@@ -45,7 +45,7 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
     run = str(project_root / "images" / "e")
     first, second = tmp_path / "a", tmp_path / "b"
     flags = ["--frames", "3", "--tilt", "none"]
-    assert main(["all", run, "-o", str(first), "--circles.threshold", "0.62", *flags]) == 0
+    assert main(["all", run, "-o", str(first), "--quality-threshold", "0.62", *flags]) == 0
     log = str(first / "detected.log.json")
     assert main(["all", run, "-o", str(second), "--settings", log, *flags]) == 0
     for name in ("detected.circles", "detected.lines"):

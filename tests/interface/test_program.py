@@ -76,8 +76,8 @@ def test_mistyped_words_are_answered_with_the_nearest(
 @pytest.mark.parametrize(
     ("words", "flag"),
     [
-        ("detect circles RUN --thresold 0.4", "--threshold"),
-        ("detect all RUN --circles.radus-m=1", "--circles.radius-m"),
+        ("detect circles RUN --quality-thresold 0.4", "--quality-threshold"),
+        ("detect all RUN --radus-m=1", "--radius-m"),
         ("slam map RUN --calibrte", "--calibrate"),
         ("camera convert a b --limit 1", "--limit-px"),
         ("explain IMAGE --polaritty dark", "--polarity"),
@@ -98,10 +98,10 @@ def test_help_has_the_common_flags_and_help_all_has_all(capsys: Captured) -> Non
     with pytest.raises(SystemExit):
         main(["detect", "all", "--help-all"])
     everything = capsys.readouterr().out
-    for flag in ("--circles.radius-m", "--circles.polarity", "--jobs", "--odometry", "--force"):
+    for flag in ("--radius-m", "--polarity", "--join-threshold", "--jobs", "--odometry", "--force"):
         assert flag in common
         assert flag in everything
-    for flag in ("--circles.separation", "--lines.regulariser", "--cluster", "--wheel-base-m"):
+    for flag in ("--separation", "--regulariser", "--cluster", "--wheel-base-m"):
         assert flag not in common
         assert flag in everything
     assert "More flags are shown by --help-all" in common
@@ -110,8 +110,25 @@ def test_help_has_the_common_flags_and_help_all_has_all(capsys: Captured) -> Non
 
 def test_flags_for_experts_are_taken(tmp_path: Path) -> None:
     parsed = import_module(PROGRAMS["detect"]).parsed
-    command = parsed(["all", str(tmp_path), "--circles.separation", "0.5", "--line-ends", "crlf"])
+    command = parsed(["all", str(tmp_path), "--separation", "0.5", "--line-ends", "crlf"])
     assert (command.circles.separation, command.line_ends) == (0.5, "crlf")
+
+
+@pytest.mark.parametrize(
+    ("former", "present"),
+    [
+        ("circles RUN --threshold 0.4", "circles RUN --quality-threshold 0.4"),
+        ("lines RUN --threshold=0.4", "lines RUN --response-threshold=0.4"),
+        ("explain IMAGE --threshold 0.4", "explain IMAGE --quality-threshold 0.4"),
+        ("all RUN --circles.threshold=.4 --lines.threshold .2",
+         "all RUN --quality-threshold=.4 --response-threshold .2"),
+        ("all RUN --circles.radius-m .06 --lines.alpha=published",
+         "all RUN --radius-m .06 --alpha=published"),
+    ],
+)  # fmt: skip
+def test_former_spellings_of_flags_are_accepted(former: str, present: str) -> None:
+    parsed = import_module(PROGRAMS["detect"]).parsed
+    assert parsed(former.split()) == parsed(present.split()) != parsed(present.split()[:2])
 
 
 @pytest.mark.parametrize("place", [0, 1, 9])

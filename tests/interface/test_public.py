@@ -56,7 +56,7 @@ def test_it_is_what_the_command_line_finds(
     """Of one image: verticals, the tilt by them, discs that are levelled by that."""
     from detect.cli import main
 
-    flags = ["--camera", str(demo / "e.cam"), "--circles.polarity", "light", "--tilt", "frame"]
+    flags = ["--camera", str(demo / "e.cam"), "--polarity", "light", "--tilt", "frame"]
     assert main(["all", str(demo_image), *flags, "-o", str(tmp_path)]) == 0
     (frame,) = read_frames(tmp_path / "detected.circles")
     write_frames(tmp_path / "own.circles", [found.frame])

@@ -21,7 +21,7 @@ WAYS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("--preset published", "circles", ("--preset", "published")),
     ("default", "circles", ()),
     ("detect all", "all", ()),
-    ("detect all, lens stated", "all", ("--circles.calibration-px", "0.3")),
+    ("detect all, lens stated", "all", ("--calibration-px", "0.3")),
 )
 
 

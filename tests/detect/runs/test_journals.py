@@ -86,7 +86,7 @@ def test_an_interrupted_run_is_resumed(kept: Trial) -> None:
     kept.assert_complete()
 
 
-@pytest.mark.parametrize("flags", [["--circles.threshold", "0.45"], ["--lines.alpha", "published"]])
+@pytest.mark.parametrize("flags", [["--quality-threshold", "0.45"], ["--alpha", "published"]])
 def test_other_settings_begin_anew(kept: Trial, other: Path, flags: list[str]) -> None:
     assert main(command(kept.run, other, *flags)) == 3
     assert kept.resumed(*flags) == 0

@@ -63,7 +63,7 @@ def test_rows_and_tilts_are_written(short_run: Path, project_root: Path, tmp_pat
 
 @pytest.mark.lowest
 def test_all_corrects_discs_for_the_tilt(short_run: Path) -> None:
-    assert main(["all", str(short_run), "--tilt", "frame", "--circles.polarity", "light"]) == 0
+    assert main(["all", str(short_run), "--tilt", "frame", "--polarity", "light"]) == 0
     levelled = [f.circles for f in read_frames(short_run / "detected.circles")]
     assert main(["circles", str(short_run), "--polarity", "light", "--force"]) == 0
     plain = [f.circles for f in read_frames(short_run / "detected.circles")]
@@ -87,7 +87,7 @@ def test_frames_with_a_tilt_do_not_count_the_unknown_one(short_run: Path) -> Non
                     "--tilt",
                     "frame",
                     "--force",
-                    "--circles.tilt-sigma-deg",
+                    "--tilt-sigma-deg",
                     sigma,
                 ]
             )
@@ -112,7 +112,7 @@ def test_frames_that_count_as_level_are_told(short_run: Path, capsys: Captured) 
         in capsys.readouterr().out
     )
     assert (
-        main(["all", str(short_run), "--tilt", "frame", "--force", "--circles.tilt-sigma-deg", "0"])
+        main(["all", str(short_run), "--tilt", "frame", "--force", "--tilt-sigma-deg", "0"])
         == 3
     )
     assert "the other 1 are assumed exactly level" in capsys.readouterr().out
