@@ -12,6 +12,7 @@ from detect.drawing.frame import draw_disc_candidates, png_of
 from detect.errors import DetectError
 from detect.options import Explain
 from detect.sources.interface import RunFrame, read_image, still
+from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
 
 
@@ -31,7 +32,7 @@ def perform(command: Explain) -> int:
             image, camera, command.parameters.radius_m, found.candidates, command.at
         )
         write_bytes(command.output, png_of(picture), overwrite=command.force)
-        print(f"{command.output}: {len(found.candidates)} candidates")
+        print(f"{command.output}: {counted(len(found.candidates), 'candidate')}")
     if command.json is not None:
         write_bytes(command.json, f"{found.to_json()}\n".encode(), overwrite=command.force)
     return 0

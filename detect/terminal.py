@@ -15,7 +15,7 @@ from functools import cache
 
 from detect.errors import EXIT_FRAMES_FAILED
 from redetect.interrupts import raise_if_interrupted
-from redetect.messages import is_quiet
+from redetect.messages import counted, is_quiet
 
 _log = logging.getLogger("redetect")
 
@@ -101,5 +101,5 @@ def report_failures(count: int, first: Sequence[str]) -> int:
     shown = [f"  {line}" for line in first[:_SHOWN_FAILURES]]
     if count > _SHOWN_FAILURES:
         shown.append(f"  and {count - _SHOWN_FAILURES} more")
-    print(f"{count} frames could not be processed:", *shown, sep="\n", file=sys.stderr)
+    print(f"{counted(count, 'frame')} could not be processed:", *shown, sep="\n", file=sys.stderr)
     return EXIT_FRAMES_FAILED

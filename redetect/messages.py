@@ -55,6 +55,11 @@ def excerpt(value: object) -> str:
     return one_line(_SHORT.repr(value), _LONGEST_EXCERPT)
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun: `1 disc`, `2 discs`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 class OneLineError(Exception):
     """An error whose message is one printable line of bounded length (`one_line`)."""
 

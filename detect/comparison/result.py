@@ -16,6 +16,7 @@ from detect.options import CompareOptions
 from detect.seen import Sight
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
+from redetect.messages import counted
 
 Kind = Literal["circles", "lines"]
 
@@ -153,7 +154,7 @@ class Comparison(ABC):
         """Sentences on found and missed rows, extra rows, errors and covariances."""
         found = (
             f"{self.found} of {self.reference} {self.what} of the reference are found, "
-            f"{self.missed} missed, in {len(self.frames)} frame{'s' * (len(self.frames) != 1)}."
+            f"{self.missed} missed, in {counted(len(self.frames), 'frame')}."
         )
         if not self.reference:
             found = f"The reference has no {self.what} to find."

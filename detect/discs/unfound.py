@@ -31,6 +31,7 @@ from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
+from redetect.messages import counted
 
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
 
@@ -140,7 +141,9 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
     if not stages:
-        return f"There is no candidate in {len(images)} of the images: no edges lie on a circle."
+        return (
+            f"There is no candidate in {counted(len(images), 'image')}: no edges lie on a circle."
+        )
     fates = (
         (stages["polarity"], f"are not {settings.polarity} (--polarity any)"),
         (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
@@ -148,7 +151,9 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
         (stages["evidence"], "do not look like a disc (--evidence)"),
     )
     failed = ", ".join(f"{count} {test}" for count, test in fates if count)
-    return f"Of {stages.total()} candidates in {len(images)} of the images {failed}."
+    return (
+        f"Of {counted(stages.total(), 'candidate')} in {counted(len(images), 'image')}, {failed}."
+    )
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray
 from redetect.landmarks import read_tilts
+from redetect.messages import counted
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
@@ -191,18 +192,19 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
 
 def _print_results(job: Job, summary: RunSummary) -> None:
     found, places, tilt = summary.found, job.places, summary.tilt
+    frames = counted(summary.frames, "frame")
     if "lines" in places:
-        print(f"{places['lines']}: {found['lines']} lines in {summary.frames} frames")
+        print(f"{places['lines']}: {counted(found['lines'], 'line')} in {frames}")
     if "tilt" in places and tilt is not None:
         place = frames_tilt_place(places["tilt"])
-        print(f"{place}: the separate tilts of {found['tilts']} frames")
+        print(f"{place}: the separate tilts of {counted(found['tilts'], 'frame')}")
         print(f"{places['tilt']}: {tilt.sentence()}")
     elif "tilt" in places:
         others = _other_frames(job.plan, summary)
-        print(f"{places['tilt']}: the tilt of {found['tilts']} frames{others}")
-    for kind, what in (("circles", "discs"), ("markers", "markers")):
+        print(f"{places['tilt']}: the tilt of {counted(found['tilts'], 'frame')}{others}")
+    for kind, what in (("circles", "disc"), ("markers", "marker")):
         if kind in places:
-            print(f"{places[kind]}: {found[what]} {what} in {summary.frames} frames")
+            print(f"{places[kind]}: {counted(found[f'{what}s'], what)} in {frames}")
     if summary.lean is not None:
         print(lean_sentence(summary.lean))
     if summary.unlevelled_deg is not None and "tilt" not in places and not job.known.tilts:
@@ -280,8 +282,8 @@ def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> 
 
     images = list(_some_images(run))
     discs = (
-        f"{summary.found['discs']} discs of radius {settings.radius_m:g} m in {summary.frames} "
-        "frames. "
+        f"{counted(summary.found['discs'], 'disc')} of radius {settings.radius_m:g} m in "
+        f"{counted(summary.frames, 'frame')}. "
     )
     if not summary.found["discs"]:
         discs += f"{why_none(images, run.camera, settings)} "

@@ -29,7 +29,7 @@ from redetect.array_types import FloatArray
 from redetect.interface.tables import Table, covariance_columns, html_table, plain
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
-from redetect.messages import excerpt
+from redetect.messages import counted, excerpt
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
@@ -200,7 +200,8 @@ class Detection(Table):
         return draw_rows(self.image, sight, rows, self.settings, self.name)
 
     def __str__(self) -> str:
-        words = f"{self.name}: {len(self.discs)} discs, {len(self.verticals)} verticals, "
+        words = f"{self.name}: {counted(len(self.discs), 'disc')}, "
+        words += f"{counted(len(self.verticals), 'vertical')}, "
         if self.tilt is None:
             return words + "no tilt"
         pitch, roll = np.degrees([self.tilt.pitch_rad, self.tilt.roll_rad])

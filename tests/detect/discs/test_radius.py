@@ -121,7 +121,7 @@ def test_where_there_are_no_discs_it_is_said_what_to_look_at(run: Path, capsys: 
         cv2.imwrite(str(path), np.full((288, 768), 100, np.uint8))
     assert main(["circles", str(run)]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "0 discs of radius 0.1 m in 12 frames. There is no candidate in 12 of" in said
+    assert "0 discs of radius 0.1 m in 12 frames. There is no candidate in 12 images" in said
     assert "Other radii find no more" in said
     shutil.rmtree(run / "images")
 
