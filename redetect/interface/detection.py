@@ -18,6 +18,7 @@ from camera import Camera, read_camera
 from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
 from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
 from detect.errors import DetectError, FrameError
+from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
 from detect.row_files import SeenRows
 from detect.runs.frame import FrameDetections, detect_batch
@@ -356,12 +357,7 @@ def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
-        if image.ndim != 2 or image.dtype != np.uint8:
-            raise FrameError(
-                f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 "
-                "of shape (H, W); give colour or 16-bit images as files"
-            )
-        return RunFrame(still("image"), None, content=np.ascontiguousarray(image))
+        return RunFrame(still("image"), None, content=plain_image(image))
     path = Path(image)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
