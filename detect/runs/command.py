@@ -234,7 +234,7 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
         return ""
     sigma_deg = summary.unlevelled_deg or math.degrees(plan.circles.tilt_sigma_rad)
     if sigma_deg == 0.0:
-        return f"; the other {others} are assumed exactly level (see --circles.tilt-sigma-deg)"
+        return f"; the other {others} are assumed exactly level (see --tilt-sigma-deg)"
     return f"; the other {others} are assumed level within {sigma_deg:g} degrees"
 
 
