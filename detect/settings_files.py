@@ -17,7 +17,6 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
-from redetect.bounds import MaybeFloat
 from redetect.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
@@ -83,7 +82,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     except (TypeError, OverflowError):
         kinds: dict[Any, str] = {
             bool: "True or False", int: "a whole number", float: "a number",
-            MaybeFloat: "a number or none",
+            float | None: "a number or none",
         }  # fmt: skip
         words = ", ".join(map(str, get_args(hints[name])))
         expected = kinds.get(hints[name], f"one of {words}")

@@ -17,14 +17,16 @@ from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, get_args, get_origin, get_type_hints
 
+from tyro.conf import arg
+
 from redetect.messages import excerpt
 
 # Types of flags; for `X | None` tyro imports another library that takes a tenth of a second.
-MaybePath = Optional[Path]  # noqa: UP045
-MaybeInt = Optional[int]  # noqa: UP045
-MaybeFloat = Optional[float]  # noqa: UP045
-MaybeStr = Optional[str]  # noqa: UP045
-MaybePixel = Optional[tuple[float, float]]  # noqa: UP045
+MaybePath = Annotated[Optional[Path], arg(metavar="PATH")]  # noqa: UP045
+MaybeInt = Annotated[Optional[int], arg(metavar="INT")]  # noqa: UP045
+MaybeFloat = Annotated[Optional[float], arg(metavar="FLOAT")]  # noqa: UP045
+MaybeStr = Annotated[Optional[str], arg(metavar="STR")]  # noqa: UP045
+MaybePixel = Annotated[Optional[tuple[float, float]], arg(metavar="U V")]  # noqa: UP045
 
 
 @dataclass(frozen=True)
