@@ -105,11 +105,11 @@ class DetectProgram(Program):
                 raise DetectError("--preset and --settings: expected one of them")
             values = read_settings(Path(file))
         known = (
-            Circles(run=MISSING, parameters=values.circles),
-            Lines(run=MISSING, parameters=values.lines),
-            Markers(run=MISSING, parameters=values.markers),
+            Circles(run=MISSING, detector=values.circles),
+            Lines(run=MISSING, detector=values.lines),
+            Markers(run=MISSING, detector=values.markers),
             All(run=MISSING, circles=values.circles, lines=values.lines),
-            Explain(image=MISSING, parameters=values.circles),
+            Explain(image=MISSING, detector=values.circles),
         )
         return super().parsed(arguments, (*known, *defaults))
 

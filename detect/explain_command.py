@@ -25,11 +25,11 @@ def perform(command: Explain) -> int:
         raise DetectError(f"{command.image}: no such image: expected one image of a run")
     camera = _camera(command)
     image = read_image(RunFrame(still("image"), command.image), camera)
-    found = explain_discs(image, camera, command.parameters, command.at)
+    found = explain_discs(image, camera, command.detector, command.at)
     _print(found)
     if command.output is not None:
         picture = draw_disc_candidates(
-            image, camera, command.parameters.radius_m, found.candidates, command.at
+            image, camera, command.detector.radius_m, found.candidates, command.at
         )
         write_bytes(command.output, png_of(picture), overwrite=command.force)
         print(f"{command.output}: {counted(len(found.candidates), 'candidate')}")

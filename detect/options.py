@@ -137,7 +137,7 @@ class Circles(DetectorFlags):
     draw: MaybePath = None
     #: Also write the rows as JSON, with pixels and evidence; -: to standard output only.
     json: MaybePath = None
-    parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+    detector: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,7 +165,7 @@ class Lines(DetectorFlags):
     draw: MaybePath = None
     #: Draw all tracks instead, rejected ones with the reason; repeats the detection.
     rejected: bool = False
-    parameters: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
+    detector: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,7 +181,7 @@ class Markers(DetectorFlags):
     #: Folder for images with the markers drawn in, after detection.
     draw: MaybePath = None
     rejected: bool = False  #: Also draw rejected candidates; repeats the detection.
-    parameters: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
+    detector: OmitArgPrefixes[MarkerSettings] = field(default_factory=MarkerSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -351,7 +351,7 @@ class Explain:
     json: MaybePath = None  #: Write the candidates as JSON; -: to standard output.
     force: bool = False  #: Replace existing files.
     settings: MaybePath = None  #: JSON file with defaults of the other flags.
-    parameters: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
+    detector: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

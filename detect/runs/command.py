@@ -83,7 +83,7 @@ def _circles(command: Circles, run: Run) -> Job:
     places = {"circles": _output(command, run, "circles")}
     if command.json is not None:
         places["json"] = command.json
-    settings = _with_radius(command.parameters, run) if command.find_radius else command.parameters
+    settings = _with_radius(command.detector, run) if command.find_radius else command.detector
     plan = FramePlan(run.camera, circles=settings)
     tilts = None if command.tilt is None else read_tilts(command.tilt)
     return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
@@ -91,7 +91,7 @@ def _circles(command: Circles, run: Run) -> Job:
 
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
-    plan = FramePlan(run.camera, lines=_joined(command.parameters, command.join_threshold, run))
+    plan = FramePlan(run.camera, lines=_joined(command.detector, command.join_threshold, run))
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
 
@@ -105,7 +105,7 @@ def _joined(settings: LineSettings, threshold_rad: float | None, run: Run) -> Li
 
 def _markers(command: Markers) -> Job:
     run = open_source(command.run, command.camera, command.source)
-    plan = FramePlan(run.camera if isinstance(run, Run) else None, markers=command.parameters)
+    plan = FramePlan(run.camera if isinstance(run, Run) else None, markers=command.detector)
     return Job(run, plan, {"markers": _output(command, run, "markers")})
 
 

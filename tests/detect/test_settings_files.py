@@ -33,7 +33,7 @@ def test_flags_start_from_a_file(tmp_path: Path) -> None:
     path.write_text('{"settings": {"circles": {"radius_m": 0.06, "threshold": 0.7}}}')
     command = parsed(["circles", "run", "--settings", str(path), "--threshold", "0.4"])
     assert isinstance(command, Circles)
-    assert command.parameters == CircleSettings(radius_m=0.06, threshold=0.4)
+    assert command.detector == CircleSettings(radius_m=0.06, threshold=0.4)
     both = parsed(["all", "run", f"--settings={path}"])
     assert isinstance(both, All)
     assert both.circles.radius_m == 0.06

@@ -100,7 +100,7 @@ def peers() -> dict[str, Function]:
 def commands(run: Path, output: Path, jobs: int = 1) -> dict[str, Command]:
     """The commands that are measured on a run, by name; their files go into a folder."""
     circles = Circles(run=run, output=output / "discs.circles", force=True, jobs=jobs)
-    published = replace(circles, output=output / "published.circles", parameters=PUBLISHED)
+    published = replace(circles, output=output / "published.circles", detector=PUBLISHED)
     return {
         "detect circles --preset published": published,
         "detect circles": circles,

@@ -111,10 +111,7 @@ def test_frames_that_count_as_level_are_told(short_run: Path, capsys: Captured) 
         "the tilt of 2 frames; the other 1 are assumed level within 0.3 degrees"
         in capsys.readouterr().out
     )
-    assert (
-        main(["all", str(short_run), "--tilt", "frame", "--force", "--tilt-sigma-deg", "0"])
-        == 3
-    )
+    assert main(["all", str(short_run), "--tilt", "frame", "--force", "--tilt-sigma-deg", "0"]) == 3
     assert "the other 1 are assumed exactly level" in capsys.readouterr().out
 
 
