@@ -28,7 +28,7 @@ from redetect.landmarks.times import TIMES_HEAD
 LEVEL = "level robot frame"
 LEVELLED = "corrected for the tilt of the frames that have one"
 
-#: The kind of the tilts that the second pass writes (`detect.runs.frame`).
+#: The kind of the tilts that the second pass writes (`detect.runs.level_run`).
 RUN_TILT = "run tilt"
 
 _ROBOT = "Robot frame: origin on the floor, X left, Y backward (forward is -Y), metres, radians."

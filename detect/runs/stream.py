@@ -216,7 +216,7 @@ def detect_run(
             raise DetectError(f"{left_out} {job.run.frames.why_left_out}, and none remain")
         written = files.rows()
         if plan.levelling == "run" and plan.camera and plan.lines and plan.circles:
-            from detect.runs.frame import level_run  # loads the compiler
+            from detect.runs.level_run import level_run  # loads the compiler
 
             written = level_run(plan.camera, plan.circles, files.rows, summary)
         files.finish(written, summary)
@@ -233,7 +233,8 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
         return plan
     if expected < LEAST_FRAMES:
         return plan
-    from detect.runs.frame import pays, searched_lean, tilt_of_some  # loads the compiler
+    from detect.runs.frame import pays  # loads the compiler, as the next one
+    from detect.runs.level_run import searched_lean, tilt_of_some
 
     step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
     tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]

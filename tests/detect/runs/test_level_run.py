@@ -9,7 +9,7 @@ import pytest
 
 from camera import Camera
 from detect.run_tilt import LEAST_FRAMES
-from detect.runs.frame import level_run
+from detect.runs.level_run import level_run
 from detect.runs.plan import RunSummary
 from detect.seen import level_seen
 from detect.settings import CircleSettings
