@@ -329,19 +329,12 @@ def _write_rows(
 def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArray) -> None:
     """Sums of products of rows in each sector, lower halves, from term `first` on."""
     for s in range(SECTORS):
-        # Blocks of three by three, so that each loaded value is used three times.
-        for a in range(first, _TERMS, 3):
-            for b in range(first, a + 1, 3):
-                s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = F32(0.0)
+        for a in range(first, _TERMS):
+            for b in range(first, a + 1):
+                total = F32(0.0)
                 for i in range(np.uint64(ends[s]), np.uint64(ends[s + 1])):
-                    a0, a1, a2 = rows[a, i], rows[a + 1, i], rows[a + 2, i]
-                    b0, b1, b2 = rows[b, i], rows[b + 1, i], rows[b + 2, i]
-                    s00, s01, s02 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2
-                    s10, s11, s12 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2
-                    s20, s21, s22 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2
-                for j, row in enumerate(((s00, s01, s02), (s10, s11, s12), (s20, s21, s22))):
-                    for k, total in enumerate(row):
-                        products[a + j, b + k, s] = total
+                    total += rows[a, i] * rows[b, i]
+                products[a, b, s] = total
 
 
 @kernel()
