@@ -241,6 +241,11 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
 def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
     """Reasons why hardly anything was found, and what to try."""
     plan, camera, found = job.plan, job.plan.camera, summary.found
+    if job.known != Known() and not summary.known:
+        yield (
+            "no image of this run is in the files of known tilts or IDs, or they have no rows: "
+            "were they made from other images?"
+        )
     if camera is None:
         return
     if plan.lines is not None and not found["lines"]:

@@ -56,6 +56,9 @@ class KnownOfFrame(NamedTuple):
     discs_level: bool = False
     mapped: tuple[CircleLandmark, ...] = ()
 
+    def __bool__(self) -> bool:
+        return bool(self.tilt or self.lines or self.discs or self.mapped)
+
 
 @dataclass(frozen=True)
 class Known:
@@ -211,6 +214,7 @@ class RunSummary:
     failed: int = 0
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0  # missing in the odometry
+    known: int = 0  # frames with prior data
     lean: Lean | None = None  # of the camera in the search for discs
     unlevelled_deg: float | None = None  # sigma of pitch and roll, as some frames show
     tilt: RunTilt | None = None  # used for levelling, if that was by the run

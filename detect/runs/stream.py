@@ -196,6 +196,11 @@ def detect_run(
         if on_progress is not None:
             on_progress()
 
+    def task(frame: RunFrame) -> FrameTask:
+        known = job.known.of(frame.step.prefix)
+        summary.known += bool(known)
+        return FrameTask(frame, known)
+
     with ExitStack() as stack:
         pool = stack.enter_context(closing(WorkerPool(workers)))
         plan = replace(job.plan, json="json" in job.places)
@@ -205,8 +210,7 @@ def detect_run(
         job, summary.lean = replace(job, plan=plan), plan.lean
         files = stack.enter_context(RunFiles(job))
         source = stack.enter_context(closing(iter(job.run.frames)))
-        every = (FrameTask(frame, job.known.of(frame.step.prefix)) for frame in source)
-        for frames in pool.detect_chunks(files.take_over(every, count), plan):
+        for frames in pool.detect_chunks(files.take_over(map(task, source), count), plan):
             files.add(frames)
             for _, rows in frames:
                 count(rows)

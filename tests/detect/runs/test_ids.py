@@ -63,6 +63,18 @@ def test_ids_of_rows_and_of_a_map(
     assert len(by_map.keys() & own.keys()) > 0.97 * len(own)
 
 
+def test_files_of_another_run_are_noticed(
+    small_run: Path, project_root: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    others, own = project_root / "images" / "e" / "map.circles", tmp_path / "own.circles"
+    command = ["circles", str(small_run), "-o", str(own), "--force"]
+    assert main([*command, "--ids-from", str(others)]) == 0
+    assert "no image of this run is in the files" in capsys.readouterr().err
+    own.rename(tmp_path / "before.circles")
+    assert main([*command, "--ids-from", str(tmp_path / "before.circles")]) == 0
+    assert "no image of this run" not in capsys.readouterr().err
+
+
 def test_a_map_needs_its_path(run: Path, tmp_path: Path, capsys: Captured) -> None:
     (tmp_path / "map.csv").write_text("kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n")
     assert main(["circles", str(run), "--ids-from-map", str(tmp_path / "map.csv")]) == 1
