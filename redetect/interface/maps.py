@@ -236,7 +236,7 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
         more = paths["more"]
-        paths["more"] = tuple(map(Path, [more] if isinstance(more, PathLike) else more))
+        paths["more"] = tuple(map(Path, [more] if isinstance(more, str | os.PathLike) else more))
     return paths
 
 

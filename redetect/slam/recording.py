@@ -36,6 +36,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+# In the head of files by `detect`: the covariances of their discs include that of a tilt.
+_TILTED, _HEAD_BYTES = b" tilt_sigma_deg=", 1 << 16
 # Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
@@ -125,6 +127,7 @@ class Recording:
     circles: CircleRows
     lines: LineRows  # none if they were not requested
     unstated_steps: int = 0  # number of steps with an assumed covariance
+    tilted: bool = False  # whether covariances of discs include that of an unknown tilt
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -147,6 +150,7 @@ class Recording:
             self.step_covariance[first:end],
             replace(discs, frame=discs.frame - first),
             replace(lines, frame=lines.frame - first),
+            tilted=self.tilted,
         )
 
 
@@ -183,6 +187,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
             tuple(ids for some in lines for ids in some.ids),
         ),
         sum(run.unstated_steps for run in runs),
+        any(run.tilted for run in runs),
     )
 
 
@@ -260,7 +265,11 @@ def read_recording(
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)
-    return recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
+    found = recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
+    if not files[0].is_file():  # a pipe cannot be read twice
+        return found
+    with files[0].open("rb") as stream:
+        return replace(found, tilted=_TILTED in stream.read(_HEAD_BYTES))
 
 
 def recording_of_frames(

@@ -253,8 +253,9 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
         rd.map(demo, start=(0, 0))
     moved = rd.map(demo, start=np.array([1.0, 2.0, 0.5]))
     np.testing.assert_allclose(moved.path.poses[0], [1.0, 2.0, 0.5])
-    both = rd.map(demo, more=str(demo))
-    assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
+    for more in (str(demo), [demo]):
+        both = rd.map(demo, more=more)
+        assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
     assert len(repr(landmarks)) < 200
     assert len(repr(in_memory)) < 200
 

@@ -306,6 +306,12 @@ def test_trunks_are_found_where_nothing_hides_them() -> None:
     order = np.argsort(bearing)
     assert found[:, 1] == pytest.approx(bearing[order], abs=np.radians(0.3))
     assert found[:, 0] == pytest.approx(np.hypot(*trees[order].T), abs=0.15)
+    around = np.linspace(-1.0, 1.0, 15)
+    for reach in (8.0, 20.0):
+        ring = reach * np.stack([np.cos(around), np.sin(around)], axis=1)
+        assert np.mean(trees_of(scan_of(ring, np.zeros(3)) / 100.0)[:, 0]) == pytest.approx(
+            reach, abs=0.02
+        )
     wall = np.full(361, 10.0)
     assert trees_of(wall).shape == (0, 2)
 

@@ -47,8 +47,8 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
 
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
-# relative changes of lengths and turns (rad/m).
-_SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN = 5.0, 0.02, 0.01
+# relative changes of lengths, turns (rad/m) and lags (intervals between frames).
+_SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN, _LEAST_LAG = 5.0, 0.02, 0.01, 0.1
 # Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
 
@@ -168,6 +168,13 @@ def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[s
         lines.append(
             "odometry does not fit the rows: it would have to turn to the "
             f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
+        )
+    if abs(check.lag_frames) > max(least * check.lag_frames_sigma, _LEAST_LAG):
+        way = "behind" if check.lag_frames > 0.0 else "ahead of"
+        lines.append(
+            f"odometry does not fit the rows: it is {abs(check.lag_frames):.2f} of the interval "
+            f"between frames {way} them; do the clocks of odometry and camera agree, is the camera "
+            "where its calibration says (--calibrate)?"
         )
     if check.outliers:
         lines.append(

@@ -240,7 +240,9 @@ def trees_of(scan: FloatArray) -> FloatArray:
         diameter = reach * np.radians(0.5 * (last - first))
         alone = min(right, left) > reach + _BEHIND_M
         if alone and reach < _FARTHEST_M and _LEAST_DIAMETER_M < diameter < _MOST_DIAMETER_M:
-            found.append((reach + 0.5 * diameter, np.radians(0.25 * (first + last - 1) - 90.0)))
+            found.append(
+                (reach + 0.125 * np.pi * diameter, np.radians(0.25 * (first + last - 1) - 90.0))
+            )
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
