@@ -168,20 +168,16 @@ def joined(runs: Sequence[Recording]) -> Recording:
         return runs[0]
     starts = first_poses(runs)
     lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
-    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
+    circles = [replace(run.circles, frame=run.circles.frame + k) for run, k in zip(runs, starts)]
+    lines = [replace(run.lines, frame=run.lines.frame + k) for run, k in zip(runs, starts)]
     # The first run's start is not a step.
     return Recording(
         tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
         np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
-        CircleRows(
-            np.concatenate([some.frame + start for some, start in zip(circles, starts)]),
-            np.concatenate([some.xy for some in circles]),
-            np.concatenate([some.covariance for some in circles]),
-            np.concatenate([some.ids for some in circles]),
-        ),
+        CircleRows(*map(np.concatenate, zip(*(vars(some).values() for some in circles)))),
         LineRows(
-            np.concatenate([some.frame + start for some, start in zip(lines, starts)]),
+            np.concatenate([some.frame for some in lines]),
             np.concatenate([some.bearing_rad for some in lines]),
             np.concatenate([some.sigma_rad for some in lines]),
             tuple(ids for some in lines for ids in some.ids),

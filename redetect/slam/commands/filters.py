@@ -287,16 +287,13 @@ def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
             f"{count.innovation_numbers}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
         )
     if distance is not None:
-        lines.append(
-            "from reference    position rms {position_rms_m:.3f} m, median "
-            "{position_median_m:.3f}, max {position_max_m:.3f}, last {position_last_m:.3f}".format(
-                **distance
+        for head, kind, unit, scale, form in (
+            ("from reference    position", "position_{}_m", "m", 1.0, ".3f"),
+            ("                  heading", "heading_{}_rad", "deg", 180.0 / math.pi, ".2f"),
+        ):
+            rms, *more = (
+                f"{name} {scale * distance[kind.format(name)]:{form}}"
+                for name in ("rms", "median", "max", "last")
             )
-        )
-        degrees = {k: math.degrees(v) for k, v in distance.items() if k.startswith("heading")}
-        lines.append(
-            "                  heading rms {heading_rms_rad:.2f} deg, median "
-            "{heading_median_rad:.2f}, max {heading_max_rad:.2f}, last {heading_last_rad:.2f}"
-            "".format(**degrees)
-        )
+            lines.append(f"{head} {rms} {unit}, {', '.join(more)}")
     return lines

@@ -47,8 +47,8 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
 
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
-# relative changes of lengths, turns (rad/m) and lags (intervals between frames).
-_SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN, _LEAST_LAG = 5.0, 0.02, 0.01, 0.1
+# changes of lengths (%), turns (rad/m) and lags (intervals between frames).
+_SIGNIFICANT, _LEAST_PERCENT, _LEAST_TURN, _LEAST_LAG = 5.0, 2.0, 0.01, 0.1
 # Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
 
@@ -156,26 +156,19 @@ def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[s
     """
     least = _SIGNIFICANT * max(root, 1.0)
     lines = []
-    if abs(check.length) > max(least * check.length_sigma, _LEAST_LENGTH):
-        percent, way = 100.0 * abs(check.length), "longer" if check.length > 0.0 else "shorter"
-        lines.append(
-            f"odometry does not fit the rows: its steps would have to be {percent:.1f} % {way}; is "
-            "it in metres, is the discs' radius right (--radius-m), does the camera lean or have "
-            "another height (--calibrate)?"
-        )
-    if abs(check.turn_per_metre) > max(least * check.turn_per_metre_sigma, _LEAST_TURN):
-        side = "left" if check.turn_per_metre > 0.0 else "right"
-        lines.append(
-            "odometry does not fit the rows: it would have to turn to the "
-            f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
-        )
-    if abs(check.lag_frames) > max(least * check.lag_frames_sigma, _LEAST_LAG):
-        way = "behind" if check.lag_frames > 0.0 else "ahead of"
-        lines.append(
-            f"odometry does not fit the rows: it is {abs(check.lag_frames):.2f} of the interval "
-            f"between frames {way} them; do the clocks of odometry and camera agree, is the camera "
-            "where its calibration says (--calibrate)?"
-        )
+    for value, sigma, smallest, ways, text in (
+        (100.0 * check.length, 100.0 * check.length_sigma, _LEAST_PERCENT, ("longer", "shorter"),
+         "its steps would have to be {0:.1f} % {1}; is it in metres, is the discs' radius right "
+         "(--radius-m), does the camera lean or have another height (--calibrate)?"),
+        (check.turn_per_metre, check.turn_per_metre_sigma, _LEAST_TURN, ("left", "right"),
+         "it would have to turn to the {1} by {0:.3f} rad more in each metre"),
+        (check.lag_frames, check.lag_frames_sigma, _LEAST_LAG, ("behind", "ahead of"),
+         "it is {0:.2f} of the interval between frames {1} them; do the clocks of odometry and "
+         "camera agree, is the camera where its calibration says (--calibrate)?"),
+    ):  # fmt: skip
+        if abs(value) > max(least * sigma, smallest):
+            said = text.format(abs(value), ways[value < 0.0])
+            lines.append(f"odometry does not fit the rows: {said}")
     if check.outliers:
         lines.append(
             f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
