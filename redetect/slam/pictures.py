@@ -179,11 +179,8 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
         # A logarithm has no place for an error of exactly 0.
         axes.plot(step, np.maximum(nees, 1e-3), color="black", lw=0.8, label="NEES", zorder=3)
         inside = (nees[known] >= NEES_BAND[0]) & (nees[known] <= NEES_BAND[1])
-        axes.set_title(
-            f"mean {np.mean(nees[known]):.3g}, in the band: {np.mean(inside):.1%}",
-            fontsize=9,
-            loc="right",
-        )
+        share = f"mean {np.mean(nees[known]):.3g}, in the band: {np.mean(inside):.1%}"
+        axes.set_title(share, fontsize=9, loc="right")
         # Space above for the legend.
         highest = max(100.0, 5.0 * float(np.max(nees[known])))
         axes.set_ylim(min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5)), highest)

@@ -24,19 +24,17 @@ MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
     """The landmark files of a run, of the kinds that a command names."""
-    circles = flags.circles or not flags.lines
-    return landmark_files(run, circles=circles, lines=flags.lines, stem=flags.stem)
+    return landmark_files(run, **_wanted(flags))
+
+
+def _wanted(flags: RunFlags) -> dict[str, Any]:
+    return {"circles": flags.circles or not flags.lines, "lines": flags.lines, "stem": flags.stem}
 
 
 def read_runs(flags: RunFlags) -> list[Recording]:
     """Read the rows of the runs that a command names."""
-    circles = flags.circles or not flags.lines
-    return [
-        read_recording(
-            run, circles=circles, lines=flags.lines, stem=flags.stem, noise=flags.odometry_noise
-        )
-        for run in flags.runs
-    ]
+    noise = flags.odometry_noise
+    return [read_recording(run, noise=noise, **_wanted(flags)) for run in flags.runs]
 
 
 def recordings_of(flags: RunFlags) -> list[Recording]:

@@ -29,13 +29,7 @@ from redetect.slam.commands.files import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck
-from redetect.slam.mapping.run_map import (
-    MappedRun,
-    Mounting,
-    as_json,
-    map_run,
-    table_lines,
-)
+from redetect.slam.mapping.run_map import MappedRun, Mounting, as_json, map_run, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
