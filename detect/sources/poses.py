@@ -159,7 +159,7 @@ def tick_poses(
     rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
     for place, (time_s, left, right) in rows:
         if last is not None:
-            ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
+            ways = [metres_per_tick * _ticks(*ends) for ends in zip(last, (left, right))]
             way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
             if not max(abs(way), abs(half_turn)) <= FARTHEST:
                 raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
@@ -169,6 +169,15 @@ def tick_poses(
             theta += 2.0 * half_turn
         last = (left, right)
         yield TimedPose(time_s, x, y, theta)
+
+
+def _ticks(before: float, after: float) -> float:
+    """Ticks between two readings; a counter of 16 or 32 bits may overflow once in between."""
+    for bits in (16, 32):
+        turn = 2.0**bits
+        if max(abs(before), abs(after)) < turn and abs(after - before) > 0.75 * turn:
+            return after - before - math.copysign(turn, after - before)
+    return after - before
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

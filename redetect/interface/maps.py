@@ -232,7 +232,7 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
         paths[name] = tuple(np.ravel(paths[name]).tolist())
         if len(paths[name]) != 3:
             raise SlamError(f"{name} is {excerpt(options[name])}: expected three numbers")
-    if paths.get("camera") is not None:
+    if isinstance(paths.get("camera"), str | os.PathLike):
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
         more = paths["more"]

@@ -150,15 +150,15 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         ),
         (
             "Robot1_Measurement",
-            "5 100 -1 0\n",
-            "expected a subject for each barcode, and ranges above 0",
+            "5 100 1 0\n6 100 -1 0\n",
+            "Odometry.dat: range -1 at 6.000: expected above 0",
         ),
         (
             "Robot1_Measurement",
             "5 100 1e200 0\n",
             "dat: expected numbers within +-1e+24",
         ),
-        ("Barcodes", "6 100\n7 100\n", "expected a subject for each barcode, and ranges above 0"),
+        ("Barcodes", "6 100\n7 100\n", "expected a subject for each barcode"),
         (
             "Robot1_Groundtruth",
             "5 1 0 0\n3 1 0 0\n",

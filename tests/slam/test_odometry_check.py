@@ -113,6 +113,10 @@ def test_wrong_identifiers_are_not_blamed_on_odometry(
     said = capsys.readouterr().out
     assert "times as large as their covariances state: `slam audit`" in said
     assert "errors of odometry" not in said
+    assert main(["map", str(tmp_path), "--loss", "geman-mcclure", "--force"]) == 0
+    assert "maps without them" not in capsys.readouterr().out
+    assert main(["ekf", str(tmp_path)]) == 0
+    assert "errors are much larger than stated: `slam audit`" in capsys.readouterr().out
 
 
 def test_a_slip_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

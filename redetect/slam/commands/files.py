@@ -69,14 +69,14 @@ def recording_of(flags: RunFlags) -> Recording:
     return recording
 
 
-def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
+def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
     """Read the calibration that belongs to a run, a folder or a file in one.
 
     By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
     there is none, `camera.CameraError` if it is ambiguous.
     """
     if camera is not None:
-        return read_camera(camera)
+        return camera if isinstance(camera, Camera) else read_camera(camera)
     folder = run if run.is_dir() else run.parent
     found = camera_in(folder)
     if found is None:

@@ -48,6 +48,8 @@ from redetect.storage import demand_free, write_bytes
 ERROR_PICTURE = "errors.png"
 # The pose is lost if this many frames with discs in succession match none of them.
 _LOST_FRAMES = 20
+# Factor of innovations with known identifiers above which some are wrong, or covariances too small.
+_MOST_FACTOR = 2.5
 
 
 #: Results of a filter: the run, the map, and further lines for the terminal.
@@ -75,6 +77,11 @@ def perform(command: Localize | Ekf) -> int:
     seconds = time.perf_counter() - began
     if command.association != "known":
         said += lost_lines(run, recording)
+    elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
+        said.append(
+            "errors are much larger than stated: `slam audit` finds wrong identifiers, and "
+            "--association joint does not use them"
+        )
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference = None if command.reference is None else read_path(command.reference)
     distance = None

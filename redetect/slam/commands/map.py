@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -138,17 +137,14 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
         (left_out.line_rows, "rows of these lines, not used"),
     ]
     lines += [f"{what}: {count}" for count, what in said if count]
-    lines += doubts_of(check, mapped.table.root, mapped.prefixes)
+    lines += doubts_of(check, mapped)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
 
 
-def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[str]:
-    """What does not fit, in words: large and significant errors of odometry, or of rows.
-
-    `root` is the factor on the standard deviations of the map, `names` those of its poses.
-    """
-    least = _SIGNIFICANT * max(root, 1.0)
+def doubts_of(check: OdometryCheck, mapped: MappedRun) -> list[str]:
+    """What does not fit, in words: large and significant errors of odometry, or of rows."""
+    least = _SIGNIFICANT * max(mapped.table.root, 1.0)
     lines = []
     for value, sigma, smallest, ways, text in (
         (100.0 * check.length, 100.0 * check.length_sigma, _LEAST_PERCENT, ("longer", "shorter"),
@@ -166,13 +162,14 @@ def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[s
     if check.outliers:
         lines.append(
             f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
-            f"are wrong, most at {names[check.worst_step + 1]}"
+            f"are wrong, most at {mapped.prefixes[check.worst_step + 1]}"
         )
     if check.rows_factor > _MOST_FACTOR:
+        without = ", and --loss geman-mcclure maps without them"
         lines.append(
             f"errors of rows are {math.sqrt(check.rows_factor):.1f} times as large as their "
-            "covariances state: `slam audit` finds wrong identifiers, and --loss geman-mcclure "
-            "maps without them"
+            "covariances state: `slam audit` finds wrong identifiers"
+            f"{without if mapped.weighting.loss != 'geman-mcclure' else ''}"
         )
     elif check.odometry_factor > _MOST_FACTOR:
         lines.append(

@@ -106,8 +106,10 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
     subject = {int(barcode): int(number) for number, barcode in barcodes}
     ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
-    if len(subject) < len(barcodes) or np.any(seen[:, 2] <= 0.0):
-        raise SlamError(f"{odometry}: expected a subject for each barcode, and ranges above 0")
+    for k in np.flatnonzero(seen[:, 2] <= 0.0)[:1]:
+        raise SlamError(f"{odometry}: range {seen[k, 2]:g} at {seen[k, 0]:.3f}: expected above 0")
+    if len(subject) < len(barcodes):
+        raise SlamError(f"{odometry}: expected a subject for each barcode")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
     return _Sightings(times, frame, seen[order, 2], seen[order, 3], ids[order])
