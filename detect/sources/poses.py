@@ -81,8 +81,7 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
         to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
         c = to_dataset @ grown @ to_dataset.T
-    entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
-    return Step(prefix, *map(float, (*pose, *entries)))
+    return Step(prefix, *pose.tolist(), *c[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist())
 
 
 def carried(
@@ -121,12 +120,11 @@ class PosesOverTime:
     def at(self, time_s: float) -> TimedPose | None:
         """The pose at a time; None if unknown, or if a later one was requested before."""
         while self._after is not None and self._after.time_s < time_s:
-            passed, self._after = self._after, next(self._poses, None)
-            self._before = passed
-            if self._after is not None and self._after.time_s < passed.time_s:
+            self._before, self._after = self._after, next(self._poses, None)
+            if self._after is not None and self._after.time_s < self._before.time_s:
                 raise DetectError(
                     f"{self._name}: the pose of {self._after.time_s:.6f} s comes after that of "
-                    f"{passed.time_s:.6f} s: expected times in order"
+                    f"{self._before.time_s:.6f} s: expected times in order"
                 )
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one

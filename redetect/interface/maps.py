@@ -87,16 +87,17 @@ class RunMap(Table):
 
     def columns(self) -> dict[str, Any]:
         """Discs, then verticals, one row each."""
-        both = {"disc": self.discs, "vertical": self.lines}
-        xy = np.concatenate([some.xy for some in both.values()])
-        covariance = np.concatenate([some.covariance for some in both.values()])
+        ids, xy, covariance, rows = (
+            np.concatenate([vars(some)[name] for some in (self.discs, self.lines)])
+            for name in ("ids", "xy", "covariance", "rows")
+        )
         return {
-            "kind": [kind for kind, some in both.items() for _ in range(len(some))],
-            "id": np.concatenate([some.ids for some in both.values()]),
+            "kind": ["disc"] * len(self.discs) + ["vertical"] * len(self.lines),
+            "id": ids,
             "x_m": xy[:, 0],
             "y_m": xy[:, 1],
             **covariance_columns(covariance),
-            "rows": np.concatenate([some.rows for some in both.values()]),
+            "rows": rows,
         }
 
     def poses(self) -> Poses:
