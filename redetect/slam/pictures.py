@@ -287,8 +287,7 @@ def picture_of_frame(folder: Path, prefix: str) -> Path | None:
 def draw_crops(crops: Sequence[Crop], title: str) -> bytes:
     """Draw parts of images side by side, a cross-hair with a gap in the middle of each."""
     rows = -(-len(crops) // _CROPS_ABREAST)
-    size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
-    with picture(size, interactive=False) as (figure, content):
+    with picture((1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows), interactive=False) as (figure, content):
         figure.suptitle(title)
         axes = figure.subplots(rows, _CROPS_ABREAST, squeeze=False)
         for some in axes.flat:

@@ -73,6 +73,19 @@ def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_movements_in_a_gap_of_the_log_are_uncertain(utias: Path, tmp_path: Path) -> None:
+    shutil.copytree(utias, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "Robot1_Odometry.dat"
+    rows = log.read_text().splitlines()
+    log.write_text("\n".join(rows[:1000] + rows[1035:]) + "\n")  # 1.75 s
+    odometry = str(log)
+    assert main(["import", odometry, "-o", str(tmp_path / "run.circles"), "--force"]) == 0
+    lines = (tmp_path / "run.circles").read_text().splitlines()
+    sigma = np.sqrt([float(line.split()[10]) for line in lines if line.startswith("STEP")])
+    assert 3 <= np.count_nonzero(sigma) <= 4
+    assert 0.005 < sigma.max() < 0.02  # turns vary by 0.01 rad/s
+
+
 def _start(folder: Path) -> list[str]:
     return ["--start", *map(str, read_path(folder / "true.csv").poses[0])]
 

@@ -210,8 +210,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
             "--association joint"
         )
     said = [f"landmarks         {discs} discs, {lines} lines"]
-    waiting = len(ekf.line_slots) - lines
-    if waiting:
+    if waiting := len(ekf.line_slots) - lines:
         said.append(f"                  {waiting} more lines, seen with too little parallax")
     return run, landmark_map, said
 
@@ -242,10 +241,8 @@ def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[st
 def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
     """Distance of landmarks from those of another map with the same identifiers."""
     offsets, covariances = [], []
-    for some, others in (
-        (landmark_map.discs, reference.discs),
-        (landmark_map.lines, reference.lines),
-    ):
+    kinds = (landmark_map.discs, reference.discs), (landmark_map.lines, reference.lines)
+    for some, others in kinds:
         _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
         offsets.append(some.xy[own] - others.xy[other])
         covariances.append(some.covariance[own])
@@ -265,7 +262,7 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
 def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any]:
     """Figures of any filter for the JSON file."""
     count = run.count
-    figures: dict[str, Any] = {
+    figures = {
         "steps": len(run.path.poses) - 1,
         "disc_rows_used": count.discs,
         "line_rows_used": count.lines,
@@ -273,9 +270,7 @@ def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any
         "innovation_squared": count.innovation_squared,
         "innovation_expected": count.innovation_numbers,
     }
-    if distance is not None:
-        figures["distance_from_reference"] = distance
-    return figures
+    return figures if distance is None else figures | {"distance_from_reference": distance}
 
 
 def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:

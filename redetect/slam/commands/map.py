@@ -53,12 +53,9 @@ def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
     output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
-    paths = [PATH_NAME]
-    if command.more:
-        paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
-    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE]
-    if command.calibrate:
-        names.append(CAMERA_NAME)
+    several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
+    paths = several if command.more else [PATH_NAME]
+    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE] + [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = recordings_of(command)
     recording = joined(runs)

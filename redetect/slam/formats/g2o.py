@@ -90,8 +90,7 @@ def write_g2o(
     overwrite: bool = False,
 ) -> None:
     """Write a graph; numbers in full precision."""
-    rows = [*_rows(graph), *(f"# {comment}" for comment in comments)]
-    write_text(path, rows, overwrite=overwrite)
+    write_text(path, [*_rows(graph), *(f"# {c}" for c in comments)], overwrite=overwrite)
 
 
 def _rows(graph: RunGraph) -> Iterator[str]:
