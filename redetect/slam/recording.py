@@ -62,9 +62,7 @@ class CircleRows:
 
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""
-        return CircleRows(
-            self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
-        )
+        return CircleRows(*(each[chosen] for each in vars(self).values()))
 
     @classmethod
     def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:

@@ -78,10 +78,7 @@ def perform(command: Localize | Ekf) -> int:
     if command.association != "known":
         said += lost_lines(run, recording)
     elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
-        said.append(
-            "errors are much larger than stated: `slam audit` finds wrong identifiers, and "
-            "--association joint does not use them"
-        )
+        said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference = None if command.reference is None else read_path(command.reference)
     distance = None

@@ -151,9 +151,8 @@ def linearise(
         *_line_blocks(graph, estimate, error.lines, loss),
     ]
     if len(error.prior):
-        lines = len(graph.line_ids)
-        of_line = layout.first_line + 2 * np.arange(lines, dtype=np.int64)
-        near = np.tile(np.eye(2) / LINE_PRIOR_M, (lines, 1, 1))
+        of_line = layout.first_line + 2 * np.arange(len(error.prior), dtype=np.int64)
+        near = np.tile(np.eye(2) / LINE_PRIOR_M, (len(error.prior), 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
     if len(error.place) and unknown:
         by_place = np.eye(MOUNTING)[None, 3:5, unknown] / PLACE_PRIOR_M
