@@ -29,7 +29,7 @@ from redetect.storage.bounded import rows_of_numbers
 FARTHEST = 1e12
 #: Longest interval between poses that is interpolated (s).
 LARGEST_GAP_S = 1.0
-# A movement that is faster (m/s), and so many times as long as the one before, is a jump of the
+# A movement that is faster (m/s), and this many times as long as the one before, is a jump of the
 # odometry, as if it was reset. Steps over it have this covariance.
 _FASTEST_M_S, _LONGER = 50.0, 100.0
 _LOST: dict[str, Any] = dict(zip(STEP_NUMBERS[3:], (1e6, 0.0, 1e6, 0.0, 0.0, 100.0)))
