@@ -29,11 +29,7 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
 
 def invert(a_from_b: ArrayLike) -> FloatArray:
     """(..., 3) poses b_from_a."""
-    a = np.asarray(a_from_b, dtype=np.float64)
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = -(c * a[..., 0] + s * a[..., 1])
-    y = -(-s * a[..., 0] + c * a[..., 1])
-    return np.stack([x, y, wrap_angle(-a[..., 2])], axis=-1)
+    return between(a_from_b, np.zeros(3))
 
 
 def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
@@ -69,14 +65,8 @@ def log_motion(a_from_b: ArrayLike) -> FloatArray:
     half = 0.5 * wrap_angle(pose[..., 2])
     small = np.abs(half) < 1e-3
     cotangent = np.where(small, 1.0 - half**2 / 3.0, half / np.tan(np.where(small, 1.0, half)))
-    return np.stack(
-        [
-            cotangent * pose[..., 0] + half * pose[..., 1],
-            cotangent * pose[..., 1] - half * pose[..., 0],
-            2.0 * half,
-        ],
-        axis=-1,
-    )
+    x, y = pose[..., 0], pose[..., 1]
+    return np.stack([cotangent * x + half * y, cotangent * y - half * x, 2.0 * half], axis=-1)
 
 
 def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:

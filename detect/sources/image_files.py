@@ -21,6 +21,7 @@ from redetect.messages import excerpt
 from redetect.storage.bounded import leads_out, link_out
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+_KINDS = " ".join(sorted(IMAGE_SUFFIXES))
 
 WILDCARDS = frozenset("*?[")
 
@@ -96,9 +97,8 @@ def images_of_folder(folder: Path) -> ImageNames:
             found = ImageNames(place)
             if found.names:
                 return found
-    kinds = " ".join(sorted(IMAGE_SUFFIXES))
     raise DetectError(
-        f"{folder}: no images: expected a run folder, or {kinds} in it or in {folder / 'images'}"
+        f"{folder}: no images: expected a run folder, or {_KINDS} in it or in {folder / 'images'}"
     )
 
 
@@ -194,6 +194,5 @@ def _matching_images(pattern: Path) -> ImageNames:
     name = glob.escape(pattern.name) if pattern.is_file() else pattern.name
     found = ImageNames(pattern.parent, name)
     if not found.names:
-        kinds = " ".join(sorted(IMAGE_SUFFIXES))
-        raise DetectError(f"{pattern}: no image matches: expected {kinds}")
+        raise DetectError(f"{pattern}: no image matches: expected {_KINDS}")
     return found

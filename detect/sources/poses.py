@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,12 +22,17 @@ from detect.errors import DetectError
 from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, wrap_angle
+from redetect.landmarks.records import STEP_NUMBERS
 from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), so that products of two remain finite.
 FARTHEST = 1e12
 #: Longest interval between poses that is interpolated (s).
 LARGEST_GAP_S = 1.0
+# A movement that is faster (m/s), and this many times as long as the one before, is a jump of the
+# odometry, as if it was reset. Steps over it have this covariance.
+_FASTEST_M_S, _LONGER = 50.0, 100.0
+_LOST: dict[str, Any] = dict(zip(STEP_NUMBERS[3:], (1e6, 0.0, 1e6, 0.0, 0.0, 100.0)))
 #: Maps (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -81,8 +86,7 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
         to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
         c = to_dataset @ grown @ to_dataset.T
-    entries = (c[0, 0], c[0, 1], c[1, 1], c[0, 2], c[1, 2], c[2, 2])
-    return Step(prefix, *map(float, (*pose, *entries)))
+    return Step(prefix, *pose.tolist(), *c[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist())
 
 
 def carried(
@@ -113,6 +117,8 @@ class PosesOverTime:
     def __init__(self, poses: Iterator[TimedPose], name: str) -> None:
         self._poses = poses
         self._name = name
+        self.jumps = self.jumped = False  # now, and since the last step
+        self._way_m = 0.0
         self._before: TimedPose | None = None
         self._after = next(poses, None)
         if self._after is None:
@@ -121,13 +127,18 @@ class PosesOverTime:
     def at(self, time_s: float) -> TimedPose | None:
         """The pose at a time; None if unknown, or if a later one was requested before."""
         while self._after is not None and self._after.time_s < time_s:
-            passed, self._after = self._after, next(self._poses, None)
-            self._before = passed
-            if self._after is not None and self._after.time_s < passed.time_s:
+            self._before, self._after = self._after, next(self._poses, None)
+            if self._after is None:
+                break
+            way_m = math.hypot(self._after.x - self._before.x, self._after.y - self._before.y)
+            seconds = self._after.time_s - self._before.time_s
+            if seconds < 0.0:
                 raise DetectError(
                     f"{self._name}: the pose of {self._after.time_s:.6f} s comes after that of "
-                    f"{passed.time_s:.6f} s: expected times in order"
+                    f"{self._before.time_s:.6f} s: expected times in order"
                 )
+            self.jumps = way_m > max(_FASTEST_M_S * max(seconds, 1e-3), _LONGER * self._way_m)
+            self.jumped, self._way_m = self.jumped or self.jumps, way_m
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one
             end = after or before
@@ -155,20 +166,27 @@ def tick_poses(
 ) -> Generator[TimedPose, None, None]:
     """The poses of a differential-drive robot from wheel ticks; arcs from row to row."""
     x = y = theta = 0.0
-    last: tuple[float, float] | None = None
+    last: list[float] = []
     rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
-    for place, (time_s, left, right) in rows:
-        if last is not None:
-            ways = metres_per_tick * (left - last[0]), metres_per_tick * (right - last[1])
-            way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
-            if not max(abs(way), abs(half_turn)) <= FARTHEST:
-                raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
-            chord = way * float(np.sinc(half_turn / math.pi))
-            x += chord * math.cos(theta + half_turn)
-            y += chord * math.sin(theta + half_turn)
-            theta += 2.0 * half_turn
-        last = (left, right)
+    for place, (time_s, *counts) in rows:
+        ways = [metres_per_tick * _ticks(*ends) for ends in zip(last or counts, counts)]
+        way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
+        if not max(abs(way), abs(half_turn)) <= FARTHEST:
+            raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
+        chord = way * float(np.sinc(half_turn / math.pi))
+        x += chord * math.cos(theta + half_turn)
+        y += chord * math.sin(theta + half_turn)
+        theta += 2.0 * half_turn
+        last = counts
         yield TimedPose(time_s, x, y, theta)
+
+
+def _ticks(before: float, after: float) -> float:
+    """Ticks between two readings; a counter of 16 or 32 bits may overflow once in between."""
+    for turn in (2.0**16, 2.0**32):
+        if max(abs(before), abs(after)) < turn and abs(after - before) > 0.75 * turn:
+            return after - before - math.copysign(turn, after - before)
+    return after - before
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
@@ -199,7 +217,9 @@ class FramesAlongPoses(Frames):
                     self.left_out += 1
                     continue
                 if last is not None:
-                    image = replace(image, step=step_between(image.step.prefix, last, pose))
+                    step = step_between(image.step.prefix, last, pose)
+                    image = replace(image, step=replace(step, **_LOST) if poses.jumped else step)
+                poses.jumped = poses.jumps
                 yield image
                 last = pose
 

@@ -173,15 +173,12 @@ class Detection(Table):
 
     def columns(self) -> dict[str, Any]:
         """Discs, then verticals, one row each; columns of the other kind are NaN."""
-        parts: dict[str, Discs | Verticals] = {"disc": self.discs, "vertical": self.verticals}
-        columns: dict[str, Any] = {
-            "kind": [kind for kind, part in parts.items() for _ in range(len(part))]
+        kinds = ["disc"] * len(self.discs) + ["vertical"] * len(self.verticals)
+        parts: tuple[Discs | Verticals, ...] = (self.discs, self.verticals)
+        return {"kind": kinds} | {
+            name: np.concatenate([p.columns().get(name, np.full(len(p), np.nan)) for p in parts])
+            for name in (*self.discs.columns(), *self.verticals.columns())
         }
-        for name in (*self.discs.columns(), *self.verticals.columns()):
-            columns[name] = np.concatenate(
-                [p.columns().get(name, np.full(len(p), np.nan)) for p in parts.values()]
-            )
-        return columns
 
     def to_json(self) -> str:
         """An object with `discs`, `verticals` (lists of records) and `tilt`."""

@@ -87,16 +87,17 @@ class RunMap(Table):
 
     def columns(self) -> dict[str, Any]:
         """Discs, then verticals, one row each."""
-        both = {"disc": self.discs, "vertical": self.lines}
-        xy = np.concatenate([some.xy for some in both.values()])
-        covariance = np.concatenate([some.covariance for some in both.values()])
+        ids, xy, covariance, rows = (
+            np.concatenate([vars(some)[name] for some in (self.discs, self.lines)])
+            for name in ("ids", "xy", "covariance", "rows")
+        )
         return {
-            "kind": [kind for kind, some in both.items() for _ in range(len(some))],
-            "id": np.concatenate([some.ids for some in both.values()]),
+            "kind": ["disc"] * len(self.discs) + ["vertical"] * len(self.lines),
+            "id": ids,
             "x_m": xy[:, 0],
             "y_m": xy[:, 1],
             **covariance_columns(covariance),
-            "rows": np.concatenate([some.rows for some in both.values()]),
+            "rows": rows,
         }
 
     def poses(self) -> Poses:
@@ -232,11 +233,11 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
         paths[name] = tuple(np.ravel(paths[name]).tolist())
         if len(paths[name]) != 3:
             raise SlamError(f"{name} is {excerpt(options[name])}: expected three numbers")
-    if paths.get("camera") is not None:
+    if isinstance(paths.get("camera"), str | os.PathLike):
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
         more = paths["more"]
-        paths["more"] = tuple(map(Path, [more] if isinstance(more, PathLike) else more))
+        paths["more"] = tuple(map(Path, [more] if isinstance(more, str | os.PathLike) else more))
     return paths
 
 

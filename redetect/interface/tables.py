@@ -8,11 +8,11 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from redetect.messages import OneLineError
+from redetect.messages import OneLineError, excerpt
 
 FrameLibrary = Literal["pandas", "polars"]
 
@@ -44,8 +44,10 @@ class Table:
         redetect.interface.tables.ResultError
             If it is not installed.
         """
-        wanted = ("pandas", "polars") if library is None else (library,)
+        wanted = get_args(FrameLibrary) if library is None else (library,)
         for name in wanted:
+            if name not in get_args(FrameLibrary):
+                raise ResultError(f"library is {excerpt(name)}: expected pandas or polars")
             with suppress(ModuleNotFoundError):
                 return import_module(name).DataFrame(self.columns())
         raise ResultError(

@@ -66,24 +66,19 @@ _MARKER_CORNERS = _numbers(
     )
 )
 
-#: The columns of each table.
-TABLES: dict[TableName, tuple[Column, ...]] = {
-    "steps": (
-        *FRAME_COLUMNS,
-        *_numbers(
-            ("dx_m", "m", "movement to the left, in the robot's frame before it"),
-            ("dy_m", "m", "movement backward"),
-            ("dphi_rad", "rad", "turn, counterclockwise from above"),
-            ("cxx_m2", "m^2", "variance of dx"),
-            ("cxy_m2", "m^2", "covariance of dx and dy"),
-            ("cyy_m2", "m^2", "variance of dy"),
-            ("cxphi_m_rad", "m rad", "covariance of dx and dphi"),
-            ("cyphi_m_rad", "m rad", "covariance of dy and dphi"),
-            ("cphiphi_rad2", "rad^2", "variance of dphi"),
-        ),
+_OWN_COLUMNS: dict[TableName, tuple[Column, ...]] = {
+    "steps": _numbers(
+        ("dx_m", "m", "movement to the left, in the robot's frame before it"),
+        ("dy_m", "m", "movement backward"),
+        ("dphi_rad", "rad", "turn, counterclockwise from above"),
+        ("cxx_m2", "m^2", "variance of dx"),
+        ("cxy_m2", "m^2", "covariance of dx and dy"),
+        ("cyy_m2", "m^2", "variance of dy"),
+        ("cxphi_m_rad", "m rad", "covariance of dx and dphi"),
+        ("cyphi_m_rad", "m rad", "covariance of dy and dphi"),
+        ("cphiphi_rad2", "rad^2", "variance of dphi"),
     ),
     "circles": (
-        *FRAME_COLUMNS,
         *_numbers(
             ("px_m", "m", "the disc's centre, to the left of the robot"),
             ("py_m", "m", "the disc's centre, behind the robot (in front: negative)"),
@@ -95,7 +90,6 @@ TABLES: dict[TableName, tuple[Column, ...]] = {
         _IDS,
     ),
     "lines": (
-        *FRAME_COLUMNS,
         *_numbers(
             ("xtop", "1", "upper end, undistorted normalised image coordinates, to the right"),
             ("ytop", "1", "upper end, downward"),
@@ -109,14 +103,12 @@ TABLES: dict[TableName, tuple[Column, ...]] = {
         _IDS,
     ),
     "markers": (
-        *FRAME_COLUMNS,
         Column("dictionary", "text", "", "which set of markers it is from"),
         Column("id", "whole number", "", "the marker's number in that set"),
         *_numbers(("quality", "1", "agreement of the cells with the pattern, 1 is perfect")),
         *_MARKER_CORNERS,
     ),
     "tilts": (
-        *FRAME_COLUMNS,
         *_numbers(
             ("pitch_rad", "rad", "rotation about the robot's X that turns directions level"),
             ("roll_rad", "rad", "rotation about the robot's Y"),
@@ -127,6 +119,8 @@ TABLES: dict[TableName, tuple[Column, ...]] = {
         Column("lines", "whole number", "", "verticals that agree with it"),
     ),
 }
+#: The columns of each table.
+TABLES = {name: (*FRAME_COLUMNS, *own) for name, own in _OWN_COLUMNS.items()}
 
 
 def table_of(record: Step | Landmark | FrameTilt) -> TableName:

@@ -35,7 +35,7 @@ def diagonal_blocks(
         If the residuals do not determine the unknowns.
     """
     found = inverse_blocks(equations.matrix, blocks)
-    eliminated, shared = _shared(equations)
+    eliminated, shared = by_shared(equations)
     for k, (width, first) in enumerate(blocks):
         by = eliminated[first[:, None] + np.arange(width)]
         found[k] = found[k] + by @ shared @ np.swapaxes(by, 1, 2)
@@ -51,16 +51,18 @@ def chosen_covariance(equations: NormalEquations, chosen: IntArray) -> FloatArra
         unit = np.zeros((size, len(some)))
         unit[some, np.arange(len(some))] = 1.0
         covariance[:, first : first + len(some)] = factored.solve(unit)[chosen]
-    eliminated, shared = _shared(equations)
+    eliminated, shared = by_shared(equations)
     covariance += eliminated[chosen] @ shared @ eliminated[chosen].T
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
-def _shared(equations: NormalEquations) -> tuple[FloatArray, FloatArray]:
+def by_shared(equations: NormalEquations) -> tuple[FloatArray, FloatArray]:
     """Border solved by the matrix of the others (K, s), and covariance of the shared (s, s)."""
     if equations.corner.size == 0:
         return equations.border, equations.corner
     eliminated = factor(equations.matrix).solve(equations.border)
+    if equations.considered is not None:
+        return eliminated, equations.considered
     return eliminated, scaled_inverse(equations.corner - equations.border.T @ eliminated)
 
 

@@ -63,7 +63,7 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     )
 
 
-def _with_heading(matrices: FloatArray) -> FloatArray:
+def with_heading(matrices: FloatArray) -> FloatArray:
     """(..., 3, 3) from (..., 2, 2) for a pose's position, with 1 for its heading."""
     whole = np.zeros((*matrices.shape[:-2], 3, 3))
     whole[..., :2, :2] = matrices
@@ -79,9 +79,9 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
     before, moved = np.broadcast_arrays(pose, step)
     turn = rotation(before[..., 2])
     way = np.einsum("...ij,...j->...i", turn, moved[..., :2])
-    by_pose = _with_heading(np.broadcast_to(np.eye(2), turn.shape))
+    by_pose = with_heading(np.broadcast_to(np.eye(2), turn.shape))
     by_pose[..., 0, 2], by_pose[..., 1, 2] = -way[..., 1], way[..., 0]
-    return by_pose, _with_heading(turn)
+    return by_pose, with_heading(turn)
 
 
 def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -91,7 +91,7 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
     """
     before, _ = np.broadcast_arrays(first, second)
     step = between(first, second)
-    by_second = _with_heading(np.swapaxes(rotation(before[..., 2]), -1, -2))
+    by_second = with_heading(np.swapaxes(rotation(before[..., 2]), -1, -2))
     by_first = -by_second
     by_first[..., 0, 2], by_first[..., 1, 2] = step[..., 1], -step[..., 0]
     return by_first, by_second

@@ -44,12 +44,10 @@ def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])
-    first = True
-    for row in rows:
-        if first and not noise.nothing:
+    for number, row in enumerate(rows):
+        if number == 0 and not noise.nothing:
             line_end = b"\r\n" if (row.source or b"").endswith(b"\r\n") else b"\n"
             yield Row(None, b"# " + noise.comment.encode() + line_end)
-        first = False
         record = row.record
         rng = of_steps if isinstance(record, Step) else of_landmarks
         yield row if record is None else row.with_record(_noisy(record, noise, rng))

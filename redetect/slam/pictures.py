@@ -47,6 +47,7 @@ _MOST_NUMBERED = 40
 _MOST_ELLIPSES = 700
 # Margin around path and discs within which verticals are drawn.
 _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
+_Extent = tuple[FloatArray, FloatArray]  # low and high corner (m)
 
 
 @contextmanager
@@ -122,7 +123,7 @@ def draw_map(
     with picture(size, interactive=interactive) as (figure, content):
         all_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, (name, some, poses) in zip(all_axes, panels):
-            _draw_panel(axes, some, poses, reference, low, high)
+            _draw_panel(axes, some, poses, reference, (low, high))
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
             axes.set(xlabel="x / m", ylabel="y / m")
             axes.set_title(name, fontsize=11)
@@ -179,11 +180,8 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
         # A logarithm has no place for an error of exactly 0.
         axes.plot(step, np.maximum(nees, 1e-3), color="black", lw=0.8, label="NEES", zorder=3)
         inside = (nees[known] >= NEES_BAND[0]) & (nees[known] <= NEES_BAND[1])
-        axes.set_title(
-            f"mean {np.mean(nees[known]):.3g}, in the band: {np.mean(inside):.1%}",
-            fontsize=9,
-            loc="right",
-        )
+        share = f"mean {np.mean(nees[known]):.3g}, in the band: {np.mean(inside):.1%}"
+        axes.set_title(share, fontsize=9, loc="right")
         # Space above for the legend.
         highest = max(100.0, 5.0 * float(np.max(nees[known])))
         axes.set_ylim(min(0.05, max(1e-3, float(np.min(nees[known])) / 1.5)), highest)
@@ -192,9 +190,7 @@ def _draw_nees(axes: Axes, step: IntArray, nees: FloatArray) -> None:
     axes.legend(loc="upper left", fontsize=8, ncols=3)
 
 
-def _extent(
-    drawn: list[tuple[LandmarkMap, Path2D]], reference: Path2D | None
-) -> tuple[FloatArray, FloatArray]:
+def _extent(drawn: list[tuple[LandmarkMap, Path2D]], reference: Path2D | None) -> _Extent:
     """Corners of the picture (m): all paths and discs, and a margin for verticals near them."""
     points = [xy for some, path in drawn for xy in (path.poses[:, :2], some.discs.xy)]
     if reference is not None:
@@ -212,12 +208,7 @@ def _extent(
 
 
 def _draw_panel(
-    axes: Axes,
-    some: LandmarkMap,
-    path: Path2D,
-    reference: Path2D | None,
-    low: FloatArray,
-    high: FloatArray,
+    axes: Axes, some: LandmarkMap, path: Path2D, reference: Path2D | None, extent: _Extent
 ) -> None:
     if reference is not None:
         axes.plot(
@@ -231,8 +222,8 @@ def _draw_panel(
         label = None if k else "path"
         axes.plot(poses[:, 0], poses[:, 1], color=_PATH, lw=0.9, label=label, zorder=3)
     ellipses = len(some.discs) + len(some.lines) <= _MOST_ELLIPSES
-    _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), low, high, ellipses=ellipses)
-    _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), low, high, ellipses=ellipses)
+    _draw_landmarks(axes, some.lines, ("vertical", _LINE, "x"), extent, ellipses=ellipses)
+    _draw_landmarks(axes, some.discs, ("disc", _DISC, "o"), extent, ellipses=ellipses)
     if len(some.discs) <= _MOST_NUMBERED:
         for number, (x, y) in zip(some.discs.ids.tolist(), some.discs.xy.tolist()):
             axes.annotate(
@@ -248,15 +239,10 @@ def _draw_panel(
 
 
 def _draw_landmarks(
-    axes: Axes,
-    some: Landmarks,
-    look: tuple[str, str, str],
-    low: FloatArray,
-    high: FloatArray,
-    *,
-    ellipses: bool,
+    axes: Axes, some: Landmarks, look: tuple[str, str, str], extent: _Extent, *, ellipses: bool
 ) -> None:
     name, colour, marker = look
+    low, high = extent
     if len(some) == 0:
         return
     shown = np.all((some.xy >= low) & (some.xy <= high), axis=1)
@@ -301,8 +287,7 @@ def picture_of_frame(folder: Path, prefix: str) -> Path | None:
 def draw_crops(crops: Sequence[Crop], title: str) -> bytes:
     """Draw parts of images side by side, a cross-hair with a gap in the middle of each."""
     rows = -(-len(crops) // _CROPS_ABREAST)
-    size = (1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows)
-    with picture(size, interactive=False) as (figure, content):
+    with picture((1.6 * _CROPS_ABREAST, 0.4 + 1.5 * rows), interactive=False) as (figure, content):
         figure.suptitle(title)
         axes = figure.subplots(rows, _CROPS_ABREAST, squeeze=False)
         for some in axes.flat:

@@ -36,6 +36,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+# In the head of files by `detect`: the covariances of their discs include that of a tilt.
+_TILTED, _HEAD_BYTES = b" tilt_sigma_deg=", 1 << 16
 # Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
@@ -60,9 +62,7 @@ class CircleRows:
 
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""
-        return CircleRows(
-            self.frame[chosen], self.xy[chosen], self.covariance[chosen], self.ids[chosen]
-        )
+        return CircleRows(*(each[chosen] for each in vars(self).values()))
 
     @classmethod
     def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
@@ -125,6 +125,7 @@ class Recording:
     circles: CircleRows
     lines: LineRows  # none if they were not requested
     unstated_steps: int = 0  # number of steps with an assumed covariance
+    tilted: bool = False  # whether covariances of discs include that of an unknown tilt
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -147,6 +148,7 @@ class Recording:
             self.step_covariance[first:end],
             replace(discs, frame=discs.frame - first),
             replace(lines, frame=lines.frame - first),
+            tilted=self.tilted,
         )
 
 
@@ -164,25 +166,22 @@ def joined(runs: Sequence[Recording]) -> Recording:
         return runs[0]
     starts = first_poses(runs)
     lost = np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, LOST_SIGMA_RAD**2])[None]
-    circles, lines = [run.circles for run in runs], [run.lines for run in runs]
+    circles = [replace(run.circles, frame=run.circles.frame + k) for run, k in zip(runs, starts)]
+    lines = [replace(run.lines, frame=run.lines.frame + k) for run, k in zip(runs, starts)]
     # The first run's start is not a step.
     return Recording(
         tuple(name for run in runs for name in ("start", *run.prefixes))[1:],
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
         np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
-        CircleRows(
-            np.concatenate([some.frame + start for some, start in zip(circles, starts)]),
-            np.concatenate([some.xy for some in circles]),
-            np.concatenate([some.covariance for some in circles]),
-            np.concatenate([some.ids for some in circles]),
-        ),
+        CircleRows(*map(np.concatenate, zip(*(vars(some).values() for some in circles)))),
         LineRows(
-            np.concatenate([some.frame + start for some, start in zip(lines, starts)]),
+            np.concatenate([some.frame for some in lines]),
             np.concatenate([some.bearing_rad for some in lines]),
             np.concatenate([some.sigma_rad for some in lines]),
             tuple(ids for some in lines for ids in some.ids),
         ),
         sum(run.unstated_steps for run in runs),
+        any(run.tilted for run in runs),
     )
 
 
@@ -260,7 +259,11 @@ def read_recording(
     frames = list(read_frames(files[0]))
     for other in files[1:]:
         frames = _merged(frames, list(read_frames(other)), files[0], other)
-    return recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
+    found = recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
+    if not files[0].is_file():  # a pipe cannot be read twice
+        return found
+    with files[0].open("rb") as stream:
+        return replace(found, tilted=_TILTED in stream.read(_HEAD_BYTES))
 
 
 def recording_of_frames(

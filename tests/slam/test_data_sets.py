@@ -73,6 +73,19 @@ def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_movements_in_a_gap_of_the_log_are_uncertain(utias: Path, tmp_path: Path) -> None:
+    shutil.copytree(utias, tmp_path, dirs_exist_ok=True)
+    log = tmp_path / "Robot1_Odometry.dat"
+    rows = log.read_text().splitlines()
+    log.write_text("\n".join(rows[:1000] + rows[1035:]) + "\n")  # 1.75 s
+    odometry = str(log)
+    assert main(["import", odometry, "-o", str(tmp_path / "run.circles"), "--force"]) == 0
+    lines = (tmp_path / "run.circles").read_text().splitlines()
+    sigma = np.sqrt([float(line.split()[10]) for line in lines if line.startswith("STEP")])
+    assert 3 <= np.count_nonzero(sigma) <= 4
+    assert 0.005 < sigma.max() < 0.02  # turns vary by 0.01 rad/s
+
+
 def _start(folder: Path) -> list[str]:
     return ["--start", *map(str, read_path(folder / "true.csv").poses[0])]
 
@@ -150,15 +163,15 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         ),
         (
             "Robot1_Measurement",
-            "5 100 -1 0\n",
-            "expected a subject for each barcode, and ranges above 0",
+            "5 100 1 0\n6 100 -1 0\n",
+            "Odometry.dat: range -1 at 6.000: expected above 0",
         ),
         (
             "Robot1_Measurement",
             "5 100 1e200 0\n",
             "dat: expected numbers within +-1e+24",
         ),
-        ("Barcodes", "6 100\n7 100\n", "expected a subject for each barcode, and ranges above 0"),
+        ("Barcodes", "6 100\n7 100\n", "expected a subject for each barcode"),
         (
             "Robot1_Groundtruth",
             "5 1 0 0\n3 1 0 0\n",
@@ -306,6 +319,12 @@ def test_trunks_are_found_where_nothing_hides_them() -> None:
     order = np.argsort(bearing)
     assert found[:, 1] == pytest.approx(bearing[order], abs=np.radians(0.3))
     assert found[:, 0] == pytest.approx(np.hypot(*trees[order].T), abs=0.15)
+    around = np.linspace(-1.0, 1.0, 15)
+    for reach in (8.0, 20.0):
+        ring = reach * np.stack([np.cos(around), np.sin(around)], axis=1)
+        assert np.mean(trees_of(scan_of(ring, np.zeros(3)) / 100.0)[:, 0]) == pytest.approx(
+            reach, abs=0.02
+        )
     wall = np.full(361, 10.0)
     assert trees_of(wall).shape == (0, 2)
 

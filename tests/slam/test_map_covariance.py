@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from redetect.landmarks import LandmarkFileError
+from redetect.landmarks import LandmarkFileError, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
@@ -18,11 +18,19 @@ from redetect.landmarks.map_file import (
     with_joint_covariance,
     write_map,
 )
+from redetect.plane import chain_steps
 from redetect.slam.commands.files import camera_of_run
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.mapping.solve import equations_at, joint_covariance
-from redetect.slam.recording import read_recording
+from redetect.slam.models import disc_in_robot
+from redetect.slam.recording import (
+    CircleRows,
+    LineRows,
+    Recording,
+    frames_of_discs,
+    read_recording,
+)
 from redetect.storage import OutputExistsError
 
 
@@ -91,3 +99,39 @@ def test_files_of_another_map_are_refused(
     covariance_file(place).write_bytes(b"no array")
     with pytest.raises(LandmarkFileError, match="cannot be read"):
         with_joint_covariance(some, place)
+
+
+@pytest.mark.parametrize("frames", [1, 200])  # number over which the tilt stays the same
+def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
+    frames: int, tmp_path: Path
+) -> None:
+    found = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        way = np.column_stack([np.zeros(60), np.full(60, -0.3), 0.01 * rng.standard_normal(60)])
+        poses, places = chain_steps(way), np.arange(1.0, 18.0, 1.5)
+        discs = np.column_stack([rng.uniform(-1.0, 1.0, len(places)), -places])
+        sigma, rows = np.radians(0.3), []
+        tilts = np.repeat(sigma * rng.standard_normal((60, 2)), frames, axis=0)
+        for k, pose in enumerate(poses[1:]):
+            seen = disc_in_robot(pose, discs)
+            near = np.flatnonzero((seen[:, 1] < -1.0) & (seen[:, 1] > -5.0))
+            for i, (x, y) in zip(near, seen[near]):
+                by_tilt = np.outer([x, y], [y, -x]) / 1.5
+                spread = 1e-4 * np.eye(2) + sigma**2 * by_tilt @ by_tilt.T
+                off = by_tilt @ tilts[k] + 0.01 * rng.standard_normal(2)
+                rows.append((k, seen[i] + off, spread, int(i)))
+        noise = np.diag([1e-4, 4e-4, 1e-5])
+        steps = way + rng.multivariate_normal(np.zeros(3), noise, 60)
+        names = tuple(f"f.{k}" for k in range(60))
+        run = Recording(
+            names, steps, np.tile(noise, (60, 1, 1)), CircleRows.of(rows), LineRows.of()
+        )
+        head = "settings radius_m=0.1 tilt_sigma_deg=0.3"
+        write_frames(tmp_path / f"{seed}.circles", frames_of_discs(run), head=head)
+        mapped = map_run(read_recording(tmp_path / f"{seed}.circles"))
+        error = mapped.estimate.disc_xy - discs[mapped.graph.disc_ids]
+        found.append(np.mean(squared_mahalanobis(error, mapped.covariance.discs)) / 2.0)
+        joint = joint_covariance(mapped.graph, mapped.estimate, Weighting())
+        np.testing.assert_allclose(joint[-2:, -2:], mapped.covariance.discs[-1], rtol=1e-6)
+    assert 0.2 < np.mean(found) < 2.0  # 0.5 and 0.8; as if independent 1.0 and 4.2

@@ -54,6 +54,7 @@ def test_wrong_lengths_and_turns_of_odometry_are_found() -> None:
     found = _check(replace(run, steps=steps))
     assert found.turn_per_metre == pytest.approx(-0.03, abs=4.0 * found.turn_per_metre_sigma)
     assert abs(found.length) < 0.02
+    assert abs(found.lag_frames) < 4.0 * found.lag_frames_sigma
 
 
 def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
@@ -63,6 +64,22 @@ def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
     one = map_run(run.part(0, 1))
     found = check_odometry(one.graph, one.estimate, Weighting(), one.table.expected)
     assert np.isnan(found.odometry_factor)
+
+
+@pytest.mark.parametrize("shift", [-0.3, 0.3])  # intervals by which odometry is later
+def test_odometry_with_another_clock_is_found(
+    shift: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _run(6)
+    steps = run.steps.copy()
+    steps[1:-1] -= 0.5 * shift * (run.steps[2:] - run.steps[:-2])
+    late = replace(run, steps=steps)
+    found = _check(late)
+    assert found.lag_frames == pytest.approx(shift, abs=4.0 * found.lag_frames_sigma + 0.05)
+    write_frames(tmp_path / "map.circles", frames_of_discs(late))
+    assert main(["map", str(tmp_path)]) == 0
+    way = "behind" if shift > 0.0 else "ahead of"
+    assert f"of the interval between frames {way} them" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.8])
@@ -96,6 +113,10 @@ def test_wrong_identifiers_are_not_blamed_on_odometry(
     said = capsys.readouterr().out
     assert "times as large as their covariances state: `slam audit`" in said
     assert "errors of odometry" not in said
+    assert main(["map", str(tmp_path), "--loss", "geman-mcclure", "--force"]) == 0
+    assert "maps without them" not in capsys.readouterr().out
+    assert main(["ekf", str(tmp_path)]) == 0
+    assert "errors are much larger than stated: `slam audit`" in capsys.readouterr().out
 
 
 def test_a_slip_is_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

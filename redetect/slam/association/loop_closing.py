@@ -243,8 +243,7 @@ def closed_path(path: FloatArray, matches: Sequence[Match], lost: IntArray) -> F
     Takes `path` (N + 1, 3), and the lost steps; returns (N + 1, 3).
     """
     count = len(path) - 1
-    first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)
-    second = np.array([m.later_frame + 1 for m in matches], dtype=np.int64)
+    first, second = 1 + np.array([(m.earlier_frame, m.later_frame) for m in matches]).T
     motion = np.array([m.motion for m in matches])
     moved = np.column_stack([apply(motion, path[second, :2]), path[second, 2] + motion[:, 2]])
     before = np.concatenate([np.arange(count), first])
@@ -263,12 +262,12 @@ def _chained(
     before: IntArray, after: IntArray, differences: FloatArray, weight: FloatArray, count: int
 ) -> FloatArray:
     """Values at nodes 0 (where they are 0) to count from weighted differences between nodes."""
-    edges = np.arange(len(before))
-    row = np.concatenate([edges, edges])
+    edges = len(before)
+    row = np.tile(np.arange(edges), 2)
     column = np.concatenate([after, before]) - 1
     value = np.concatenate([weight, -weight])
     free = column >= 0
-    matrix = csc_array((value[free], (row[free], column[free])), shape=(len(edges), count))
+    matrix = csc_array((value[free], (row[free], column[free])), shape=(edges, count))
     solver = splu((matrix.T @ matrix).tocsc(), permc_spec="MMD_AT_PLUS_A")
     solved = solver.solve(np.asarray(matrix.T @ (differences * weight[:, None])))
     return np.concatenate([np.zeros((1, differences.shape[1])), solved])

@@ -109,9 +109,7 @@ def located(
     if min(len(discs), len(disc_xy)) < least:
         return None
     motion = motion_onto(discs, disc_xy, ANYWHERE)
-    if motion.agreeing < least:
-        return None
-    found = refined_motion(discs, disc_xy, motion.pose, least)
+    found = refined_motion(discs, disc_xy, motion.pose, least) if motion.agreeing >= least else None
     if found is None:
         return None
     pose, pairs = found

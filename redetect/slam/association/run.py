@@ -135,10 +135,7 @@ def associate_run(
             if len(line_labels):
                 report("verticals on the path of the discs")
                 line_labels, path_of_both = lines_by_points(
-                    recording,
-                    path,
-                    labels,
-                    line_labels,
+                    *(recording, path, labels, line_labels),
                     camera_xy=camera_xy,
                     disc_sigma_scale=settings.sigma_scale,
                 )
@@ -266,12 +263,9 @@ def _closed(
         if not by_discs:
             start = chain_steps(recording.steps) if path is None else path
             line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+        of_kinds = (labels, none) if by_discs else (none, labels)
         found = solve_path(
-            swayed,
-            labels if by_discs else none,
-            none if by_discs else labels,
-            path,
-            line_xy,
+            *(swayed, *of_kinds, path, line_xy),
             camera_xy=camera_xy,
             sigma_scale=settings.sigma_scale,
         )

@@ -62,10 +62,7 @@ def perform(options: Associate) -> int:
                 "noise": factor,
                 "seconds": round(seconds, 2),
                 "loop_matches": len(found.matches),
-                "scores": {
-                    kind: {stage: asdict(score) for stage, score in stages.items()}
-                    for kind, stages in scores.items()
-                },
+                "scores": {k: {s: asdict(x) for s, x in by.items()} for k, by in scores.items()},
             }
         )
         print("\n".join(score_lines(factor, seconds, scores)))

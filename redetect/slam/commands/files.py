@@ -24,19 +24,17 @@ MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
 
 def files_of(flags: RunFlags, run: Path) -> list[Path]:
     """The landmark files of a run, of the kinds that a command names."""
-    circles = flags.circles or not flags.lines
-    return landmark_files(run, circles=circles, lines=flags.lines, stem=flags.stem)
+    return landmark_files(run, **_wanted(flags))
+
+
+def _wanted(flags: RunFlags) -> dict[str, Any]:
+    return {"circles": flags.circles or not flags.lines, "lines": flags.lines, "stem": flags.stem}
 
 
 def read_runs(flags: RunFlags) -> list[Recording]:
     """Read the rows of the runs that a command names."""
-    circles = flags.circles or not flags.lines
-    return [
-        read_recording(
-            run, circles=circles, lines=flags.lines, stem=flags.stem, noise=flags.odometry_noise
-        )
-        for run in flags.runs
-    ]
+    noise = flags.odometry_noise
+    return [read_recording(run, noise=noise, **_wanted(flags)) for run in flags.runs]
 
 
 def recordings_of(flags: RunFlags) -> list[Recording]:
@@ -71,14 +69,14 @@ def recording_of(flags: RunFlags) -> Recording:
     return recording
 
 
-def camera_of_run(run: Path, camera: Path | None = None) -> Camera:
+def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
     """Read the calibration that belongs to a run, a folder or a file in one.
 
     By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
     there is none, `camera.CameraError` if it is ambiguous.
     """
     if camera is not None:
-        return read_camera(camera)
+        return camera if isinstance(camera, Camera) else read_camera(camera)
     folder = run if run.is_dir() else run.parent
     found = camera_in(folder)
     if found is None:

@@ -48,6 +48,8 @@ from redetect.storage import demand_free, write_bytes
 ERROR_PICTURE = "errors.png"
 # The pose is lost if this many frames with discs in succession match none of them.
 _LOST_FRAMES = 20
+# Factor of innovations with known identifiers above which some are wrong, or covariances too small.
+_MOST_FACTOR = 2.5
 
 
 #: Results of a filter: the run, the map, and further lines for the terminal.
@@ -75,6 +77,8 @@ def perform(command: Localize | Ekf) -> int:
     seconds = time.perf_counter() - began
     if command.association != "known":
         said += lost_lines(run, recording)
+    elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
+        said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     reference = None if command.reference is None else read_path(command.reference)
     distance = None
@@ -203,8 +207,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
             "--association joint"
         )
     said = [f"landmarks         {discs} discs, {lines} lines"]
-    waiting = len(ekf.line_slots) - lines
-    if waiting:
+    if waiting := len(ekf.line_slots) - lines:
         said.append(f"                  {waiting} more lines, seen with too little parallax")
     return run, landmark_map, said
 
@@ -235,10 +238,8 @@ def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[st
 def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
     """Distance of landmarks from those of another map with the same identifiers."""
     offsets, covariances = [], []
-    for some, others in (
-        (landmark_map.discs, reference.discs),
-        (landmark_map.lines, reference.lines),
-    ):
+    kinds = (landmark_map.discs, reference.discs), (landmark_map.lines, reference.lines)
+    for some, others in kinds:
         _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
         offsets.append(some.xy[own] - others.xy[other])
         covariances.append(some.covariance[own])
@@ -258,7 +259,7 @@ def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str,
 def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any]:
     """Figures of any filter for the JSON file."""
     count = run.count
-    figures: dict[str, Any] = {
+    figures = {
         "steps": len(run.path.poses) - 1,
         "disc_rows_used": count.discs,
         "line_rows_used": count.lines,
@@ -266,9 +267,7 @@ def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any
         "innovation_squared": count.innovation_squared,
         "innovation_expected": count.innovation_numbers,
     }
-    if distance is not None:
-        figures["distance_from_reference"] = distance
-    return figures
+    return figures if distance is None else figures | {"distance_from_reference": distance}
 
 
 def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
@@ -287,16 +286,13 @@ def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
             f"{count.innovation_numbers}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
         )
     if distance is not None:
-        lines.append(
-            "from reference    position rms {position_rms_m:.3f} m, median "
-            "{position_median_m:.3f}, max {position_max_m:.3f}, last {position_last_m:.3f}".format(
-                **distance
+        for head, kind, unit, scale, form in (
+            ("from reference    position", "position_{}_m", "m", 1.0, ".3f"),
+            ("                  heading", "heading_{}_rad", "deg", 180.0 / math.pi, ".2f"),
+        ):
+            rms, *more = (
+                f"{name} {scale * distance[kind.format(name)]:{form}}"
+                for name in ("rms", "median", "max", "last")
             )
-        )
-        degrees = {k: math.degrees(v) for k, v in distance.items() if k.startswith("heading")}
-        lines.append(
-            "                  heading rms {heading_rms_rad:.2f} deg, median "
-            "{heading_median_rad:.2f}, max {heading_max_rad:.2f}, last {heading_last_rad:.2f}"
-            "".format(**degrees)
-        )
+            lines.append(f"{head} {rms} {unit}, {', '.join(more)}")
     return lines

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -29,13 +28,7 @@ from redetect.slam.commands.files import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck
-from redetect.slam.mapping.run_map import (
-    MappedRun,
-    Mounting,
-    as_json,
-    map_run,
-    table_lines,
-)
+from redetect.slam.mapping.run_map import MappedRun, Mounting, as_json, map_run, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
@@ -47,8 +40,8 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
 
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
-# relative changes of lengths and turns (rad/m).
-_SIGNIFICANT, _LEAST_LENGTH, _LEAST_TURN = 5.0, 0.02, 0.01
+# changes of lengths (%), turns (rad/m) and lags (intervals between frames).
+_SIGNIFICANT, _LEAST_PERCENT, _LEAST_TURN, _LEAST_LAG = 5.0, 2.0, 0.01, 0.1
 # Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
 
@@ -60,12 +53,9 @@ def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
     output = command.output or default_output(command.run)
     joint_name = covariance_file(Path(MAP_NAME)).name
-    paths = [PATH_NAME]
-    if command.more:
-        paths = [f"path_{k}.csv" for k in range(1, len(command.runs) + 1)]
-    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE]
-    if command.calibrate:
-        names.append(CAMERA_NAME)
+    several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
+    paths = several if command.more else [PATH_NAME]
+    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE] + [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = recordings_of(command)
     recording = joined(runs)
@@ -144,41 +134,39 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
         (left_out.line_rows, "rows of these lines, not used"),
     ]
     lines += [f"{what}: {count}" for count, what in said if count]
-    lines += doubts_of(check, mapped.table.root, mapped.prefixes)
+    lines += doubts_of(check, mapped)
     lines.append(f"steps of the solver: {mapped.steps}, in {seconds:.2f} s")
     return lines
 
 
-def doubts_of(check: OdometryCheck, root: float, names: Sequence[str]) -> list[str]:
-    """What does not fit, in words: large and significant errors of odometry, or of rows.
-
-    `root` is the factor on the standard deviations of the map, `names` those of its poses.
-    """
-    least = _SIGNIFICANT * max(root, 1.0)
+def doubts_of(check: OdometryCheck, mapped: MappedRun) -> list[str]:
+    """What does not fit, in words: large and significant errors of odometry, or of rows."""
+    least = _SIGNIFICANT * max(mapped.table.root, 1.0)
     lines = []
-    if abs(check.length) > max(least * check.length_sigma, _LEAST_LENGTH):
-        percent, way = 100.0 * abs(check.length), "longer" if check.length > 0.0 else "shorter"
-        lines.append(
-            f"odometry does not fit the rows: its steps would have to be {percent:.1f} % {way}; is "
-            "it in metres, is the discs' radius right (--radius-m), does the camera lean or have "
-            "another height (--calibrate)?"
-        )
-    if abs(check.turn_per_metre) > max(least * check.turn_per_metre_sigma, _LEAST_TURN):
-        side = "left" if check.turn_per_metre > 0.0 else "right"
-        lines.append(
-            "odometry does not fit the rows: it would have to turn to the "
-            f"{side} by {abs(check.turn_per_metre):.3f} rad more in each metre"
-        )
+    for value, sigma, smallest, ways, text in (
+        (100.0 * check.length, 100.0 * check.length_sigma, _LEAST_PERCENT, ("longer", "shorter"),
+         "its steps would have to be {0:.1f} % {1}; is it in metres, is the discs' radius right "
+         "(--radius-m), does the camera lean or have another height (--calibrate)?"),
+        (check.turn_per_metre, check.turn_per_metre_sigma, _LEAST_TURN, ("left", "right"),
+         "it would have to turn to the {1} by {0:.3f} rad more in each metre"),
+        (check.lag_frames, check.lag_frames_sigma, _LEAST_LAG, ("behind", "ahead of"),
+         "it is {0:.2f} of the interval between frames {1} them; do the clocks of odometry and "
+         "camera agree, is the camera where its calibration says (--calibrate)?"),
+    ):  # fmt: skip
+        if abs(value) > max(least * sigma, smallest):
+            said = text.format(abs(value), ways[value < 0.0])
+            lines.append(f"odometry does not fit the rows: {said}")
     if check.outliers:
         lines.append(
             f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
-            f"are wrong, most at {names[check.worst_step + 1]}"
+            f"are wrong, most at {mapped.prefixes[check.worst_step + 1]}"
         )
     if check.rows_factor > _MOST_FACTOR:
+        without = ", and --loss geman-mcclure maps without them"
         lines.append(
             f"errors of rows are {math.sqrt(check.rows_factor):.1f} times as large as their "
-            "covariances state: `slam audit` finds wrong identifiers, and --loss geman-mcclure "
-            "maps without them"
+            "covariances state: `slam audit` finds wrong identifiers"
+            f"{without if mapped.weighting.loss != 'geman-mcclure' else ''}"
         )
     elif check.odometry_factor > _MOST_FACTOR:
         lines.append(

@@ -357,8 +357,7 @@ class Associator:
         """Rows with the identifiers of their paired landmarks."""
         if self.method == "known":
             return rows
-        discs = self._discs(rows.circles, estimate)
-        lines = self._lines(rows.lines, estimate)
+        discs, lines = self._discs(rows.circles, estimate), self._lines(rows.lines, estimate)
         return FrameRows(replace(rows.circles, ids=discs), replace(rows.lines, ids=lines))
 
     def _discs(self, rows: CircleRows, estimate: Filter) -> IntArray:

@@ -14,6 +14,7 @@ algorithm for real-time implementation", IEEE Transactions on Robotics and Autom
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -25,11 +26,11 @@ from scipy.io.matlab import MatReadError
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import LARGEST_NUMBER
-from redetect.landmarks.axes import to_dataset
+from redetect.landmarks.axes import covariance_from_dataset, to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
-from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
+from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
 
 #: Suffixes of the names of a robot's odometry and of the files beside it.
@@ -38,6 +39,8 @@ LANDMARKS, BARCODES = "Landmark_Groundtruth.dat", "Barcodes.dat"
 _ROBOTS = 5
 #: Most that the clock of a robot's log may go back, seconds.
 _SET_BACK_S = 1.0
+# A log has a gap if nothing is logged for this many of its usual intervals, and this time.
+_GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.25
 
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
@@ -77,16 +80,24 @@ def _steps_between(
     times: FloatArray,
     along: Callable[[IntArray, FloatArray], FloatArray],
     ends: tuple[float, float],
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Movements (N, 3) to each time, from the first of `ends` on; log rows hold until the next.
 
-    `along` gives the movements for rows of the log (k,) held for some seconds (k,).
+    `along` gives the movements for rows of the log (k,) held for some seconds (k,). Movements in
+    gaps of the log have a covariance (N, 3, 3), from how much those per second vary; others zero.
     """
     knots = np.union1d(np.append(logged, ends[1]), times)
     knots = knots[knots >= ends[0]]
     held = np.clip(np.searchsorted(logged, knots[:-1], side="right") - 1, 0, None)
     poses = chain_steps(along(held, np.diff(knots)))[np.searchsorted(knots, times)]
-    return between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+    steps = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
+    usual = np.median(np.diff(logged)) if len(logged) > 1 else math.inf
+    silent = knots[1:] - logged[held] > max(_GAP_INTERVALS * usual, _LEAST_GAP_S)
+    of_step = np.searchsorted(times, knots[1:])
+    silence_s = np.bincount(of_step, np.diff(knots) * silent, len(times) + 1)[: len(times)]
+    spread = np.var(along(np.arange(len(logged)), np.ones(len(logged))), axis=0)
+    covariance = silence_s[:, None, None] ** 2 * np.diag(spread) + ASSUMED.covariance(steps)
+    return steps, covariance * (silence_s > 0.0)[:, None, None]
 
 
 class _Sightings(NamedTuple):
@@ -106,8 +117,10 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
     subject = {int(barcode): int(number) for number, barcode in barcodes}
     ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
-    if len(subject) < len(barcodes) or np.any(seen[:, 2] <= 0.0):
-        raise SlamError(f"{odometry}: expected a subject for each barcode, and ranges above 0")
+    for k in np.flatnonzero(seen[:, 2] <= 0.0)[:1]:
+        raise SlamError(f"{odometry}: range {seen[k, 2]:g} at {seen[k, 0]:.3f}: expected above 0")
+    if len(subject) < len(barcodes):
+        raise SlamError(f"{odometry}: expected a subject for each barcode")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
     return _Sightings(times, frame, seen[order, 2], seen[order, 3], ids[order])
@@ -122,13 +135,15 @@ def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     steps = _velocity_steps(velocity, seen.times)
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad)
-    return _run(seen.times, steps, CircleRows(seen.frame, *rows, seen.ids))
+    return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids))
 
 
-def _run(times: FloatArray, steps: FloatArray, rows: CircleRows) -> Recording:
+def _run(
+    times: FloatArray, steps: FloatArray, covariance: FloatArray, rows: CircleRows
+) -> Recording:
     """A run of movements (N, 3), X forward, before frames at some times (N,)."""
-    unstated = np.zeros((len(steps), 3, 3))
-    return Recording(_names(times), to_dataset(steps), unstated, rows, LineRows.of())
+    spread = covariance_from_dataset(covariance, back=True)
+    return Recording(_names(times), to_dataset(steps), spread, rows, LineRows.of())
 
 
 def read_truth(odometry: Path) -> tuple[Path2D, int]:
@@ -159,17 +174,16 @@ def read_landmarks(path: Path) -> LandmarkMap:
     )
 
 
-def _velocity_steps(velocity: FloatArray, times: FloatArray) -> FloatArray:
+def _velocity_steps(velocity: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Movements from the start of the odometry to each time, arcs approximated by their chords."""
-    first = min(velocity[0, 0], times[0])
-    last = max(times[-1], velocity[-1, 0]) + 1.0
+    ends = min(velocity[0, 0], times[0]), max(times[-1], velocity[-1, 0]) + 1.0
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:
         turn = velocity[held, 2] * duration
         chord = velocity[held, 1] * duration * np.sinc(turn / (2.0 * np.pi))
         return np.stack([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn], axis=1)
 
-    return _steps_between(velocity[:, 0], times, along, (first, last))
+    return _steps_between(velocity[:, 0], times, along, ends)
 
 
 def _beside(odometry: Path, ending: str) -> Path:
@@ -221,7 +235,7 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
     frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
     rows = discs_of_ranges(trees[:, 0], trees[:, 1], sigma_m, sigma_rad)
     steps = _car_steps(time / 1000.0, speed, steering, times)
-    return _run(times, steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
+    return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
 
 
 def trees_of(scan: FloatArray) -> FloatArray:
@@ -240,13 +254,15 @@ def trees_of(scan: FloatArray) -> FloatArray:
         diameter = reach * np.radians(0.5 * (last - first))
         alone = min(right, left) > reach + _BEHIND_M
         if alone and reach < _FARTHEST_M and _LEAST_DIAMETER_M < diameter < _MOST_DIAMETER_M:
-            found.append((reach + 0.5 * diameter, np.radians(0.25 * (first + last - 1) - 90.0)))
+            found.append(
+                (reach + 0.125 * np.pi * diameter, np.radians(0.25 * (first + last - 1) - 90.0))
+            )
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
 def _car_steps(
     time: FloatArray, speed: FloatArray, steering: FloatArray, times: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Movements of the scanner between times, from the speed of a rear wheel and the steering."""
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:

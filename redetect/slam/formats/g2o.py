@@ -29,6 +29,7 @@ from redetect.landmarks.axes import covariance_from_dataset, from_dataset, to_da
 from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
+from redetect.slam.models import with_heading
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage import write_text
 from redetect.storage.bounded import read_text
@@ -76,9 +77,7 @@ def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
     Rotated by their own dphi, they are in the axes at the end, as errors of SE(2) edges.
     """
-    turn = np.zeros((len(angle_rad), 3, 3))
-    turn[:, :2, :2] = np.swapaxes(rotation(angle_rad), 1, 2)
-    turn[:, 2, 2] = 1.0
+    turn = with_heading(np.swapaxes(rotation(angle_rad), 1, 2))
     turned = turn @ covariance @ np.swapaxes(turn, 1, 2)
     return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
@@ -91,8 +90,7 @@ def write_g2o(
     overwrite: bool = False,
 ) -> None:
     """Write a graph; numbers in full precision."""
-    rows = [*_rows(graph), *(f"# {comment}" for comment in comments)]
-    write_text(path, rows, overwrite=overwrite)
+    write_text(path, [*_rows(graph), *(f"# {c}" for c in comments)], overwrite=overwrite)
 
 
 def _rows(graph: RunGraph) -> Iterator[str]:

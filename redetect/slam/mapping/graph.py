@@ -41,6 +41,8 @@ class Graph:
     camera: Camera | None = None  # as calibrated; needed if the mounting is estimated
     # (K, 2): priors of lines (m), which bound those that bearings do not determine.
     line_prior: FloatArray | None = None
+    # Whether discs of all frames may be displaced by a common tilt, part of their covariances.
+    tilted: bool = False
 
     @property
     def disc_row_counts(self) -> IntArray:
@@ -89,6 +91,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
         member_line=none,
         camera_xy=np.zeros(2) if camera is None else np.array(camera.centre[:2]),
         camera=camera,
+        tilted=recording.tilted,
     )
 
 

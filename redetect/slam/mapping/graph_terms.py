@@ -20,6 +20,7 @@ from redetect.slam.models import (
     between_jacobians,
     disc_in_robot,
     disc_jacobians,
+    tilt_jacobian,
 )
 from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
 
@@ -120,11 +121,14 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
     )
 
 
-def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
+def linearise(
+    graph: Graph, estimate: Estimate, weighting: Weighting, *, by_tilt: bool = False
+) -> Linear:
     """The problem linearised at an estimate, with unknowns as in `Layout`; the mounting is shared.
 
     The mounting changes by a rotation vector in the robot frame, applied from the left, and a
-    translation, restricted to the unknown numbers.
+    translation, restricted to the unknown numbers. `by_tilt`: instead of these, by pitch and roll
+    that all frames share.
     """
     layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
@@ -135,23 +139,25 @@ def linearise(graph: Graph, estimate: Estimate, weighting: Weighting) -> Linear:
         graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
     )
     unknown = weighting.unknown_mounting
+    by_shared = by_mounting[:, :, unknown] if unknown else None
+    if by_tilt:
+        by_shared = graph.disc_whitening @ rows_by_tilt(graph)
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is not unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
     whiten = graph.step_whitening
     blocks = [
         Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
-        Block(error.discs, seen, by_mounting[:, :, unknown] if unknown else None, loss),
+        Block(error.discs, seen, by_shared, loss),
         *_line_blocks(graph, estimate, error.lines, loss),
     ]
     if len(error.prior):
-        lines = len(graph.line_ids)
-        of_line = layout.first_line + 2 * np.arange(lines, dtype=np.int64)
-        near = np.tile(np.eye(2) / LINE_PRIOR_M, (lines, 1, 1))
+        of_line = layout.first_line + 2 * np.arange(len(error.prior), dtype=np.int64)
+        near = np.tile(np.eye(2) / LINE_PRIOR_M, (len(error.prior), 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
     if len(error.place) and unknown:
         by_place = np.eye(MOUNTING)[None, 3:5, unknown] / PLACE_PRIOR_M
         blocks.append(Block(error.place, [], by_place))
-    return stack(blocks, layout.size, len(unknown))
+    return stack(blocks, layout.size, 2 if by_tilt else len(unknown))
 
 
 def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -175,6 +181,11 @@ def _disc_rows(
         return seen - rows, by_pose, by_disc, -moves
     rows, by_floor, by_mounting = rows_as_recorded(graph.camera, seen, estimate.mounting)
     return rows - graph.disc_xy, by_floor @ by_pose, by_floor @ by_disc, by_mounting
+
+
+def rows_by_tilt(graph: Graph) -> FloatArray:
+    """(n, 2, 2) derivatives of rows of discs by a tilt about the robot's origin (m / rad)."""
+    return tilt_jacobian(graph.disc_xy) - tilt_jacobian(np.zeros((1, 2)))
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:

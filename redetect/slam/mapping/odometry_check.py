@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
 
-from redetect.least_squares.covariance import diagonal_blocks
+from redetect.least_squares.covariance import by_shared, diagonal_blocks
 from redetect.least_squares.solver import normal_equations
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
@@ -42,6 +43,8 @@ class OdometryCheck:
     length_sigma: float
     turn_per_metre: float  # additional turn (rad/m)
     turn_per_metre_sigma: float
+    lag_frames: float  # how much later odometry is than the frames, in intervals between frames
+    lag_frames_sigma: float
     outliers: int  # steps that are wrong beyond any chance: slips, or rows there are wrong
     worst_step: int  # the one with the largest error
 
@@ -54,13 +57,14 @@ def check_odometry(
     Raises `numpy.linalg.LinAlgError` if the measurements do not determine the unknowns.
     """
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
+    border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
-        by_change = np.zeros((count, 3, 2))
+        by_change = np.zeros((count, 3, 3))
         by_change[:, :2, 0] = -graph.steps[:, :2]
         by_change[:, 2, 1] = -np.hypot(graph.steps[:, 0], graph.steps[:, 1])
-        border = np.zeros((len(problem.residual), 2))
-        border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 2)
-        problem = problem._replace(border=border)
+        by_change[1:-1, :, 2] = 0.5 * (graph.steps[:-2] - graph.steps[2:])
+        border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 3)
+        problem = problem._replace(border=border[:, :2])
     equations = normal_equations(problem)
     # Of each pose with the next; the first one is known.
     pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
@@ -77,16 +81,16 @@ def check_odometry(
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     of_steps = np.sum(error.odometry**2, axis=1)
-    change, sigma = np.full(2, math.nan), np.full(2, math.nan)
+    change, sigma = np.full(3, math.nan), np.full(3, math.nan)
     if not weighting.calibrate:
-        change, sigma = equations.step(0.0)[1], np.sqrt(np.diag(spread))
-    return OdometryCheck(
-        odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
-        rows_factor=sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
-        length=float(change[0]),
-        length_sigma=float(sigma[0]),
-        turn_per_metre=float(change[1]),
-        turn_per_metre_sigma=float(sigma[1]),
-        outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
-        worst_step=int(np.argmax(of_steps)),
-    )
+        with_lag = normal_equations(problem._replace(border=border))
+        change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
+        sigma = np.sqrt(np.append(np.diag(spread), by_shared(with_lag)[1][2, 2]))
+    numbers: list[Any] = [
+        squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
+        sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
+        *np.stack([change, sigma], axis=1).ravel().tolist(),
+        int(np.count_nonzero(of_steps > _MOST_SQUARED)),
+        int(np.argmax(of_steps)),
+    ]
+    return OdometryCheck(*numbers)

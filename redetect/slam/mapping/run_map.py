@@ -68,27 +68,22 @@ def chi_squared(
 ) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
-    parts = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
+    odometry, discs, lines = (
+        float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)
+    )
+    total = odometry + discs + lines
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
-    # The start is measured (it is the origin) and estimated, so it does not change the difference.
-    measured = 3 * poses + 2 * len(graph.disc_pose) + len(graph.line_pose)
-    unknown = 3 * poses + 2 * landmarks + len(weighting.unknown_mounting)
-    # A lost step contributes practically nothing.
-    expected = measured - unknown - 3 * lost_steps
-    factor = sum(parts) / expected if expected > 0 else math.nan
+    rows = len(graph.disc_pose) + len(graph.line_pose)
+    # As many numbers of odometry are measured as of poses are estimated; the start is the origin. A
+    # lost step contributes practically nothing.
+    unknown = 2 * landmarks + len(weighting.unknown_mounting) + 3 * lost_steps
+    expected = 2 * len(graph.disc_pose) + len(graph.line_pose) - unknown
+    factor = total / expected if expected > 0 else math.nan
     return ChiSquared(
-        poses=poses,
-        landmarks=landmarks,
-        steps=poses,
-        measurements=len(graph.disc_pose) + len(graph.line_pose),
-        odometry=parts[0],
-        discs=parts[1],
-        lines=parts[2],
-        chi_squared=sum(parts),
-        expected=expected,
-        factor=factor,
-        root=math.sqrt(factor) if expected > 0 else math.nan,
+        *(poses, landmarks, poses, rows),
+        *(odometry, discs, lines, total),
+        *(expected, factor, math.sqrt(factor)),
     )
 
 

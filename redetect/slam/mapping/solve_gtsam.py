@@ -21,6 +21,7 @@ from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
+from redetect.slam.models import with_heading
 
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
@@ -78,9 +79,7 @@ def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
         values.insert(first_disc + j, np.append(xy, 0.0))
 
     factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start.poses[0]), noise.Constrained.All(3)))
-    turned = np.zeros((len(graph.steps), 3, 3))
-    turned[:, :2, :2] = rotation(graph.steps[:, 2])
-    turned[:, 2, 2] = 1.0
+    turned = with_heading(rotation(graph.steps[:, 2]))
     # This factor's error is in the frame after the step.
     for k, (step, whiten) in enumerate(zip(graph.steps, graph.step_whitening @ turned)):
         factors.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*step), root(whiten, False)))

@@ -192,6 +192,21 @@ def test_images_between_poses_and_beyond_them(tmp_path: Path) -> None:
     assert frames[1].step.dy == pytest.approx(-0.2 * np.cos(3.1))
 
 
+def test_odometry_that_is_reset_is_lost_there(tmp_path: Path) -> None:
+    ros, said = Ros(), []
+    for k in range(100):
+        x = 0.01 * k + 3.0 if k < 55 else 0.01 * k
+        moved = ros.odometry(x, 0.0, 0.0, 1.0 + 0.02 * k, np.zeros((3, 3)))
+        said.append(Said("/odom", 1.0 + 0.02 * k, moved))
+    blank = np.zeros((4, 4), np.uint8)
+    said += [Said("/i", t, ros.image(blank, "mono8", t)) for t in np.arange(1.0, 2.9, 0.2).tolist()]
+    run = open_source(ros.write(tmp_path / "d", sorted(said, key=lambda s: s.time_s)))
+    steps = [frame.step for frame in run.frames]
+    lost = [k for k, step in enumerate(steps) if step.cxx > 1e5]
+    assert lost == [6]
+    assert [step.dy for k, step in enumerate(steps[1:], 1) if k != 6] == pytest.approx([-0.1] * 8)
+
+
 # -- encodings ------------------------------------------------------------------------------
 
 COLOURS = np.random.default_rng(8).integers(0, 256, (6, 8, 3)).astype(np.uint8)  # B, G, R

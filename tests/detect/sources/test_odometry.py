@@ -152,6 +152,17 @@ def test_ticks_of_wheels_give_the_path(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("low", [-(2**15), 0, -(2**31)])
+def test_counters_of_ticks_may_overflow(low: int, tmp_path: Path) -> None:
+    turn = 2**32 if low == -(2**31) else 2**16
+    path = tmp_path / "a.ticks"
+    count = [turn - 500 + 200 * k for k in range(6)]
+    path.write_text("".join(f"{k} {(n % turn) + low} {(-n % turn) + low}\n"
+                            for k, n in enumerate(count)))  # fmt: skip
+    poses = list(tick_poses(path, 0.4, 0.001))
+    np.testing.assert_allclose([p.theta for p in poses], -np.arange(6.0), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("content", "wheels", "told"),
     [
