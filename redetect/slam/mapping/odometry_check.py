@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -86,11 +85,16 @@ def check_odometry(
         with_lag = normal_equations(problem._replace(border=border))
         change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
         sigma = np.sqrt(np.append(np.diag(spread), by_shared(with_lag)[1][2, 2]))
-    numbers: list[Any] = [
-        squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
-        sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
-        *np.stack([change, sigma], axis=1).ravel().tolist(),
-        int(np.count_nonzero(of_steps > _MOST_SQUARED)),
-        int(np.argmax(of_steps)),
-    ]
-    return OdometryCheck(*numbers)
+    (length, turn, lag), (length_sigma, turn_sigma, lag_sigma) = change.tolist(), sigma.tolist()
+    return OdometryCheck(
+        odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
+        rows_factor=sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
+        length=length,
+        length_sigma=length_sigma,
+        turn_per_metre=turn,
+        turn_per_metre_sigma=turn_sigma,
+        lag_frames=lag,
+        lag_frames_sigma=lag_sigma,
+        outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
+        worst_step=int(np.argmax(of_steps)),
+    )

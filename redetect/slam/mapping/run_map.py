@@ -81,9 +81,17 @@ def chi_squared(
     expected = 2 * len(graph.disc_pose) + len(graph.line_pose) - unknown
     factor = total / expected if expected > 0 else math.nan
     return ChiSquared(
-        *(poses, landmarks, poses, rows),
-        *(odometry, discs, lines, total),
-        *(expected, factor, math.sqrt(factor)),
+        poses=poses,
+        landmarks=landmarks,
+        steps=poses,
+        measurements=rows,
+        odometry=odometry,
+        discs=discs,
+        lines=lines,
+        chi_squared=total,
+        expected=expected,
+        factor=factor,
+        root=math.sqrt(factor),
     )
 
 
