@@ -88,8 +88,9 @@ def _circles(command: Circles, run: Run) -> Job:
     if command.json is not None:
         places["json"] = command.json
     settings = _with_radius(command.detector, run) if command.find_radius else command.detector
-    plan = FramePlan(run.camera, circles=settings)
-    tilts = None if command.tilt is None else read_tilts(command.tilt)
+    bare = command.tilt == Path("none")
+    plan = FramePlan(run.camera, circles=settings, levelling="none" if bare else "frame")
+    tilts = None if bare or command.tilt is None else read_tilts(command.tilt)
     return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
 
 
