@@ -251,6 +251,12 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "no image of this run is in the files of known tilts or IDs, or they have no rows: "
             "were they made from other images?"
         )
+    others = summary.rejected["no matching pattern"]
+    if plan.markers and not found["markers"] and others >= summary.frames:
+        yield (
+            f"{others} squares look like markers, but not of the dictionary "
+            f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
+        )
     if camera is None:
         return
     if plan.lines is not None and not found["lines"]:
