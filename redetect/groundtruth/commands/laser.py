@@ -78,6 +78,12 @@ def perform(options: Laser) -> int:
         f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
         f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
     )
+    if track.outline_moved_m:
+        warn(
+            f"the outline in robot.json is some {1e3 * abs(track.outline_moved_m):.0f} mm too "
+            f"{'small' if track.outline_moved_m > 0.0 else 'large'} on each side: one that fits "
+            "the readings was used"
+        )
     share = seen_through(track)
     if share > _MOST_SEEN_THROUGH:
         warn(
@@ -171,6 +177,7 @@ def describe(
     counts = np.bincount(track.status, minlength=len(STATUS)).tolist()
     return {
         "sets": {status: count for status, count in zip(STATUS, counts) if count},
+        "outline_moved_m": track.outline_moved_m,
         "segments": segments,
         COMMON: (shared.mean(axis=0) if len(shared) else np.zeros((3, 3))).tolist(),
         "scanners": entries,
