@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import Bounds, direct, minimize, minimize_scalar
+from scipy.optimize import Bounds, minimize, minimize_scalar
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -36,7 +36,6 @@ from redetect.groundtruth.trajectories.streams import (
     last_of_each_time,
     segments_between_gaps,
 )
-from redetect.landmarks import wrap_angle
 
 _FEWEST_SAMPLES = 20
 _MOST_SAMPLES = 400
@@ -46,9 +45,9 @@ _LEAST_WAY_M = 1.0
 _SMOOTHED_SAMPLES, _SMOOTHED_S = 5, 0.5
 _ROUNDS = 2
 # Steps of the search (s, at the middle and at the ends). Of the parabola at its minimum: its grid,
-# its rise at the ends of that, and the widest one (of the bounds).
+# its rise at the ends of that, the widest one (of the bounds), and shares of it that are tried.
 _STEP_S = 0.005
-_GRID, _RISE, _WIDEST = (-1.0, -0.5, 0.0, 0.5, 1.0), 15.0, 0.5
+_GRID, _RISE, _WIDEST, _SHRUNK = (-1.0, -0.5, 0.0, 0.5, 1.0), 15.0, 0.5, (1.0, 0.3, 0.1)
 # Ratio of the errors in simulated sessions to the deviations from the likelihood's curvature, since
 # errors of wheels do not follow the model exactly.
 _SIGMA_FACTOR = 2.0
@@ -184,19 +183,17 @@ def _segment(
     measured = segment.only(segment.during(own.times_s[0] + reach, own.times_s[-1] - reach))
     if len(measured) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
-    # By least squares of headings; by maximum likelihood of headings; and of whole poses.
-    reference_s = float(np.mean(measured.times_s))
-    clock = _search(own, measured, reference_s, bounds)
+    # By maximum likelihood of headings, and of whole poses.
+    reference_s, start = float(np.mean(measured.times_s)), np.array([start_s, 0.0])
     jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
-    best = _most_likely_clock(own, _headings_alone(jittered), reference_s, clock, bounds)
+    best = _most_likely_clock(own, _headings_alone(jittered), reference_s, start, bounds)
     if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
     if measured.covariances is not None and driven >= _LEAST_WAY_M:
         # Headings of a robot that hardly turns are a poor start.
-        starts = [best.clock]
-        if abs(start_s - best.clock[0]) > _ANOTHER_START_S:
-            starts.append(np.array([start_s, 0.0]))
+        far = abs(start_s - best.clock[0]) > _ANOTHER_START_S
+        starts = [best.clock, start] if far else [best.clock]
         fits = [_most_likely_clock(own, jittered, reference_s, at, bounds) for at in starts]
         maxima = [fit for fit in fits if fit is not None]
         moving = min(maxima, key=lambda fit: fit.deviance, default=best)
@@ -211,15 +208,18 @@ def _segment(
             parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
+    offset_s, drift = best.clock
+    times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
+    own_headings = np.interp(times_s, own.times_s, np.unwrap(own.poses[:, 2]))
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
     return [
         ClockSegment(
             from_s=float(segment.times_s[0]),
             to_s=float(segment.times_s[-1]),
             reference_s=reference_s,
-            offset_s=float(best.clock[0]),
-            rate=1.0 + float(best.clock[1]),
-            angle_rad=_mean_angle(_heading_differences(own, measured, reference_s, best.clock)),
+            offset_s=float(offset_s),
+            rate=1.0 + float(drift),
+            angle_rad=float(np.angle(np.mean(np.exp(1j * (measured.poses[:, 2] - own_headings))))),
             sigma_offset_s=float(best.sigmas[0]),
             sigma_rate=float(best.sigmas[1]),
             turned_rad=turned,
@@ -233,34 +233,6 @@ def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
     if clock.status != "ok":
         return clock
     return replace(clock, status="jump", note=f"the clock was set near {time_s:.2f} s")
-
-
-def _heading_differences(
-    odometry: PlanarPoses, measured: PlanarPoses, reference_s: float, clock: FloatArray
-) -> FloatArray:
-    """(N,) heading of the ground truth minus heading of the odometry, by a clock (2,)."""
-    times_s = measured.times_s + clock[0] + clock[1] * (measured.times_s - reference_s)
-    own = np.interp(times_s, odometry.times_s, np.unwrap(odometry.poses[:, 2]))
-    return np.asarray(measured.poses[:, 2] - own)
-
-
-def _mean_angle(differences: FloatArray) -> float:
-    return float(np.angle(np.mean(np.exp(1j * differences))))
-
-
-def _search(
-    odometry: PlanarPoses, measured: PlanarPoses, reference_s: float, bounds: SyncSettings
-) -> FloatArray:
-    """(2,) offset (s) and drift with the least squared differences, the angle eliminated."""
-    largest = np.array(bounds.largest)
-    some = measured.only(slice(None, None, 1 + len(measured) // _MOST_SAMPLES))
-
-    def squared(x: FloatArray) -> float:
-        differences = _heading_differences(odometry, some, reference_s, x * largest)
-        return float(np.mean(np.square(wrap_angle(differences - _mean_angle(differences)))))
-
-    found = direct(squared, Bounds([-1.0, -1.0], [1.0, 1.0]), maxfun=1500, maxiter=1000)
-    return np.asarray(found.x * largest)
 
 
 class ClockFit(NamedTuple):
@@ -367,19 +339,21 @@ def _parabola(
             if rise > _RISE:
                 break
             steps[k] = min(1.6 * steps[k], _WIDEST * largest[k])
-    x, y = np.array(list(product(_GRID, repeat=2))).T
+    grid = np.array(list(product(_GRID, repeat=2)))
+    x, y = grid.T
     design = np.column_stack([x, y, 0.5 * x * x, x * y, 0.5 * y * y, np.ones(len(x))])
-    values = np.array([deviance(at + steps * point) for point in np.column_stack([x, y])])
     inverse = np.linalg.inv(design.T @ design)
-    c = inverse @ design.T @ values
-    curvature = np.array([[c[2], c[3]], [c[3], c[4]]])
-    if not np.linalg.eigvalsh(curvature)[0] > 0.0:
-        return None
-    root = np.linalg.inv(curvature)
-    kinks = float(np.sum((values - design @ c) ** 2)) / (len(x) - len(c))
-    covariance = 2.0 * root + kinks * root @ inverse[:2, :2] @ root
-    minimum = np.clip(-root @ c[:2], -1.0, 1.0)
-    return at + steps * minimum, steps * np.sqrt(np.diag(covariance))
+    for scale in _SHRUNK:
+        values = np.array([deviance(at + scale * steps * point) for point in grid])
+        c = inverse @ design.T @ values
+        curvature = np.array([[c[2], c[3]], [c[3], c[4]]])
+        if np.linalg.eigvalsh(curvature)[0] > 0.0:
+            root = np.linalg.inv(curvature)
+            kinks = float(np.sum((values - design @ c) ** 2)) / (len(x) - len(c))
+            sigmas = np.sqrt(np.diag(2.0 * root + kinks * root @ inverse[:2, :2] @ root))
+            minimum = np.clip(-root @ c[:2], -1.0, 1.0)
+            return at + scale * steps * minimum, scale * steps * sigmas
+    return None
 
 
 def _rounding(odometry: PlanarPoses) -> FloatArray:
