@@ -1,14 +1,11 @@
 """The robot's clock: time offset, drift and angle offset, segment by segment.
 
-The headings of odometry and ground truth are those of one robot; the offset and the rate between
-their clocks minimise the squared difference, with the angle between their axes eliminated in closed
-form (RAWSEEDS D2.1 part 2). That search is global within a second and derivative-free; farther
-offsets are found before, from movements over seconds (`redetect.groundtruth.fusion.coarse_offset`).
-But odometry's heading drifts, which a sum of squares would partly explain by a time offset. So the
-clock is then refined by maximising the likelihood of the measured poses, given odometry's movements
-and their errors: once for the headings of the ground truth alone, and once for its full poses, if
-they have covariances, so that curves of the path and changes of speed contribute, too. The more
-certain result is used.
+Odometry and ground truth describe the path of one robot (RAWSEEDS D2.1 part 2 compares its
+headings). Offsets to a tenth of a second are found from movements over seconds
+(`redetect.groundtruth.fusion.coarse_offset`). Then the likelihood of the measured poses, given
+odometry's movements and their errors, is maximised: once for the headings of the ground truth
+alone, and once for its full poses, if they have covariances, so that curves of the path and changes
+of speed contribute, too. The more certain result is used.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ the walls' offsets.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -19,7 +20,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import MapProblem, still_scan
+from redetect.groundtruth.lasers.walls import MapProblem, StillScan, still_scan
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 
@@ -34,7 +35,6 @@ _ROUNDS = 50
 #: Standard deviations of readings, wall and map together, as the fit to the map narrows (m).
 _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
 _WEAK_M = 0.02
-_MOST_STEPS = 500
 # Start headings of the pairs, relative to the measured ones.
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 # Decrease of the share of a scan that others explain, by its pose on the map, that is noticed.
@@ -109,13 +109,13 @@ def align_scanners(
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = _round(scans, steps["merged"], s)
     steps["together"] = _together(scans, steps["realigned"], s)
-    whole = _whole_to_map(scans, steps["together"], measured, building, s)
+    narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
+    whole = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
-    narrowing = [n for n in _NARROWING_M if n <= s.gate_m]
     priors = [_prior(scanner) for scanner in scanners]
     starts, others = [], []
     for one, still, pose, prior in zip(scanners, stills, whole, priors):
-        coarse = [n for n in narrowing if n >= _COARSE_M]
+        coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
         try:
             lone = MapProblem([still], one.pose[None], prior, building)
             start, other = lone.likely_pose(pose, coarse)
@@ -250,23 +250,19 @@ def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> Flo
 
 
 def _whole_to_map(
-    scans: list[Scan], poses: FloatArray, measured: FloatArray, building: FloatArray,
-    s: AlignmentSettings,
+    stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    narrowing_m: list[float],
 ) -> FloatArray:  # fmt: skip
     """Align all scanners, as one rigid body, with the map, from their measured poses."""
     if len(poses) > 1:
         body = fitted(poses[:, :2], measured[:, :2])
     else:
         body = compose(measured[0], invert(poses[0]))
-    everything = _merge(scans, poses, range(len(scans))).points
-    from_map = invert(body)
-    for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
-        from_map, _, count = fit_outline(
-            everything, building, from_map, gate, s.keep, 1e-5, _MOST_STEPS
-        )
-        if count < 3:
-            raise GeometryError(f"{count} readings near the map: expected 3 or more")
-    return compose(np.broadcast_to(invert(from_map), poses.shape), poses)
+    prior = np.eye(3) / _UNKNOWN_SIGMA**2
+    problem = MapProblem(stills, body[None], prior, building, mounts=poses)
+    with suppress(GeometryError):  # then each scanner's start is searched around its measured pose
+        body = problem.fit(body[None], narrowing_m, _WEAK_M).poses[0]
+    return compose(np.broadcast_to(body, poses.shape), poses)
 
 
 def icp_by_step(

@@ -16,7 +16,13 @@ from scipy.stats import trim_mean
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
+from redetect.groundtruth.lasers.acquisition import (
+    ScanSets,
+    acquire,
+    face_normals,
+    refine,
+    robot_body,
+)
 from redetect.groundtruth.lasers.icp import fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking_kernels import (
@@ -269,9 +275,7 @@ class Tracker:
     def outside_m(self) -> float:
         """Mean distance of most readings from the outline, outward, in a sample of the sets (m)."""
         rows = np.flatnonzero(np.isin(self.track.status, (OK, REACQUIRED)))
-        x1, y1, x2, y2 = self.body.faces.T
-        normals = np.stack([y2 - y1, x1 - x2], axis=-1) / np.hypot(x2 - x1, y2 - y1)[:, None]
-        off = [np.zeros(0)]
+        normals, off = face_normals(self.body.faces), [np.zeros(0)]
         for i in rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(np.int64)]:
             pose = self.track.poses[i]
             seen = apply(invert(pose), self._points(i, pose, self.track.motion[i], 0.0).points)
@@ -382,7 +386,7 @@ def track_by_lasers(
     settings = LaserSettings() if settings is None else settings
     allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0
     for _ in range(_OUTLINE_ROUNDS):
-        body = robot_body(moved_outline(robot.outline, moved_m), settings.symmetry_m)
+        body = robot_body(robot.outline, settings.symmetry_m, moved_m)
         tracker = Tracker(sets, fixed, body, robot.largest_speed_m_s, settings)
         track, off_m = tracker.run(), tracker.outside_m()
         track = replace(track, outline_moved_m=moved_m)
@@ -390,17 +394,6 @@ def track_by_lasers(
             break
         moved_m += off_m
     return track
-
-
-def moved_outline(outline: FloatArray, outward_m: float) -> FloatArray:
-    """Corners (k, 2) of a closed outline whose faces are moved outward."""
-    along = np.roll(outline, -1, axis=0) - outline
-    before = np.roll(outline, 1, axis=0)
-    around = np.sign(np.sum(before[:, 0] * outline[:, 1] - outline[:, 0] * before[:, 1]))
-    normals = around * np.stack([along[:, 1], -along[:, 0]], -1) / np.hypot(*along.T)[:, None]
-    others = np.roll(normals, 1, axis=0)
-    share = 1.0 + np.sum(normals * others, axis=1, keepdims=True)
-    return np.asarray(outline + outward_m * (normals + others) / share)
 
 
 def track_without_suspects(

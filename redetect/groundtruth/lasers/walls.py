@@ -35,6 +35,7 @@ _MAP_SIGMAS_M, _LIKELY_MAP_SIGMA_M = np.geomspace(1e-4, 0.3, 80), 0.02
 _MAP_EVIDENCE, _MOST_INFLATED = 7.0, 9.0
 # Steps at each gate, most steps afterwards, and the change (m, rad) that ends them.
 _STEPS_PER_GATE, _MOST_STEPS, _SETTLED = 3, 15, 1e-6
+_SIGMA_PER_MEDIAN = 1.4826  # Of a normal distribution
 # Of the grid of starts: standard deviations from the measured pose, number of readings, largest
 # cost of that deviation, and the difference (m, rad) up to which poses are the same.
 _START_SIGMAS, _COARSE_READINGS, _LARGEST_PRIOR_COST, _SAME_POSE = 1.5, 240, 50.0, 2e-3
@@ -166,8 +167,11 @@ class MapProblem(NamedTuple):
             If fewer than ten readings match walls.
         """
         poses, offsets, _ = self._narrowed(starts, narrowing_m)
+        # Walls are not straight to a millimetre everywhere.
+        usual = np.median(np.abs(self._on_walls(poses, offsets, min(narrowing_m)).rest_m))
+        floor = max(FLOOR_M, _SIGMA_PER_MEDIAN * float(usual))
         for _ in range(_MOST_STEPS):
-            on = self._on_walls(poses, offsets, FLOOR_M)
+            on = self._on_walls(poses, offsets, floor)
             found = self._solved(on, poses, None)
             poses, offsets = poses + found.step, found.offsets_m
             if np.abs(found.step).max() < _SETTLED:
@@ -180,7 +184,7 @@ class MapProblem(NamedTuple):
         by_mounts = []
         for change in _DIFFERENCE * np.eye(0 if self.mounts is None else self.mounts.size):
             moved = self._replace(mounts=self.mounts + change.reshape(-1, 3))
-            on = moved._on_walls(poses, offsets, FLOOR_M)
+            on = moved._on_walls(poses, offsets, floor)
             by_mounts.append(self._solved(on, poses, found.map_sigma_m).step.ravel() / _DIFFERENCE)
         scale, parts = np.array([1.0, 1.0, _TURN_ARM_M]), range(0, poses.size, 3)
         of_readings = [
