@@ -355,8 +355,12 @@ def _parabola(
 
 def _rounding(odometry: PlanarPoses) -> FloatArray:
     """(3,) standard deviations of x, y and the heading that are due to their rounding."""
-    levels = [np.unique(np.round(values, 9)) for values in odometry.poses.T]
-    return np.array([min(np.diff(level), default=0.0) for level in levels]) / math.sqrt(12.0)
+    found = np.zeros(3)
+    for k, levels in enumerate(np.unique(np.round(values, 9)) for values in odometry.poses.T):
+        step = min(np.diff(levels), default=0.0)
+        if step > 0.0 and np.all(np.abs(levels - step * np.rint(levels / step)) < 0.01 * step):
+            found[k] = step / math.sqrt(12.0)
+    return found
 
 
 def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatArray) -> PlanarPoses:
@@ -394,9 +398,8 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
 def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
     """Poses with known headings only."""
     assert measured.covariances is not None
-    covariances = np.tile(np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]), (len(measured), 1, 1))
-    covariances[:, 2, 2] = measured.covariances[:, 2, 2]
-    return PlanarPoses(measured.times_s, measured.poses, covariances)
+    unknown = np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0])
+    return PlanarPoses(measured.times_s, measured.poses, measured.covariances + unknown)
 
 
 def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:

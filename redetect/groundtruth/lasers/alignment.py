@@ -39,6 +39,8 @@ _WEAK_M = 0.02
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 # Decrease of the share of a scan that others explain, by its pose on the map, that is noticed.
 _MUCH_WORSE = 0.1
+# Walls farther than this from what scanners see, by their measured poses, are ignored (m).
+_AROUND_M = 5.0
 # A scanner's start on the map is found with standard deviations down to this (m).
 _COARSE_M = 0.02
 # Standard deviations of measured poses (m, rad): without a covariance, and the least.
@@ -100,6 +102,13 @@ def align_scanners(
             )
     scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
     measured = np.stack([scanner.pose for scanner in scanners])
+    # Only walls that a scanner can see; drawings may show a whole city.
+    reach = max(float(still.range_m.max()) for still in stills) + _AROUND_M
+    low, high = measured[:, :2].min(axis=0) - reach, measured[:, :2].max(axis=0) + reach
+    ends = building.reshape(-1, 2, 2)
+    building = building[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
+    if not len(building):
+        raise GeometryError("no wall of the map is near the scanners: expected some")
     steps: dict[str, FloatArray] = {}
     shares, relative = _pairs(scans, measured, s)
     steps["pairs"], order = _chained(measured, shares, relative)
@@ -128,28 +137,21 @@ def align_scanners(
     steps["each to the map"] = fit.poses
     covariance = fit.covariance + block_diag(*others)
     blocks = [covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(scanners))]
-    is_open = [
-        fit.open_directions[k] > 0 or np.trace(other[:2, :2]) > _WEAK_M**2
-        for k, other in enumerate(others)
-    ]
-    return Alignment(
-        scanners=tuple(
-            replace(scanner, pose=pose, covariance=block)
-            for scanner, pose, block in zip(scanners, fit.poses, blocks)
-        ),
-        steps=steps,
-        pairs=shares,
-        matched=fit.used,
-        rms_m=fit.rms_m,
-        covariance=covariance,
-        map_sigma_m=fit.map_sigma_m,
-        undetermined=tuple(one.name for one, wide in zip(scanners, is_open) if wide),
-        inconsistent=tuple(
-            one.name
-            for k, one in enumerate(scanners)
-            if _contradicts(scans, fit.poses, steps["together"], k)
-        ),
+    elsewhere = np.array([np.trace(other[:2, :2]) for other in others]) > _WEAK_M**2
+    is_open = (fit.open_directions > 0) | elsewhere
+    wrong = [_contradicts(scans, fit.poses, steps["together"], k) for k in range(len(scanners))]
+    undetermined, inconsistent = (
+        tuple(one.name for one, noted in zip(scanners, which) if noted)
+        for which in (is_open, wrong)
     )
+    placed = tuple(
+        replace(scanner, pose=pose, covariance=block)
+        for scanner, pose, block in zip(scanners, fit.poses, blocks)
+    )
+    return Alignment(
+        placed, steps, shares, fit.used, fit.rms_m, covariance, fit.map_sigma_m, undetermined,
+        inconsistent,
+    )  # fmt: skip
 
 
 def _prior(scanner: Scanner) -> FloatArray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -210,20 +211,17 @@ class MapProblem(NamedTuple):
         scan, measured = self.scans[0], self.measured[0]
         every = max(1, len(scan.range_m) // _COARSE_READINGS)
         thin = StillScan(scan.range_m[::every], scan.direction[::every], scan.sigma_m)
+        coarse = self._replace(scans=[thin])
         wide = _START_SIGMAS / np.sqrt(np.diag(self.prior))
         grid = [measured + wide * shift for shift in product((0.0, -1.0, 1.0), repeat=3)]
         found: list[tuple[float, FloatArray]] = []
-        failed = GeometryError("no readings")
         for start in (aligned, *grid):
-            try:
-                poses, _, cost = self._replace(scans=[thin])._narrowed(start[None], narrowing_m)
-            except GeometryError as error:
-                failed = error
-                continue
-            if not any(np.allclose(poses[0], other, atol=_SAME_POSE) for _, other in found):
-                found.append((cost, poses[0]))
+            with suppress(GeometryError):
+                poses, _, cost = coarse._narrowed(start[None], narrowing_m)
+                if not any(np.allclose(poses[0], other, atol=_SAME_POSE) for _, other in found):
+                    found.append((cost, poses[0]))
         if not found:
-            raise failed
+            raise GeometryError("hardly any readings lie on the map")
         best, pose = min(found, key=lambda entry: entry[0])
         weights = np.exp([0.5 * (best - cost) for cost, _ in found])
         apart = pose_differences(np.stack([other for _, other in found]), pose)
