@@ -108,7 +108,7 @@ def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) ->
     """Warn of scans that seem to be of one moment, although the robot moves during them."""
     if any(scanner.sweep_s for scanner in scanners) or len(sets) < 2:
         return
-    turn = max((s.readings - 1) * s.angle_step_rad for s in scanners) / (2.0 * np.pi)
+    turn = max((s.readings - 1) * abs(s.angle_step_rad) for s in scanners) / (2.0 * np.pi)
     sweep_s = turn * float(np.median(np.diff(sets.times_s)))
     moved_m = 0.5 * sweep_s * robot.largest_speed_m_s
     if moved_m > _LARGEST_SWEEP_M:

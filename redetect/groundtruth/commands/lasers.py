@@ -29,6 +29,8 @@ from redetect.storage import write_bytes
 _FAR_OFF_SIGMA = 5.0
 #: Offsets of walls from the map above which a warning is printed (m).
 _NOTED_M = 0.001
+#: Share of readings on walls of the map below which a warning is printed.
+_LEAST_ON_MAP = 0.5
 #: Steps of the ICP that the picture shows.
 _ICP_STEPS = 30
 
@@ -80,6 +82,12 @@ def perform(options: Lasers) -> int:
     drawn = draw_alignment(measured, alignment, points, building, by_step)
     write_bytes(picture, drawn, overwrite=options.force)
     _print_differences(measured, alignment, far_off)
+    for one, seen, matched in zip(alignment.scanners, points, alignment.matched):
+        if matched < _LEAST_ON_MAP * len(seen):
+            warn(
+                f"scanner {one.name}: only {100.0 * matched / len(seen):.0f} % of its readings lie "
+                f"on walls of {map_file}: expected the map of this place, in metres"
+            )
     return 0
 
 

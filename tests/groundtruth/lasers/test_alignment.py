@@ -256,6 +256,9 @@ def test_a_drawing_that_is_centimetres_off_is_noticed(
     write_building(tmp_path / "building.csv", drawn)
     assert perform(Lasers(tmp_path)) == 0
     assert "the walls are off the map by some" in capsys.readouterr().err
+    write_building(tmp_path / "building.csv", 1000.0 * ROOM, overwrite=True)
+    assert perform(Lasers(tmp_path, output=tmp_path / "other.json")) == 0
+    assert "of its readings lie on walls of" in capsys.readouterr().err
     path = tmp_path / "aligned.json"
     joint_read = read_joint_covariance(path, read_scanners(path))
     assert joint_read is not None
