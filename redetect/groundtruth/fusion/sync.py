@@ -157,12 +157,9 @@ def _if_matching(
 
 
 def _segment(
-    odometry: PlanarPoses,
-    segment: PlanarPoses,
-    bounds: SyncSettings,
-    start_s: float,
+    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
     jumps_left: int,
-) -> list[ClockSegment]:
+) -> list[ClockSegment]:  # fmt: skip
     """One segment's clock; several parts if the clock was set within it.
 
     `start_s`: an offset from which the refinement by whole poses also starts.
@@ -205,24 +202,17 @@ def _segment(
             parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
-    offset_s, drift = best.clock
+    offset_s, drift = best.clock.tolist()
     times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
-    own_headings = np.interp(times_s, own.times_s, np.unwrap(own.poses[:, 2]))
+    angles = measured.poses[:, 2] - np.interp(times_s, own.times_s, np.unwrap(own.poses[:, 2]))
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
     return [
         ClockSegment(
-            from_s=float(segment.times_s[0]),
-            to_s=float(segment.times_s[-1]),
-            reference_s=reference_s,
-            offset_s=float(offset_s),
-            rate=1.0 + float(drift),
-            angle_rad=float(np.angle(np.mean(np.exp(1j * (measured.poses[:, 2] - own_headings))))),
-            sigma_offset_s=float(best.sigmas[0]),
-            sigma_rate=float(best.sigmas[1]),
-            turned_rad=turned,
-            status="at a bound" if at_bound else "ok",
+            float(segment.times_s[0]), float(segment.times_s[-1]), reference_s, offset_s,
+            1.0 + drift, float(np.angle(np.mean(np.exp(1j * angles)))), float(best.sigmas[0]),
+            float(best.sigmas[1]), turned, "at a bound" if at_bound else "ok",
         )
-    ]
+    ]  # fmt: skip
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
@@ -257,12 +247,9 @@ class ClockFit(NamedTuple):
 
 
 def _most_likely_clock(
-    odometry: PlanarPoses,
-    measured: PlanarPoses,
-    reference_s: float,
-    start: FloatArray,
+    odometry: PlanarPoses, measured: PlanarPoses, reference_s: float, start: FloatArray,
     bounds: SyncSettings,
-) -> ClockFit | None:
+) -> ClockFit | None:  # fmt: skip
     """The most likely clock near a start and within the bounds; None without a maximum."""
     largest = np.array(bounds.largest)
     half = 0.5 * float(np.ptp(measured.times_s))
@@ -441,14 +428,8 @@ def _differ(parts: list[ClockSegment]) -> bool:
 
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
-    return ClockSegment(
-        from_s=float(segment.times_s[0]),
-        to_s=float(segment.times_s[-1]),
-        reference_s=float(np.mean(segment.times_s)),
-        turned_rad=turned_rad,
-        status="no turns",
-        note=note,
-    )
+    from_s, to_s, at_s = (float(f(segment.times_s)) for f in (np.min, np.max, np.mean))
+    return ClockSegment(from_s, to_s, at_s, turned_rad=turned_rad, status="no turns", note=note)
 
 
 def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:

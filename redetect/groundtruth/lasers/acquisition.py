@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
+from redetect.groundtruth.lasers.icp import face_normals, fit_outline, moved, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
@@ -225,12 +225,6 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     return faces
 
 
-def face_normals(faces: FloatArray) -> FloatArray:
-    """(k, 2) outward normals of faces (k, 4)."""
-    along = faces[:, 2:] - faces[:, :2]
-    return np.asarray(np.stack([along[:, 1], -along[:, 0]], -1) / np.hypot(*along.T)[:, None])
-
-
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
     """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
 
@@ -281,13 +275,9 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
 
 
 def refine(
-    seen: NewReadings,
-    start: FloatArray,
-    fixed: FixedScanners,
-    body: Body,
-    settings: LaserSettings,
-    prior_m: float,
-) -> OutlinePose:
+    seen: NewReadings, start: FloatArray, fixed: FixedScanners, body: Body,
+    settings: LaserSettings, prior_m: float,
+) -> OutlinePose:  # fmt: skip
     """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     fit = OutlineFit(
@@ -356,13 +346,9 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
 
 
 def _search(
-    place: FloatArray,
-    seen: NewReadings,
-    scans: ScanSet,
-    fixed: FixedScanners,
-    body: Body,
+    place: FloatArray, seen: NewReadings, scans: ScanSet, fixed: FixedScanners, body: Body,
     settings: LaserSettings,
-) -> list[tuple[float, FloatArray]]:
+) -> list[tuple[float, FloatArray]]:  # fmt: skip
     """Poses that explain the beams, with a score: beams that agree less those that disagree."""
     found: list[tuple[float, FloatArray]] = []
     tried: list[FloatArray] = []

@@ -26,16 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.bounds import (
-    ABOVE_0,
-    FINITE,
-    LARGEST_NUMBER,
-    Bounds,
-    NotNegative,
-    Positive,
-    demand_fields,
-    whole,
-)
+from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
@@ -51,7 +42,6 @@ _FARTHEST_M = 1e3
 # readings scatter by this factor more than it, or than what rounding to millimetres explains.
 _FEWEST_FOR_NOISE = 20
 _BELIEVED_NOISE = 1.5
-_NOT_0 = Bounds("a finite number but 0", lambda x: 0.0 < abs(x) <= LARGEST_NUMBER)
 _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 
@@ -70,7 +60,7 @@ class Scanner:
     # Beam i points to first_angle + i step in the scanner's frame.
     first_angle_rad: Annotated[float, FINITE]
     # Negative where it is mounted upside down
-    angle_step_rad: Annotated[float, _NOT_0]
+    angle_step_rad: Annotated[float, NOT_0]
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
     max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)

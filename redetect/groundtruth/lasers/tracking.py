@@ -16,14 +16,8 @@ from scipy.stats import trim_mean
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import (
-    ScanSets,
-    acquire,
-    face_normals,
-    refine,
-    robot_body,
-)
-from redetect.groundtruth.lasers.icp import fit_outline, nearest_on_segments
+from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
+from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking_kernels import (
     BeamCounts,
@@ -95,34 +89,22 @@ class Tracker:
     """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
 
     def __init__(
-        self,
-        sets: ScanSets,
-        fixed: FixedScanners,
-        body: Body,
-        largest_speed_m_s: float,
+        self, sets: ScanSets, fixed: FixedScanners, body: Body, largest_speed_m_s: float,
         settings: LaserSettings,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.sets, self.fixed, self.body = sets, fixed, body
         self.speed, self.settings = largest_speed_m_s, settings
         n, scanners = len(sets), len(fixed.origins)
         self.track = LaserTrack(
             sets.times_s,
-            status=np.full(n, LOST),
-            segment=np.full(n, -1),
-            poses=np.full((n, 3), np.nan),
-            covariances=np.full((n, 3, 3), np.nan),
-            noise=np.full((n, 3, 3), np.nan),
-            motion=np.zeros((n, 3)),
-            readings=np.zeros(n, dtype=np.int64),
-            rms_m=np.full(n, np.nan),
-            chi2=np.full(n, np.nan),
-            beams=np.zeros((n, 6)),
-            weak=np.zeros((n, 3)),
-            reasons={},
+            status=np.full(n, LOST), segment=np.full(n, -1),
+            poses=np.full((n, 3), np.nan), covariances=np.full((n, 3, 3), np.nan),
+            noise=np.full((n, 3, 3), np.nan), motion=np.zeros((n, 3)),
+            readings=np.zeros(n, dtype=np.int64), rms_m=np.full(n, np.nan),
+            chi2=np.full(n, np.nan), beams=np.zeros((n, 6)), weak=np.zeros((n, 3)), reasons={},
             corrections=np.full((scanners, 3), np.nan),
-            correction_sigma=np.full((scanners, 3), np.nan),
-            fronts={},
-        )
+            correction_sigma=np.full((scanners, 3), np.nan), fronts={},
+        )  # fmt: skip
         self.prior_m = np.full(n, 0.02)
         self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
@@ -397,12 +379,9 @@ def track_by_lasers(
 
 
 def track_without_suspects(
-    sets: ScanSets,
-    fixed: FixedScanners,
-    robot: Robot,
-    scanners: tuple[Scanner, ...],
+    sets: ScanSets, fixed: FixedScanners, robot: Robot, scanners: tuple[Scanner, ...],
     settings: LaserSettings | None = None,
-) -> tuple[LaserTrack, dict[str, FloatArray]]:
+) -> tuple[LaserTrack, dict[str, FloatArray]]:  # fmt: skip
     """Follow the robot, excluding scanners whose readings disagree with the others'.
 
     They are excluded one at a time, the worst first, and only while at least three scanners remain.

@@ -286,12 +286,9 @@ def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
 
 
 def draw_alignment(
-    measured: tuple[Scanner, ...],
-    alignment: Alignment,
-    clouds: list[FloatArray],
-    building: FloatArray,
-    icp_rms_m: list[FloatArray],
-) -> bytes:
+    measured: tuple[Scanner, ...], alignment: Alignment, clouds: list[FloatArray],
+    building: FloatArray, icp_rms_m: list[FloatArray],
+) -> bytes:  # fmt: skip
     """Draw scanners' points on the map for measured and aligned poses; returns a PNG's bytes.
 
     Beside them, `icp_rms_m`: for each scanner, the distances from the map (m) after each step of an
