@@ -345,19 +345,12 @@ def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
         return [Part("note", "No clock.json: all times are assumed to be of one clock.")]
     rows = [
-        (
-            f"{s.from_s:.2f}",
-            f"{s.to_s:.2f}",
-            f"{1e3 * s.offset_s:+.2f}",
-            _number(s.sigma_offset_s, 1e3),
-            f"{1e6 * (s.rate - 1.0):+.1f}",
-            _number(s.sigma_rate, 1e6, 1),
-            f"{math.degrees(s.angle_rad):+.3f}",
-            f"{math.degrees(s.turned_rad):.0f}",
-            s.status,
-        )
+        (f"{s.from_s:.2f}", f"{s.to_s:.2f}", f"{1e3 * s.offset_s:+.2f}",
+         _number(s.sigma_offset_s, 1e3), f"{1e6 * (s.rate - 1.0):+.1f}",
+         _number(s.sigma_rate, 1e6, 1), f"{math.degrees(s.angle_rad):+.3f}",
+         f"{math.degrees(s.turned_rad):.0f}", s.status)
         for s in inputs.clock.segments[:_MOST_ROWS]
-    ]
+    ]  # fmt: skip
     head = (
         "from / s", "to / s", "offset / ms", "sigma", "drift / ppm", "sigma", "angle / deg",
         "turned / deg", "status",
