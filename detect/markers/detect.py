@@ -276,8 +276,9 @@ def _marker_at(
         edges = refine_quadrangle(
             picture, fit.corners, templates.border, capture_px, settings, _PARTS
         )
-        if not isinstance(edges, str) and _contradicts(edges, fit):
-            best = edges
+        if not isinstance(edges, str):
+            edges = edges._replace(corners=edges.corners - fit.toned)
+            best = edges if _contradicts(edges, fit) else fit
     number, turns = templates.turned_id(template)
     printed = (np.arange(4) - turns) % 4
     corners, covariance = best.corners[printed], best.covariance[printed]

@@ -46,7 +46,7 @@ _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 
 #: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
 #: and of the tone curve's curvature; the largest of the latter.
-_SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _LARGEST_TONE = 0.3, 0.15, 0.15, 0.6
+_SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _TONES = 0.3, 0.15, 0.15, (-0.6, 3.0)
 #: Limits of the variance of the blur along any direction, px^2; the lower is about a pixel's own.
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 0.07, 60.0
 _CLOSE_ENOUGH_PX = 2e-3
@@ -75,6 +75,7 @@ class PatternFit(NamedTuple):
     explained: float  # share of the grey values' variance that is explained, noise aside
     blur_px: float  # mean standard deviation of the blur
     blur_cells: float  # the larger one along the marker's axes, in cells
+    toned: FloatArray  # (4, 2) shifts of corners by the centroids of edges, due to the tone curve
 
 
 def fit_marker(
@@ -134,6 +135,7 @@ def fit_marker(
         explained=1.0 - max(0.0, unexplained) / max(float(np.var(samples.grey)), 1e-9),
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
         blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
+        toned=_toned_corners(corners_of(homography), p),
     )
 
 
@@ -180,7 +182,7 @@ def _solved(
         off = corners_of(_homography_of(p)) - corners
         if not np.hypot(*off.T).max() <= reach_px:
             return None
-        p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
+        p[TONE] = min(max(p[TONE], _TONES[0]), _TONES[1])
         # The blur's variances are clamped in all directions.
         values, vectors = np.linalg.eigh(p[BLUR][[0, 1, 1, 2]].reshape(2, 2))
         largest = min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE)
@@ -213,6 +215,22 @@ def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
     widths_per_px = np.linalg.inv((homography[:2, :2] - np.outer(middle, homography[2, :2])) / w)
     covariance = widths_per_px @ blur[[0, 1, 1, 2]].reshape(2, 2) @ widths_per_px.T
     return float(np.sqrt(np.diag(covariance).max()))
+
+
+def _toned_corners(corners: FloatArray, p: FloatArray) -> FloatArray:
+    """(4, 2) shifts of the corners (4, 2) where edges meet that are measured by their centroids.
+
+    A blurred edge's centroid moves towards black by about t / (1 + t / 2) / sqrt(pi) of its blur.
+    """
+    along = np.roll(corners, -1, axis=0) - corners
+    along /= np.hypot(*along.T)[:, None]
+    u, v = along.T
+    blur_px = np.sqrt(p[BLUR][0] * v * v - 2.0 * p[BLUR][1] * u * v + p[BLUR][2] * u * u)
+    inwards = (p[TONE] / (1.0 + 0.5 * p[TONE]) / math.sqrt(math.pi) * blur_px)[:, None]
+    # If an edge moves, the corner moves along the other edge.
+    before = np.roll(along, 1, axis=0)
+    moved = np.roll(inwards, 1, axis=0) * along - inwards * before
+    return np.asarray(moved / (before[:, :1] * along[:, 1:] - before[:, 1:] * along[:, :1]))
 
 
 def _inflation(pixel: IntArray, left: Linearised) -> float:
