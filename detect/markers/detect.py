@@ -271,7 +271,8 @@ def _marker_at(
     if isinstance(quality, str):
         return quality
     best: RefinedQuadrangle | PatternFit = fit
-    if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
+    sharp = fit.blur_px <= _SHARP_BLURS * templates.border * side
+    if side >= _LEAST_BENT_PX and sharp and fit.surrounded:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
         edges = refine_quadrangle(
             picture, fit.corners, templates.border, capture_px, settings, _PARTS

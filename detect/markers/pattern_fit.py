@@ -40,6 +40,9 @@ from redetect.array_types import FloatArray, IntArray
 
 #: Width of the margin around the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
+#: If the residuals in the margin exceed this many standard deviations of those inside, the fit
+#: excludes it, and this depth inside the marker: blurs, at most a share of a cell's size.
+_SEAM_SIGMAS, _DEPTH_BLURS, _DEPTH_CELLS = 1.7, 2.0, 0.5
 #: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
 #: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
@@ -75,6 +78,7 @@ class PatternFit(NamedTuple):
     explained: float  # share of the grey values' variance that is explained, noise aside
     blur_px: float  # mean standard deviation of the blur
     blur_cells: float  # the larger one along the marker's axes, in cells
+    surrounded: bool  # whether there is enough white around it for its outer edges to be used
     toned: FloatArray  # (4, 2) shifts of corners by the centroids of edges, due to the tone curve
 
 
@@ -97,17 +101,21 @@ def fit_marker(
     pattern = pattern_of(templates.lines, templates.blackness(template))
     near = _SEAM_BLURS * blur_px + _SEAM_PX
     reach = min(near, max(_LEAST_SEAM_PX, cell_px))
-    samples = _samples(picture, corners, pattern.lines, reach, near, most_pixels)
-    if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
-        return None
     noise = max(picture.noise, _LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
     start = start._replace(corners=corners - centre)
-    solution = _solved(samples, pattern, start, noise, reach_px, steps)
-    if solution is None:
-        return None
-    p, left, inverse = solution
+    for margin in (reach, -min(_DEPTH_BLURS * blur_px, _DEPTH_CELLS * cell_px)):
+        samples = _samples(picture, corners, pattern.lines, margin, near, most_pixels)
+        if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
+            return None
+        solution = _solved(samples, pattern, start, noise, reach_px, steps)
+        if solution is None:
+            return None
+        p, left, inverse = solution
+        surrounded = margin > 0.0 and not _seam_differs(left, noise)
+        if surrounded:
+            break
 
     energy = left.weight * left.residual**2
     variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
@@ -135,6 +143,7 @@ def fit_marker(
         explained=1.0 - max(0.0, unexplained) / max(float(np.var(samples.grey)), 1e-9),
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
         blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
+        surrounded=surrounded,
         toned=_toned_corners(corners_of(homography), p),
     )
 
@@ -189,6 +198,15 @@ def _solved(
         confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
         p[BLUR] = confined.flat[[0, 1, 3]]
     return p, left, inverse
+
+
+def _seam_differs(left: Linearised, noise: float) -> bool:
+    """Whether the surroundings are not as white as the model: a narrow quiet zone."""
+    x, y = np.abs(left.at.x - 0.5) - 0.5, np.abs(left.at.y - 0.5) - 0.5
+    inside, seam = (x < 0.0) & (y < 0.0), (x > left.at.sigma_x) | (y > left.at.sigma_y)
+    sigma = robust_sigma(left.residual[inside], noise)
+    energy = float(np.sum(left.residual[seam] ** 2))
+    return energy > (_SEAM_SIGMAS * sigma) ** 2 * np.count_nonzero(seam)
 
 
 def robust_sigma(residual: FloatArray, least: float) -> float:
@@ -276,7 +294,7 @@ def _samples(
     last = np.array(picture.grey.shape[::-1]) - 1
     if not (np.all(low >= 0.0) and np.all(high <= last)):
         return None
-    pad = 1.5 * reach + 2.0
+    pad = 1.5 * max(reach, 0.0) + 2.0
     begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
     # Every n-th pixel is used, and far from boundaries every 10 n-th, chosen by a hash.
     area = abs(signed_area(corners))
