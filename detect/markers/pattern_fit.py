@@ -40,9 +40,9 @@ from redetect.array_types import FloatArray, IntArray
 
 #: Width of the margin around the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
-#: If the residuals in the margin exceed this many standard deviations of those inside, the fit
-#: excludes it, and this depth inside the marker: blurs, at most a share of a cell's size.
-_SEAM_SIGMAS, _DEPTH_BLURS, _DEPTH_CELLS = 1.7, 2.0, 0.5
+#: If the residuals in the margin are this many times those inside, the fit excludes the margin and
+#: this depth inside the marker: blurs, at most a share of a cell's size.
+_SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 1.7, 2.0, 0.5
 #: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
 #: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
@@ -113,7 +113,7 @@ def fit_marker(
         if solution is None:
             return None
         p, left, inverse = solution
-        surrounded = margin > 0.0 and not _seam_differs(left, noise)
+        surrounded = margin > 0.0 and not _seam_differs(left)
         if surrounded:
             break
 
@@ -200,13 +200,12 @@ def _solved(
     return p, left, inverse
 
 
-def _seam_differs(left: Linearised, noise: float) -> bool:
-    """Whether the surroundings are not as white as the model: a narrow quiet zone."""
+def _seam_differs(left: Linearised) -> bool:
+    """Whether the surroundings are not as white as the model although the marker is as modelled."""
     x, y = np.abs(left.at.x - 0.5) - 0.5, np.abs(left.at.y - 0.5) - 0.5
     inside, seam = (x < 0.0) & (y < 0.0), (x > left.at.sigma_x) | (y > left.at.sigma_y)
-    sigma = robust_sigma(left.residual[inside], noise)
-    energy = float(np.sum(left.residual[seam] ** 2))
-    return energy > (_SEAM_SIGMAS * sigma) ** 2 * np.count_nonzero(seam)
+    squares = [np.sum(left.residual[of] ** 2) / max(np.sum(of), 1) for of in (inside, seam)]
+    return bool(squares[1] > _SEAM_RATIO**2 * squares[0])
 
 
 def robust_sigma(residual: FloatArray, least: float) -> float:
@@ -239,12 +238,14 @@ def _toned_corners(corners: FloatArray, p: FloatArray) -> FloatArray:
     """(4, 2) shifts of the corners (4, 2) where edges meet that are measured by their centroids.
 
     A blurred edge's centroid moves towards black by about t / (1 + t / 2) / sqrt(pi) of its blur.
+    Cameras' curves are concave, t > 0; ink that spread looks like t < 0, but its edges are there.
     """
     along = np.roll(corners, -1, axis=0) - corners
     along /= np.hypot(*along.T)[:, None]
     u, v = along.T
     blur_px = np.sqrt(p[BLUR][0] * v * v - 2.0 * p[BLUR][1] * u * v + p[BLUR][2] * u * u)
-    inwards = (p[TONE] / (1.0 + 0.5 * p[TONE]) / math.sqrt(math.pi) * blur_px)[:, None]
+    tone = max(float(p[TONE]), 0.0)
+    inwards = (tone / (1.0 + 0.5 * tone) / math.sqrt(math.pi) * blur_px)[:, None]
     # If an edge moves, the corner moves along the other edge.
     before = np.roll(along, 1, axis=0)
     moved = np.roll(inwards, 1, axis=0) * along - inwards * before
