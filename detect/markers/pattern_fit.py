@@ -42,7 +42,7 @@ from redetect.array_types import FloatArray, IntArray
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
 #: If the residuals in the margin are this many times those inside, the fit excludes the margin and
 #: this depth inside the marker: blurs, at most a share of a cell's size.
-_SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 1.7, 2.0, 0.5
+_SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 1.4, 2.0, 0.5
 #: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
 #: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
