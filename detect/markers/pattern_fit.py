@@ -102,18 +102,22 @@ def fit_marker(
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
     start = start._replace(corners=corners - centre)
+    samples = solution = None
+    surrounded = False
     for margin in (reach, -min(_DEPTH_BLURS * blur_px, _DEPTH_CELLS * cell_px)):
-        samples = _samples(picture, corners, pattern.lines, margin, near, most_pixels)
-        if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
-            return None
-        solution = _solved(samples, pattern, start, noise, reach_px, steps)
-        if solution is None:
-            return None
-        p, left, inverse = solution
-        surrounded = margin > 0.0 and not _seam_differs(left)
+        some = _samples(picture, corners, pattern.lines, margin, near, most_pixels)
+        if some is None or len(some.grey) < PARAMETERS + _SPARE_PIXELS:
+            break
+        found = _solved(some, pattern, start, noise, reach_px, steps)
+        if found is None:
+            break
+        samples, solution = some, found
+        surrounded = margin > 0.0 and not _seam_differs(found[1])
         if surrounded:
             break
-    assert samples is not None
+    if samples is None or solution is None:
+        return None
+    p, left, inverse = solution
     energy = left.weight * left.residual**2
     variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
     homography = _homography_of(p)
