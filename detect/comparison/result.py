@@ -151,7 +151,7 @@ class Comparison(ABC):
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
 
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on found and missed rows, extra rows, errors and covariances."""
+        """Sentences on found, missed and extra rows, rows set aside, errors and covariances."""
         found = (
             f"{self.found} of {self.reference} {self.what} of the reference are found, "
             f"{self.missed} missed, in {counted(len(self.frames), 'frame')}."
@@ -169,6 +169,10 @@ class Comparison(ABC):
             )
         if not self.detected:
             extra = f"No {self.what}{' that count' * bool(self.set_aside)} are detected."
+        if self.set_aside:
+            with_ids = " with an ID" if self.options.only_identified else ""
+            aside = f"{self.set_aside} more {'is' if self.set_aside == 1 else 'are'}"
+            extra += f" {aside} on {self.what} that the reference does not list{with_ids}."
         if not self.matched:
             return found, extra, "There are no errors: no rows match."
         return found, extra, self._errors(), _agreement(self.normalised_error)

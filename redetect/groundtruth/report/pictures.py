@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from redetect import plane
 from redetect.array_types import FloatArray
@@ -25,9 +26,6 @@ from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.onboard import OF_A_WALL_M
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _WIDE_IN, _TALLEST_IN, _SERIES_HIGH_IN = 7.9, 7.9, 2.9
 _MOST_POINTS, _MOST_STAGE_POINTS = 1500, 400
