@@ -30,14 +30,7 @@ from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
 from detect.settings import CircleSettings, Polarity
-from lut import (
-    DiscShape,
-    DiscTable,
-    VoteShape,
-    VoteTable,
-    cached_disc_table,
-    cached_vote_table,
-)
+from lut import DiscShape, DiscTable, VoteShape, VoteTable, cached_disc_table, cached_vote_table
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
