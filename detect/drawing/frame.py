@@ -51,8 +51,8 @@ _WORDS_COLOUR: Colour = (230, 230, 230)
 _SUBPIXEL_BITS = 4
 # OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Up to this width, strokes are one pixel wide; wider pictures (of phones) get wider strokes.
-_COLUMNS = 1500
+# Text and strokes are enlarged in proportion to pictures of this width.
+_COLUMNS = 750
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
@@ -91,7 +91,7 @@ def draw_rows(
     if rows.tilt is not None:
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
-    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38, scale)
+    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38)
 
 
 def processed(rows: SeenRows) -> bool:
@@ -161,14 +161,12 @@ def _draw_discs(
             outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
             rims.append(_scaled(outline, scale))
             draw_curve(canvas, rims[-1], colour, closed=True)
-    _draw_labels(canvas, [f"{row.quality:.2f}{text}" for row, text, _ in drawn], rims[2::3], scale)
+    _draw_labels(canvas, [f"{row.quality:.2f}{text}" for row, text, _ in drawn], rims[2::3])
 
 
-def _draw_labels(
-    canvas: ByteArray, texts: Sequence[str], rims: Sequence[FloatArray], scale: int
-) -> None:
+def _draw_labels(canvas: ByteArray, texts: Sequence[str], rims: Sequence[FloatArray]) -> None:
     """Labels to the right of rims, or else to the left, or else moved down until on no other."""
-    times = scale * enlargement(canvas)
+    times = enlargement(canvas)
     taken = np.zeros((0, 2))
 
     def free(place: FloatArray) -> bool:
@@ -186,7 +184,7 @@ def _draw_labels(
         while not free(place):
             place[1] += size[1]
         taken = np.vstack([taken, place])
-        draw_text(canvas, text, place, _TEXT_COLOUR, scale=scale)
+        draw_text(canvas, text, place, _TEXT_COLOUR)
 
 
 def _draw_lines(
@@ -203,17 +201,17 @@ def _draw_lines(
     rows = [row for row, _, _ in drawn]
     curves = _scaled(line_curves(camera, ends_of(rows)), scale)
     bars = _scaled(sigma_bars(camera, ends_of(rows), numbers(rows, "sigma")), scale)
-    tick = scale * enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
+    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas, curve, colour)
         for points in (bar, bar[0] + tick, bar[1] + tick):
             draw_curve(canvas, points, SIGMA_COLOUR)
-        draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9), scale)
+        draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
 def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
     """Edges, a circle at the top left corner, and ellipses of 20 standard deviations."""
-    times = scale * enlargement(canvas)
+    times = enlargement(canvas)
     circle = circle_on_floor((0.0, 0.0), 1.0, _POINTS)
     for row in found:
         corners = _scaled(np.array([(c.u, c.v) for c in row.corners]), scale)
@@ -222,7 +220,7 @@ def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int
         for ellipse in ellipses(corners, spreads, scale * _SIGMAS, _POINTS):
             draw_curve(canvas, ellipse, LINE_COLOUR, closed=True)
         draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
-        draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5), scale)
+        draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
@@ -259,7 +257,7 @@ def _unseen(camera: Camera) -> BoolArray:
 
 
 def enlargement(canvas: ByteArray) -> int:
-    """Factor on strokes and text, so that they are visible when the whole picture is shown."""
+    """Factor on text and marks, so that they are visible when the whole picture is shown."""
     return max(1, round(int(canvas.shape[1]) / _COLUMNS))
 
 
@@ -269,7 +267,7 @@ def draw_curve(
     """Draw a curve through (N, 2) points u, v, unless one is not finite."""
     if np.all(np.abs(points) < _FARTHEST_PX):
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        width = enlargement(canvas)
+        width = max(1, enlargement(canvas) // 2)
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
@@ -280,15 +278,14 @@ def draw_text(
     colour: Colour,
     size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
-    scale: int = 1,
 ) -> None:
     """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
 
-    `shift` moves the text, by more in wide pictures; `scale` is that of an enlarged one.
+    `shift` moves the text, by more in wide pictures.
     """
     place = np.asarray(at, dtype=np.float64)
     if np.all(np.abs(place) < _FARTHEST_PX):
-        times = scale * enlargement(canvas)
+        times = enlargement(canvas)
         u, v = (np.rint(place) + times * np.array(shift)).astype(int).tolist()
         cv2.putText(
             canvas, text.encode("ascii", "replace").decode(), (u, max(v, 10 * times)),
@@ -297,21 +294,17 @@ def draw_text(
 
 
 def with_legend(
-    canvas: ByteArray,
-    words: Sequence[tuple[str, Colour]],
-    column_px: int,
-    size: float,
-    scale: int = 1,
+    canvas: ByteArray, words: Sequence[tuple[str, Colour]], column_px: int, size: float
 ) -> ByteArray:
-    """The picture with text below it, in columns of a given width; `scale` as in `draw_text`."""
-    times = scale * enlargement(canvas)
+    """The picture with text below it, in columns of a given width."""
+    times = enlargement(canvas)
     width = int(canvas.shape[1])
     per_row = max(1, width // (column_px * times))
     rows = -(-len(words) // per_row)
     legend = np.zeros(((14 * rows + 4) * times, width, 3), np.uint8)
     for k, (text, colour) in enumerate(words):
         shift = 4 + column_px * (k % per_row), 13 + 14 * (k // per_row)
-        draw_text(legend, text, (0, 0), colour, size, shift, scale)
+        draw_text(legend, text, (0, 0), colour, size, shift)
     return np.concatenate([canvas, legend])
 
 
@@ -345,7 +338,7 @@ def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> 
             draw_curve(picture, _scaled(candidate.outline, scale), _CANDIDATE_COLOUR, closed=True)
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
-    return with_legend(picture, words, 210, 0.36, scale)
+    return with_legend(picture, words, 210, 0.36)
 
 
 def draw_disc_candidates(
