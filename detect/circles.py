@@ -38,7 +38,7 @@ from lut import (
     cached_disc_table,
     cached_vote_table,
 )
-from lut.outlines import floor_positions
+from lut.outlines import fingerprint, floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
@@ -103,11 +103,16 @@ def detect_circles(
     FrameError
         If the image is not an 8-bit grey image of the camera's size.
     DetectError
-        If the table belongs to the other detector.
+        If the table is for another detector, camera or shape of the discs.
     """
-    if isinstance(table, DiscTable) == settings.refine:
-        owner = "the published detector" if settings.refine else "the default detector"
-        raise DetectError(f"the table is for {owner}: expected disc_table(camera, settings)")
+    kind, shape = (VoteTable, vote_shape) if settings.refine else (DiscTable, disc_shape)
+    if not isinstance(table, kind) or not np.array_equal(
+        table.made_for, fingerprint(camera, shape(settings))
+    ):
+        raise DetectError(
+            f"the {type(table).__name__} is for another detector, camera or other settings, such "
+            "as radius_m: expected disc_table(camera, settings)"
+        )
     image = plain_image(image, (camera.height, camera.width))
     if isinstance(table, DiscTable):
         return _by_quality(image, camera, table, settings)

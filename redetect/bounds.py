@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from math import inf
-from numbers import Integral
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, Optional, get_args, get_origin, get_type_hints
 
@@ -99,9 +99,15 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
 def demand_fields(settings: object, error: type[Exception]) -> None:
     """Reject a dataclass of settings with a number out of the bounds that annotate its field, or
     a word that is none of a field's.
+
+    Whole numbers and NumPy's become Python's of the field's type: kernels are compiled for those.
     """
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
+    for name, bounds in _annotated(kind).items():
+        value, number = getattr(settings, name), int if bounds.whole else float
+        if isinstance(value, Real) and type(value) is not number:
+            object.__setattr__(settings, name, number(value))
 
 
 @cache
