@@ -30,16 +30,10 @@ from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
 from detect.settings import CircleSettings, Polarity
-from lut import (
-    DiscShape,
-    DiscTable,
-    VoteShape,
-    VoteTable,
-    cached_disc_table,
-    cached_vote_table,
-)
+from lut import DiscShape, DiscTable, VoteShape, VoteTable, cached_disc_table, cached_vote_table
 from lut.outlines import fingerprint, floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.tables import ByContent
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -57,8 +51,8 @@ _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 _numbers = lru_cache(maxsize=4)(camera_numbers)
 
 
-@dataclass(frozen=True)
-class CircleDetections:
+@dataclass(frozen=True, eq=False)
+class CircleDetections(ByContent):
     """The discs found in one image, in scan order of their pixels."""
 
     pixels: IntArray  #: (N, 2) pixel (u, v) of each local maximum of the quality

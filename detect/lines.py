@@ -35,6 +35,7 @@ from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow
 from lut.verticals import VerticalTable
 from redetect.array_types import GreyImage
 from redetect.landmarks import LineLandmark, wrap_angle
+from redetect.tables import ByContent
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
@@ -43,7 +44,7 @@ _SAME_LINE_RAD = np.radians(0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class LineDetections:
+class LineDetections(ByContent):
     """Detections in one image."""
 
     lines: Lines  # the leftmost is the first, here and elsewhere

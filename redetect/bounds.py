@@ -105,9 +105,10 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
     for name, bounds in _annotated(kind).items():
-        value, number = getattr(settings, name), int if bounds.whole else float
-        if isinstance(value, Real) and type(value) is not number:
-            object.__setattr__(settings, name, number(value))
+        value = getattr(settings, name)
+        if isinstance(value, Real):
+            number = round(value) if bounds.whole else float(value)
+            object.__setattr__(settings, name, number)
 
 
 @cache

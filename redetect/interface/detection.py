@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from numbers import Integral
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,17 +27,30 @@ from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
-from redetect.interface.tables import Table, covariance_columns, html_table, plain
+from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.messages import counted, excerpt
+from redetect.tables import Table, covariance_columns, html_picture, html_table, plain
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
 
 
+class Landmarks(Table):
+    """Landmarks of an image as arrays with one row each."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, chosen: Any) -> Any:
+        """One, by its number, with its values as attributes; some, by a slice, numbers or mask."""
+        own = {name: values[chosen] for name, values in vars(self).items()}
+        return SimpleNamespace(**own) if isinstance(chosen, Integral) else type(self)(**own)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Discs(Table):
+class Discs(Landmarks):
     """Discs on the floor, N of them, in scan order.
 
     Attributes
@@ -61,9 +74,6 @@ class Discs(Table):
     quality: FloatArray
     evidence: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.u)
-
     def columns(self) -> dict[str, Any]:
         """One row per disc."""
         return {
@@ -78,7 +88,7 @@ class Discs(Table):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Verticals(Table):
+class Verticals(Landmarks):
     """Vertical lines of the building, N of them, the leftmost first.
 
     Attributes
@@ -98,9 +108,6 @@ class Verticals(Table):
     inclination_rad: FloatArray
     top: FloatArray
     bottom: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.bearing_rad)
 
     def columns(self) -> dict[str, Any]:
         """One row per vertical."""
@@ -212,10 +219,11 @@ class Detection(Table):
         return png_of(self.picture())
 
     def _repr_html_(self) -> str:
-        words, picture = html.escape(str(self)), html_picture(self.picture(), self.name)
-        return f"<p>{words}</p>{picture}{html_table(self.discs.columns())}"
+        tables = html_table(self.discs.columns()) + html_table(self.verticals.columns())
+        return f"<p>{html.escape(str(self))}</p>{html_picture(self)}{tables}"
 
 
+@keywords_named()
 def detect(
     image: ImageLike,
     camera: CameraLike,
@@ -300,6 +308,7 @@ class RecordedFrame:
         """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
         return read_image(self.frame, self.camera)
 
+    @keywords_named()
     def detect(
         self,
         radius_m: float | None = None,
@@ -312,7 +321,8 @@ class RecordedFrame:
     ) -> Detection:
         """Detect discs, verticals and tilt: see `detect`."""
         if axes not in MEANING:
-            raise DetectError(f"axes is {excerpt(axes)}: expected one of {', '.join(MEANING)}")
+            meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())
+            raise DetectError(f"axes is {excerpt(axes)}: expected {meant}; robotics are REP 103's")
         chosen = settings_of(settings, radius_m, polarity)
         plan = FramePlan(
             self.camera,
@@ -330,32 +340,28 @@ def settings_of(
     settings: CircleSettings | None, radius_m: float | None, polarity: Polarity | None
 ) -> CircleSettings:
     """Settings with the radius and polarity that are given separately."""
-    settings = settings or CircleSettings()
-    # Kernels are compiled for Python's numbers, not for those of NumPy.
-    number = radius_m.item() if isinstance(radius_m, np.generic) else radius_m
-    return replace(
-        settings,
-        radius_m=settings.radius_m if number is None else number,
-        polarity=polarity or settings.polarity,
-    )
+    if isinstance(radius_m, str):
+        raise DetectError(
+            f"radius_m is {excerpt(radius_m)}: expected metres, which `detect all --radius-m auto` "
+            "and detect.discs.radius.find_radius estimate from images"
+        )
+    given: dict[str, Any] = {"radius_m": radius_m, "polarity": polarity}
+    given = {name: value for name, value in given.items() if value is not None}
+    return replace(settings or CircleSettings(), **given)
 
 
 def camera_of(camera: CameraLike) -> Camera:
     """The given camera, or the one in the given file."""
-    return camera if isinstance(camera, Camera) else read_camera(camera)
-
-
-def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
-    """A picture as HTML with embedded content."""
-    content = base64.b64encode(png_of(picture)).decode()
-    return f'<img alt="{html.escape(name)}" src="data:image/png;base64,{content}"/>'
+    if isinstance(camera, Camera):
+        return camera
+    return read_camera(path_of(camera, "a Camera, or the name of its .cam file", DetectError))
 
 
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
         return RunFrame(still("image"), None, content=plain_image(image))
-    path = Path(image)
+    path = path_of(image, "an array of grey values, or the name of an image file", FrameError)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
     return RunFrame(still("_".join(path.stem.split()) or "image"), path)  # a prefix is one word
@@ -459,9 +465,10 @@ class Explanation(DiscExplanation, Table):
 
     def _repr_html_(self) -> str:
         words = "".join(f"<p>{html.escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
-        return f"{words}{html_picture(self.picture())}{super()._repr_html_()}"
+        return words + super()._repr_html_()
 
 
+@keywords_named()
 def explain(
     image: ImageLike,
     camera: CameraLike,

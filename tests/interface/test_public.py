@@ -17,9 +17,9 @@ import pytest
 
 import redetect as rd
 from detect.errors import DetectError, FrameError
-from redetect.interface.tables import FrameLibrary, ResultError
 from redetect.landmarks import read_frames, write_frames
 from redetect.storage import OutputExistsError
+from redetect.tables import FrameLibrary, ResultError
 
 
 def test_importing_costs_nothing(project_root: Path) -> None:
