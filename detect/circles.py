@@ -178,13 +178,9 @@ def candidates_of(
 
 
 def judged(
-    image: GreyImage,
-    camera: Camera,
-    settings: CircleSettings,
-    candidates: HoughCandidates,
-    noise: float,
-    networks: Networks | None = None,
-) -> Judgement:
+    image: GreyImage, camera: Camera, settings: CircleSettings, candidates: HoughCandidates,
+    noise: float, networks: Networks | None = None,
+) -> Judgement:  # fmt: skip
     """Classify candidates (see `detect.discs.judgement`); parameters as for `candidates_of`.
 
     `networks` defaults to the trained ones.
@@ -256,15 +252,9 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     """The settings on which the table of outlines depends."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
     return DiscShape(
-        inner_radius_m=inner,
-        outer_radius_m=outer,
-        samples=settings.samples,
-        border_px=settings.border_px,
-        far_limit_m_per_px=settings.far_limit_m_per_px,
-        least_pairs=settings.least_pairs,
-        apart_px=settings.apart_px,
-        stride_m=settings.stride * (outer - inner),
-    )
+        inner, outer, settings.samples, settings.border_px, settings.far_limit_m_per_px,
+        settings.least_pairs, settings.apart_px, stride_m=settings.stride * (outer - inner),
+    )  # fmt: skip
 
 
 def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -284,13 +274,6 @@ def refined_covariance(
 
     The covariances of the fits, plus those due to standard deviations of pixels and of the tilt.
     """
-    return np.asarray(
-        refined_covariances(
-            _numbers(camera),
-            np.array(camera.centre, np.float64),
-            np.ascontiguousarray(floor_xy, np.float64),
-            np.ascontiguousarray(fitted, np.float64),
-            sigma_px**2,
-            tilt_sigma_rad**2,
-        )
-    )
+    floor_xy, fitted = (np.ascontiguousarray(each, np.float64) for each in (floor_xy, fitted))
+    centre, variances = np.array(camera.centre, np.float64), (sigma_px**2, tilt_sigma_rad**2)
+    return np.asarray(refined_covariances(_numbers(camera), centre, floor_xy, fitted, *variances))

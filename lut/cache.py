@@ -72,12 +72,9 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
 
 
 def _cached(
-    kind: type[Table],
-    name: str,
-    of: tuple[Any, ...],
-    build: Callable[..., Table],
+    kind: type[Table], name: str, of: tuple[Any, ...], build: Callable[..., Table],
     folder: Path | None,
-) -> Table:
+) -> Table:  # fmt: skip
     content = f"{TABLE_VERSION} {fingerprint(*of).tobytes().hex()}"
     key = hashlib.sha256(content.encode()).hexdigest()[:32]
     path = (folder or cache_folder()) / f"{name}-{key}.table"

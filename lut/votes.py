@@ -119,22 +119,15 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     known = np.flatnonzero(last)
     at = np.arange(math.floor((edges[-1] - edges[0]) / step)) + 0.5
     return VoteTable(
-        floor_xy=floor_xy.astype(np.float32),
-        paired=paired,
-        image_row=np.array(image_row),
-        pixel=pixel[image_row],
+        floor_xy=floor_xy.astype(np.float32), paired=paired,
+        image_row=np.array(image_row), pixel=pixel[image_row],
         row_of_step=np.searchsorted(edges, edges[0] + step * at, side="right") - 1,
         ahead=0.5 * (edges[1:] + edges[:-1]),
         first=np.interp(np.arange(len(first)), known, first[known]).astype(np.int64),
         last=np.interp(np.arange(len(last)), known, last[known]).astype(np.int64),
-        columns=int(last.max()) + 3,
-        cell=cell,
-        step=step,
-        left=left,
-        foot=foot,
-        turn=turn,
+        columns=int(last.max()) + 3, cell=cell, step=step, left=left, foot=foot, turn=turn,
         made_for=fingerprint(camera, shape),
-    )
+    )  # fmt: skip
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:

@@ -40,6 +40,11 @@ class Table(ByContent):
         """Columns of equal length by name; names end with the unit."""
         raise NotImplementedError
 
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as dicts with JSON's types."""
+        columns = plain(self.columns())
+        return [dict(zip(columns, values)) for values in zip(*columns.values())]
+
     def to_dataframe(self, library: FrameLibrary | None = None) -> Any:
         """The columns as a data frame.
 
@@ -116,7 +121,7 @@ def html_picture(shown: Any) -> str:
     if not hasattr(shown, "_repr_png_"):
         return ""
     content = base64.b64encode(shown._repr_png_()).decode()
-    return f'<img alt="" src="data:image/png;base64,{content}"/>'
+    return f'<img alt="{html.escape(repr(shown))}" src="data:image/png;base64,{content}"/>'
 
 
 def html_table(columns: Mapping[str, Sequence[Any]]) -> str:

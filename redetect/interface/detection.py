@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
-from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
+from detect.discs.unfound import Explanation, explain_discs
+from detect.drawing.frame import draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
@@ -31,7 +31,7 @@ from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.messages import counted, excerpt
-from redetect.tables import Table, covariance_columns, html_picture, html_table, plain
+from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table, plain
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
@@ -123,7 +123,7 @@ class Verticals(Landmarks):
 
 
 @dataclass(frozen=True, eq=False)
-class Tilt:
+class Tilt(ByContent):
     """The robot's tilt, from the verticals.
 
     Attributes
@@ -193,8 +193,8 @@ class Detection(Table):
             "image": self.name,
             "axes": self.axes,
             "tilt": None if self.tilt is None else plain(vars(self.tilt)),
-            "discs": _records(self.discs),
-            "verticals": _records(self.verticals),
+            "discs": self.discs.records(),
+            "verticals": self.verticals.records(),
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
@@ -373,35 +373,24 @@ def _detection(
     assert found.image is not None
     assert found.discs is not None
     assert found.lines is not None
-    verticals, discs = found.lines, found.discs
+    verticals, lines, discs = found.lines, found.lines.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
     unknown = np.full(len(discs), -1)
     rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     return Detection(
-        discs=Discs(
-            u=pixels[:, 0],
-            v=pixels[:, 1],
-            xy=from_dataset(discs.floor_xy, axes),
+        Discs(
+            u=pixels[:, 0], v=pixels[:, 1], xy=from_dataset(discs.floor_xy, axes),
             covariance=covariance_from_dataset(discs.covariance, axes),
-            quality=discs.quality,
-            evidence=discs.evidence,
+            quality=discs.quality, evidence=discs.evidence,
         ),
-        verticals=Verticals(
-            bearing_rad=verticals.lines.alpha_rad,
-            sigma_rad=verticals.lines.sigma_rad,
-            inclination_rad=verticals.lines.beta_rad,
-            top=camera.distort(verticals.lines.ends[:, :2]),
-            bottom=camera.distort(verticals.lines.ends[:, 2:]),
+        Verticals(
+            bearing_rad=lines.alpha_rad, sigma_rad=lines.sigma_rad, inclination_rad=lines.beta_rad,
+            top=camera.distort(lines.ends[:, :2]), bottom=camera.distort(lines.ends[:, 2:]),
         ),
-        tilt=_tilt_of(found.tilt, axes),
-        axes=axes,
-        name=step.prefix,
-        image=found.image,
-        camera=camera,
-        settings=settings,
+        _tilt_of(found.tilt, axes), axes, step.prefix, found.image, camera, settings,
         frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
         frame_tilt=found.tilt,
-    )
+    )  # fmt: skip
 
 
 def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
@@ -411,61 +400,6 @@ def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     sign = 1.0 if axes == "dataset" else -1.0
     covariance = np.array([[tilt.cpp, sign * tilt.cpr], [sign * tilt.cpr, tilt.crr]])
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
-
-
-def _records(table: Table) -> list[dict[str, Any]]:
-    columns = plain(table.columns())
-    return [dict(zip(columns, values)) for values in zip(*columns.values())]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Explanation(DiscExplanation, Table):
-    """Candidates of an image with the stage and the number that rejected them, and suggestions.
-
-    Attributes
-    ----------
-    candidates : tuple of detect.discs.unfound.Candidate
-        Accepted ones first, then in order of decreasing votes.
-    place : str
-        Description of the given pixel; empty without one.
-    suggestions : tuple of str
-        Flags or settings to try, with their results.
-    """
-
-    image: NDArray[np.uint8]
-    camera: Camera
-    settings: CircleSettings
-    at: tuple[float, float] | None
-
-    def columns(self) -> dict[str, Any]:
-        """One row per candidate, numbered as in the picture."""
-        rows = self.candidates
-        return {
-            "number": list(range(1, len(rows) + 1)),
-            **{name: [getattr(row, name) for row in rows] for name in Candidate._fields},
-            "reason": [row.reason() for row in rows],
-        }
-
-    def picture(self) -> NDArray[np.uint8]:
-        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
-        return draw_disc_candidates(
-            self.image, self.camera, self.settings.radius_m, self.candidates, self.at
-        )
-
-    def __str__(self) -> str:
-        lines = [self.place] if self.place else []
-        lines += [
-            f"{number:3d}  ({row.u:.0f}, {row.v:.0f})  {row.reason()}"
-            for number, row in enumerate(self.candidates, start=1)
-        ]
-        return "\n".join([*lines, *self.suggestions])
-
-    def _repr_png_(self) -> bytes:
-        return png_of(self.picture())
-
-    def _repr_html_(self) -> str:
-        words = "".join(f"<p>{html.escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
-        return words + super()._repr_html_()
 
 
 @keywords_named()
@@ -502,6 +436,4 @@ def explain(
     chosen = settings_of(settings, radius_m, polarity)
     if at is not None and (np.shape(at) != (2,) or not np.isreal(at).all()):
         raise DetectError(f"at is {excerpt(at)}: expected a pixel (u, v)")
-    pixels = read_image(frame, camera)
-    found = explain_discs(pixels, camera, chosen, at)
-    return Explanation(**vars(found), image=pixels, camera=camera, settings=chosen, at=at)
+    return explain_discs(read_image(frame, camera), camera, chosen, at)

@@ -8,7 +8,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from camera import Camera
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
@@ -132,11 +131,8 @@ def compare(
     in_file = None if reference is None else Path(reference)
     if detected is None or isinstance(detected, str | os.PathLike):
         path = None if detected is None else Path(detected)
-        command = Compare(
-            run, lines=lines, reference=in_file, detected=path, matching=options,
-            camera=None if camera is None or isinstance(camera, Camera) else Path(camera),
-        )  # fmt: skip
-        return comparison_of(command, camera if isinstance(camera, Camera) else None)
+        command = Compare(run, lines=lines, reference=in_file, detected=path, matching=options)
+        return comparison_of(command, None if camera is None else camera_of(camera))
     found = list(detected) if isinstance(detected, Iterable) else [detected]
     for one in found:
         if not isinstance(one, Detection):
