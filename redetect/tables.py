@@ -109,11 +109,7 @@ def plain(value: Any) -> Any:
 
 def covariance_columns(covariance: Any) -> dict[str, Sequence[Any]]:
     """Columns of (N, 2, 2) covariances of positions, square metres."""
-    return {
-        "cxx_m2": covariance[:, 0, 0],
-        "cxy_m2": covariance[:, 0, 1],
-        "cyy_m2": covariance[:, 1, 1],
-    }
+    return dict(zip(("cxx_m2", "cxy_m2", "cyy_m2"), covariance[:, (0, 0, 1), (0, 1, 1)].T))
 
 
 def html_picture(shown: Any) -> str:

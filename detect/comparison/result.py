@@ -153,11 +153,12 @@ class Comparison(Table, ABC):
 
     def columns(self) -> dict[str, Any]:
         """One row per frame that is in both files."""
-        return {
-            "name": [match.name for match in self.frames],
-            **{count: [len(getattr(m, count)) for m in self.frames] for count in self.counts},
-            f"largest_error_{self.unit}": [match.largest_error for match in self.frames],
-        }
+        rows = [self._row(match) for match in self.frames]
+        return {name: [row[name] for row in rows] for name in rows[0]}
+
+    def _row(self, match: FrameMatch) -> dict[str, Any]:
+        counts = {count: len(getattr(match, count)) for count in self.counts}
+        return {"name": match.name, **counts, f"largest_error_{self.unit}": match.largest_error}
 
     def __str__(self) -> str:
         return "\n".join(self.sentences())
@@ -203,14 +204,7 @@ class Comparison(Table, ABC):
         figures |= {
             "frames": len(self.frames),
             "pairs": self.matched,
-            "worst_frames": [
-                {
-                    "name": match.name,
-                    **{count: len(getattr(match, count)) for count in self.counts},
-                    f"largest_error_{self.unit}": match.largest_error,
-                }
-                for match in self.worst_frames(WORST_FRAMES)
-            ],
+            "worst_frames": [self._row(match) for match in self.worst_frames(WORST_FRAMES)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
         return plain

@@ -235,13 +235,9 @@ def draw_curve(
 
 
 def draw_text(
-    canvas: ByteArray,
-    text: str,
-    at: ArrayLike,
-    colour: Colour,
-    size: float = 0.35,
+    canvas: ByteArray, text: str, at: ArrayLike, colour: Colour, size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
-) -> None:
+) -> None:  # fmt: skip
     """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
 
     `shift` moves the text, by more in wide pictures.

@@ -144,11 +144,6 @@ def compare(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
     seen_by = found[0].camera if camera is None else camera_of(camera)
-    return compare_with_file(
-        kind,
-        in_file,
-        [one.frame for one in found],
-        options,
-        sight=Sight.by(seen_by, found[0].settings, read_head(in_file).level),
-        names=(str(in_file), "detections"),
-    )
+    sight = Sight.by(seen_by, found[0].settings, read_head(in_file).level)
+    frames, names = [one.frame for one in found], (str(in_file), "detections")
+    return compare_with_file(kind, in_file, frames, options, sight=sight, names=names)
