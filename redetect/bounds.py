@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from math import inf
-from numbers import Integral, Real
+from numbers import Integral
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Optional, get_args, get_origin, get_type_hints
 
@@ -100,13 +100,13 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
     """Reject a dataclass of settings with a number out of the bounds that annotate its field, or
     a word that is none of a field's.
 
-    Whole numbers and NumPy's become Python's of the field's type: kernels are compiled for those.
+    Numbers become Python's of the field's type, for which kernels are compiled.
     """
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
     for name, bounds in _annotated(kind).items():
         value = getattr(settings, name)
-        if isinstance(value, Real):
+        if value is not None and not isinstance(value, str | tuple):
             number = round(value) if bounds.whole else float(value)
             object.__setattr__(settings, name, number)
 

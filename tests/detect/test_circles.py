@@ -374,7 +374,7 @@ def test_a_table_that_is_not_that_of_camera_and_settings_is_refused(
         detect_lines(image, tables["VoteTable"])
 
 
-@pytest.mark.parametrize("radius_m", [1, np.float32(1.0), np.int64(1)])
+@pytest.mark.parametrize("radius_m", [1, np.float32(1.0), np.int64(1), np.array(1.0)])
 def test_numbers_of_other_types_are_the_same_settings(
     published_camera: Camera, radius_m: Any
 ) -> None:
