@@ -14,6 +14,9 @@ from detect.sources.interface import RunFrame, read_image, still
 from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
 
+#: Number of candidates in the table.
+_SHOWN = 40
+
 
 def perform(command: Explain) -> int:
     """Execute the command; returns the exit code."""
@@ -55,10 +58,12 @@ def _print(found: Explanation) -> None:
     for heading in ("", "u", "v", "ahead m", "left m", "votes", "contrast"):
         table.add_column(heading, justify="right")
     table.add_column("result")
-    for number, row in enumerate(found.candidates, start=1):
+    for number, row in enumerate(found.candidates[:_SHOWN], start=1):
         figures = f"{row.u:.0f} {row.v:.0f} {-row.y_m:.2f} {row.x_m:.2f} {row.votes:.1f}"
         contrast = f"{row.contrast:+.0f}" if row.contrast == row.contrast else "-"
         table.add_row(str(number), *figures.split(), contrast, row.reason())
     console.print(table if found.candidates else "No candidate for a disc.")
+    if len(found.candidates) > _SHOWN:
+        console.print(f"{len(found.candidates) - _SHOWN} more with fewer votes: --at U V, --json")
     for words in found.suggestions:
         console.print(f"Try: {words}", highlight=False, markup=False)

@@ -10,7 +10,7 @@ outlines of discs of known size: with a wrong height, their pitch differs from t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import leaning_camera, level_matrix
 from detect.settings import CircleSettings
+from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
@@ -37,6 +38,9 @@ from redetect.storage import demand_place
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
+#: If the camera is at an estimated height, this share of frames with discs still has some, and the
+#: height that is estimated again is the same within this many sigmas.
+_STILL_SEEN, _MOST_SIGMAS = 0.9, 3.0
 #: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
@@ -48,10 +52,23 @@ def perform(options: Level) -> int:
     """Execute the command; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     run = open_run(options.run, options.camera)
-    camera, height_m = run.camera, float(run.camera.centre[2])
-    plan = FramePlan(
-        camera, LineSettings(), CircleSettings(radius_m=options.radius_m), levelling="none"
-    )
+    mounting = _mounting(run, run.camera, options.radius_m)
+    if abs(mounting.raised_m) > HEIGHT_STEPS[-1] * run.camera.centre[2]:
+        # Far from the right height, only things of another size are taken for discs.
+        again = _mounting(run, remounted(run.camera, mounting), options.radius_m)
+        near = abs(again.raised_m) < _MOST_SIGMAS * again.raised_sigma_m
+        if not near or again.frames_with_discs < _STILL_SEEN * mounting.frames_with_discs:
+            mounting = replace(mounting, raised_m=math.nan, raised_sigma_m=math.nan)
+    print("\n".join(mounting.sentences()))
+    write_camera(remounted(run.camera, mounting), options.output, overwrite=options.force)
+    print(f"written: {options.output}")
+    return 0
+
+
+def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
+    """The mounting of a run's camera, compared with the given one."""
+    height_m = float(camera.centre[2])
+    plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
     tilts, pitches, failures = [], [], []
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
@@ -62,7 +79,7 @@ def perform(options: Level) -> int:
                 continue
             outlines = [
                 tilt_of_outlines(
-                    found.image, camera, found.seen.floor_xy, options.radius_m, share * height_m
+                    found.image, camera, found.seen.floor_xy, radius_m, share * height_m
                 )
                 for share in HEIGHT_STEPS
             ]
@@ -70,19 +87,16 @@ def perform(options: Level) -> int:
             pitches.append([math.nan if one is None else one.pitch for one in outlines])
     report_failures(len(failures), failures)
     if not tilts:
-        raise DetectError(f"{options.run}: none of its images could be processed")
+        raise DetectError(f"{run.folder}: none of its images could be processed")
     mounting = mounting_of_run(
         height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
     )
     if mounting is None:
         raise DetectError(
-            f"{options.run}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
+            f"{run.folder}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
             "drive where doors, shelves or walls are visible"
         )
-    print("\n".join(mounting.sentences()))
-    write_camera(remounted(camera, mounting), options.output, overwrite=options.force)
-    print(f"written: {options.output}")
-    return 0
+    return mounting
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +118,7 @@ class Mounting:
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
         ]
         if math.isnan(self.raised_m):
-            lines.append("its height is unchanged: too few discs to estimate it")
+            lines.append("its height is unchanged: too few discs of that radius to estimate it")
         else:
             lines.append(
                 f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "

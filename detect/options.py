@@ -122,7 +122,8 @@ class Circles(DetectorFlags):
     """
 
     preset: DetectorPreset = "default"
-    #: Tilts of the frames (written by `detect lines`), for which positions are corrected.
+    #: Tilts of the frames (written by `detect lines`), for which positions are corrected; `none`:
+    #: images are not examined for how much the robot tilts.
     tilt: MaybePath = None
     #: Estimate the radius of the discs from some images first; the same as --radius-m auto.
     find_radius: bool = False

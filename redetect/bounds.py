@@ -68,6 +68,7 @@ def whole(least: int, most: int | None = None) -> Bounds:
 LARGEST_NUMBER = 1e24
 FINITE = Bounds(f"a finite number, within +-{LARGEST_NUMBER:g}", lambda x: abs(x) <= LARGEST_NUMBER)
 ABOVE_0 = Bounds(f"above 0, at most {LARGEST_NUMBER:g}", lambda x: 0.0 < x <= LARGEST_NUMBER)
+NOT_0 = Bounds("a finite number but 0", lambda x: 0.0 < abs(x) <= LARGEST_NUMBER)
 NOT_NEGATIVE = Bounds(f"0 or more, at most {LARGEST_NUMBER:g}", lambda x: 0 <= x <= LARGEST_NUMBER)
 SHARE = from_to(0.0, 1.0)
 PROBABILITY = inside(0.0, 1.0)

@@ -14,7 +14,8 @@ from operator import or_
 from typing import Annotated, Any
 
 from redetect import __version__
-from redetect.command_line import FOR_ALL, end_with, no_such
+from redetect.command_line import FOR_ALL, end_with
+from redetect.messages import no_such
 
 PROGRAMS = {
     "camera": "camera.cli",

@@ -6,12 +6,11 @@ command ends with its exit code and, in case of an error, one line on the termin
 
 from __future__ import annotations
 
-import difflib
 import os
 import select
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
@@ -29,7 +28,7 @@ from tyro.conf import Suppress, arg, subcommand
 
 from redetect import __version__
 from redetect.interrupts import interrupts_noted, say_interrupted
-from redetect.messages import QUIET, OneLineError, excerpt, one_line
+from redetect.messages import QUIET, OneLineError, no_such, one_line
 
 #: The command failed.
 EXIT_ERROR = 1
@@ -206,13 +205,6 @@ class Program:
 def all_but(kind: type, *names: str) -> frozenset[str]:
     """The names of a dataclass's fields except these."""
     return frozenset(each.name for each in fields(kind)) - {*names}
-
-
-def no_such(what: str, word: str, known: Iterable[str]) -> str:
-    """The message for an unknown word, with the nearest known one."""
-    near = difflib.get_close_matches(word, sorted(known), 1, 0.5)
-    names = ", ".join(sorted(known))
-    return f"{what} {excerpt(word)}: " + (f"did you mean {near[0]}?" if near else f"one of {names}")
 
 
 def end_with(words: str) -> None:

@@ -6,8 +6,10 @@ a word of a gigabyte. Every typed error of the project passes its message throug
 
 from __future__ import annotations
 
+import difflib
 import os
 import reprlib
+from collections.abc import Iterable
 
 #: Environment variable that is set if only warnings and errors are to be shown.
 QUIET = "REDETECT_QUIET"
@@ -58,6 +60,13 @@ def excerpt(value: object) -> str:
 def counted(number: int, noun: str) -> str:
     """A number with its noun: `1 disc`, `2 discs`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def no_such(what: str, word: str, known: Iterable[str]) -> str:
+    """The message for an unknown word, with the nearest known one."""
+    near = difflib.get_close_matches(word.lower(), sorted(known), 1, 0.5)
+    names = ", ".join(sorted(known))
+    return f"{what} {excerpt(word)}: " + (f"did you mean {near[0]}?" if near else f"one of {names}")
 
 
 class OneLineError(Exception):

@@ -17,8 +17,10 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def changed(picture: NDArray[np.uint8], grey: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Where a picture in colour is not the grey one."""
-    return np.asarray(np.any(picture != grey[:, :, None], axis=2))
+    """Where a picture in colour is not the grey one, each pixel of which may be several of it."""
+    large = grey.repeat(picture.shape[0] // len(grey), axis=0)
+    large = large.repeat(picture.shape[1] // grey.shape[1], axis=1)
+    return np.asarray(np.any(picture != large[:, :, None], axis=2))
 
 
 def centroid(weight: NDArray[np.floating]) -> NDArray[np.float64]:

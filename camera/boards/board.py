@@ -134,8 +134,10 @@ def board_of(flags: BoardFlags) -> Board:
 
 def charuco_of(board: Board) -> cv2.aruco.CharucoBoard:
     """OpenCV's object for a ChArUco board."""
-    number = getattr(cv2.aruco, board.dictionary, None)
-    if not board.dictionary.startswith("DICT_") or number is None:
+    name = board.dictionary.lower()
+    known = {each.lower(): each for each in dir(cv2.aruco) if each.startswith("DICT_")}
+    number = getattr(cv2.aruco, known.get(f"dict_{name.removeprefix('dict_')}", ""), None)
+    if number is None:
         raise CalibrationError(
             f"dictionary {board.dictionary!r} is unknown: expected a name of OpenCV's, such as "
             "DICT_5X5_100"

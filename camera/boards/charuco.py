@@ -18,8 +18,8 @@ from camera.boards.board import Board, charuco_of
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray, GreyImage, IntArray
 
-# Length of the strips along the edges, in squares; farther out, the lens bends the edges.
-_ALONG = 0.4
+# Greatest length of the strips along the edges, in squares and in pixels: the lens bends edges.
+_ALONG, _LONGEST_PX = 0.4, 16.0
 # Largest and smallest half-width of a strip (px).
 _WIDEST_PX = 3.0
 _NARROWEST_PX = 1.2
@@ -208,7 +208,7 @@ def _strips(square: FloatArray, across: FloatArray, half_px: FloatArray) -> Floa
     # Pixels to the edge that goes right (along which x grows), and to the one that goes down.
     right = np.clip(half_px[0] + 0.5 - away[:, 1] * across[0], 0.0, 1.0)
     down = np.clip(half_px[1] + 0.5 - away[:, 0] * across[1], 0.0, 1.0)
-    near = np.clip(1.0 - away / _ALONG, 0.0, 1.0)
+    near = np.clip(1.0 - away / np.minimum(_ALONG, _LONGEST_PX / across[::-1]), 0.0, 1.0)
     return np.asarray(np.maximum(right * near[:, 0], down * near[:, 1]))
 
 

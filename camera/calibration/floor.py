@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from camera.boards.board import board_of
 from camera.boards.points import find_board
-from camera.calibration.adjustment import (
-    Adjusted,
-    Points,
-    adjust,
-    fit_to_centres,
-    project_estimate,
-)
+from camera.calibration.adjustment import Adjusted, Points, adjust, fit_to_centres, project_estimate
 from camera.calibration.calibrate import largest_rms_px
 from camera.calibration.images import read_grey
 from camera.calibration.model import COUNT

@@ -127,15 +127,14 @@ def _shown(figure: Any) -> str | None:
 
 
 def _over_distance(c: DiscComparison) -> FigureTable:
-    head = ("metres", "ref.", "missed", "recall", "det.", "extra", "prec.", "error m")
+    head = ("metres", "ref.", "missed", "recall", "det.", "extra", "prec.", "error mm")
     rows = []
     for part in c.bins:
         if part.reference or part.detected:
-            recall, precision, error = (
-                number(value, 3) for value in (part.recall, part.precision, part.error_median_m)
-            )
+            recall, precision = (number(value, 3) for value in (part.recall, part.precision))
             wanted, found = (part.reference, part.missed), (part.detected, part.extra)
-            rows.append((str(part), *map(str, wanted), recall, *map(str, found), precision, error))
+            rates = (*map(str, wanted), recall, *map(str, found), precision)
+            rows.append((str(part), *rates, _mm(part.error_median_m)))
     return FigureTable("By forward distance (position error: median)", head, tuple(rows))
 
 
@@ -145,10 +144,9 @@ def floor_table(c: DiscComparison) -> FigureTable:
     for part in c.bins:
         if part.as_written.pairs and part.alike is not None:
             figures = [*astuple(part.as_written)[1:], *astuple(part.alike)[1:]]
-            shown = (number(value, 3) for value in figures)
-            rows.append((str(part), str(part.as_written.pairs), *shown))
+            rows.append((str(part), str(part.as_written.pairs), *map(_mm, figures)))
     caption = (
-        "On the floor, m: detected minus reference as they are written; the same levelled alike\n"
+        "On the floor, mm: detected minus reference as they are written; the same levelled alike\n"
         "(along: farther away, across: to the left; medians)"
     )
     head = ("median", "95 %", "along", "across")
@@ -157,15 +155,17 @@ def floor_table(c: DiscComparison) -> FigureTable:
 
 def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     """The frames with most missed and extra rows."""
-    rows = tuple(
-        (
-            match.name,
-            *(str(len(getattr(match, count))) for count in c.counts),
-            number(match.largest_error, 3),
-        )
-        for match in c.worst_frames(most)
-    )
-    return FigureTable("Worst frames", ("image", *c.counts, f"largest error {c.unit}"), rows)
+    rows = []
+    for match in c.worst_frames(most):
+        largest = match.largest_error
+        error = _mm(largest) if c.unit == "m" else number(largest, 3)
+        rows.append((match.name, *(str(len(getattr(match, n))) for n in c.counts), error))
+    unit = "mm" if c.unit == "m" else c.unit
+    return FigureTable("Worst frames", ("image", *c.counts, f"largest error {unit}"), tuple(rows))
+
+
+def _mm(value_m: float | None) -> str:
+    return number(None if value_m is None else 1e3 * value_m, 1)
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -164,7 +164,7 @@ class Comparison(Table, ABC):
         return "\n".join(self.sentences())
 
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on found and missed rows, extra rows, errors and covariances."""
+        """Sentences on found, missed and extra rows, rows set aside, errors and covariances."""
         found = (
             f"{self.found} of {self.reference} {self.what} of the reference are found, "
             f"{self.missed} missed, in {counted(len(self.frames), 'frame')}."
@@ -182,6 +182,10 @@ class Comparison(Table, ABC):
             )
         if not self.detected:
             extra = f"No {self.what}{' that count' * bool(self.set_aside)} are detected."
+        if self.set_aside:
+            with_ids = " with an ID" if self.options.only_identified else ""
+            aside = f"{self.set_aside} more {'is' if self.set_aside == 1 else 'are'}"
+            extra += f" {aside} on {self.what} that the reference does not list{with_ids}."
         if not self.matched:
             return found, extra, "There are no errors: no rows match."
         return found, extra, self._errors(), _agreement(self.normalised_error)

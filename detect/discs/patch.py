@@ -14,12 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from detect.discs.model import (
-    F32,
-    FASTMATH,
-    PIXEL_VARIANCE,
-    Disc,
-)
+from detect.discs.model import F32, FASTMATH, PIXEL_VARIANCE, Disc
 from redetect.array_types import Float32Array, GreyImage, IntArray
 from redetect.compiled import kernel
 

@@ -128,10 +128,7 @@ class Explanation(Table):
         return json.dumps(content, indent=1, allow_nan=False)
 
     def picture(self) -> ByteArray:
-        """(H + h, W, 3) the image with its candidates, coloured by their fates, numbered in order.
-
-        In OpenCV's order blue, green, red; with a legend.
-        """
+        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
         canvas = drawing.canvas_of(self.image, self.camera)
         for number, candidate in enumerate(self.candidates, start=1):
             colour, place = _COLOURS[candidate.stage], (candidate.x_m, candidate.y_m)
@@ -317,14 +314,18 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
         return replace(scene, settings=changed).count(at) - here
 
     where = "there" if at is not None else "more"
-    if settings.polarity != "any" and (more := gained(replace(settings, polarity="any"))) > 0:
-        yield f"--polarity any finds {more} {where}."
-    radius_m = _radius_at(scene, at) if at is not None else None
-    if at is None and not here:
+    by_polarity = gained(replace(settings, polarity="any")) if settings.polarity != "any" else 0
+    if by_polarity > 0:
+        yield f"--polarity any finds {by_polarity} {where}."
+    radius_m, discs = None, "a disc there"
+    if at is not None and by_polarity <= 0:
+        radius_m = _radius_at(scene, at)
+    elif at is None and not here:
         estimate = find_radius([scene.image], scene.camera, replace(settings, polarity="any"))
-        radius_m = None if estimate is None else estimate.radius_m
+        if estimate is not None:
+            radius_m, discs = estimate.radius_m, counted(estimate.discs, "disc")
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
-        yield f"--radius-m {radius_m:.3f} finds a disc {'there' if at is not None else 'here'}."
+        yield f"--radius-m {radius_m:.3f} finds {discs}."
     rims = scene.judgement[1]
     discs = (rims.fate == JUDGED) & (rims.log_odds > settings.evidence)
     sizes = rims.radius[discs] / (RIM_RADIUS * settings.radius_m)

@@ -93,7 +93,9 @@ def _with_rejected(
     (found,) = detect_batch([FrameTask(frame)], plan)
     if found.lines is not None and plan.camera is not None:
         picture = draw_tracks(image, vertical_table_of(plan.camera), found.lines)
-    return picture if found.markers is None else draw_candidates(picture, found.markers)
+    if found.markers is None:
+        return picture
+    return draw_candidates(picture, found.markers, picture.shape[1] // image.shape[1])
 
 
 @contextmanager

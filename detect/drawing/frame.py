@@ -23,7 +23,7 @@ from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
-from detect.row_files import SeenRows
+from detect.row_files import KINDS, SeenRows
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
 from detect.sources.image_files import image_name
@@ -40,7 +40,6 @@ _SIGMAS = 20.0
 Colour = tuple[int, int, int]
 LINE_COLOUR: Colour = (60, 220, 60)
 SIGMA_COLOUR: Colour = (0, 170, 255)
-_EDGE_COLOUR: Colour = (0, 170, 255)
 _OUTLINE_COLOUR: Colour = (60, 200, 60)
 _TEXT_COLOUR: Colour = (0, 230, 255)
 EXTRA_COLOUR: Colour = (255, 60, 255)
@@ -50,44 +49,57 @@ _WORDS_COLOUR: Colour = (230, 230, 230)
 _SUBPIXEL_BITS = 4
 # OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Up to this width, strokes are one pixel wide; wider pictures (of phones) get wider strokes.
-_COLUMNS = 1500
+# Text and strokes are enlarged in proportion to pictures of this width.
+_COLUMNS = 750
+# Narrower images are drawn at double scale.
+_SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def draw_rows(
-    image: GreyImage,
-    sight: Sight | None,
-    rows: SeenRows,
-    settings: CircleSettings,
-    title: str = "",
+    image: GreyImage, sight: Sight | None, rows: SeenRows, settings: CircleSettings, title: str = ""
 ) -> ByteArray:
     """Draw rows of a frame into its image (H, W), with a caption below it.
 
     Without a calibrated camera only markers are drawn. The settings contain the radii of the discs'
-    outlines. The channels of the picture (H + h, W, 3) are in OpenCV's order, blue, green, red.
+    outlines. The channels of the picture (S H + h, S W, 3) are in OpenCV's order, blue, green, red;
+    S is 2 for small images, to separate labels, otherwise 1.
     """
+    scale = 2 if image.shape[1] < _SMALL_PX else 1
     canvas = canvas_of(image, None if sight is None else sight.camera)
+    canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
     words = [title] if title else []
+    if not processed(rows):
+        words.append("not processed")
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
         match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
-        _draw_lines(canvas, sight.camera, match, compared)
+        _draw_lines(canvas, sight.camera, match, compared, scale)
         words.append(_count("verticals", match, compared))
     if sight is not None and rows.circles is not None:
         discs = rows.reference_circles, rows.circles, rows.unlisted
         match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
         compared = rows.reference_circles is not None
-        _draw_discs(canvas, match, settings, compared)
+        _draw_discs(canvas, match, settings, compared, scale)
         words.append(_count("discs", match, compared))
     if rows.markers is not None:
-        _draw_markers(canvas, rows.markers.markers)
+        _draw_markers(canvas, rows.markers.markers, scale)
         words.append(f"{len(rows.markers.markers)} markers")
     if rows.tilt is not None:
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
-    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], canvas.shape[1], 0.38)
+    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38)
+
+
+def processed(rows: SeenRows) -> bool:
+    """Whether any file of detected rows has the image."""
+    return any(getattr(rows, kind) is not None for kind in KINDS)
+
+
+def _scaled(points: FloatArray, scale: int) -> FloatArray:
+    """Positions (..., 2) in an image as those in its enlarged picture."""
+    return scale * (points + 0.5) - 0.5
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
@@ -127,33 +139,56 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool
+    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int
 ) -> None:
-    """Missed reference discs; detected ones with their two outlines and a label above."""
+    """Missed reference discs; detected ones with their two outlines and a label beside them."""
     view = match.view
     assert view is not None
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
     for edge in view.reference_px(rings):
-        draw_curve(canvas, edge, MISSED_COLOUR, closed=True)
-    apart = apart_px(match)
-    drawn = [(row, "", _EDGE_COLOUR) for row in match.set_aside]
-    drawn += [(row, "", EXTRA_COLOUR if compared else _EDGE_COLOUR) for row in match.extra]
-    drawn += [(row, f" {px:.1f}px", _EDGE_COLOUR) for row, px in zip(match.matched, apart)]
-    for row, text, edge_colour in drawn:
-        centre_xy = np.array([row.px, row.py])
-        for radius_m, colour in (
-            (settings.inner_radius_m, _OUTLINE_COLOUR),
-            (settings.radius_m, edge_colour),
-            (settings.outer_radius_m, _OUTLINE_COLOUR),
-        ):
-            outline = view.detected_px(circle_on_floor(centre_xy, radius_m))
-            draw_curve(canvas, outline, colour, closed=True)
-        top = view.detected_px(centre_xy + np.array([0.0, -settings.outer_radius_m]))
-        draw_text(canvas, f"{row.quality:.2f}{text}", top, _TEXT_COLOUR, shift=(-14, -3))
+        draw_curve(canvas, _scaled(edge, scale), MISSED_COLOUR, closed=True)
+    drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
+    drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
+    drawn += [
+        (row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in zip(match.matched, apart_px(match))
+    ]
+    radii = (settings.inner_radius_m, settings.radius_m, settings.outer_radius_m)
+    rims = []
+    for row, _, edge_colour in drawn:
+        for radius_m, colour in zip(radii, (_OUTLINE_COLOUR, edge_colour, _OUTLINE_COLOUR)):
+            outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
+            rims.append(_scaled(outline, scale))
+            draw_curve(canvas, rims[-1], colour, closed=True)
+    _draw_labels(canvas, [f"{row.quality:.2f}{text}" for row, text, _ in drawn], rims[2::3])
 
 
-def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool) -> None:
-    for curve in line_curves(camera, ends_of(match.missed)):
+def _draw_labels(canvas: ByteArray, texts: Sequence[str], rims: Sequence[FloatArray]) -> None:
+    """Labels to the right of rims, or else to the left, or else moved down until on no other."""
+    times = enlargement(canvas)
+    taken = np.zeros((0, 2))
+
+    def free(place: FloatArray) -> bool:
+        return not np.any(np.all(np.abs(taken - place) < size, axis=1))
+
+    for text, rim in zip(texts, rims):
+        if not np.all(np.abs(rim) < _FARTHEST_PX):
+            continue
+        wide, high = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * times, times)[0]
+        size = np.array([wide, high]) + 2.0 * times
+        (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
+        place = np.array([right + 3.0 * times, 0.5 * (top + bottom + high)])
+        if place[0] + wide > canvas.shape[1] or not free(place):
+            place[0] = left - 3.0 * times - wide
+        while not free(place):
+            place[1] += size[1]
+        taken = np.vstack([taken, place])
+        draw_text(canvas, text, place, _TEXT_COLOUR)
+
+
+def _draw_lines(
+    canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int
+) -> None:
+    for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
@@ -162,8 +197,8 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))
     rows = [row for row, _, _ in drawn]
-    curves = line_curves(camera, ends_of(rows))
-    bars = sigma_bars(camera, ends_of(rows), numbers(rows, "sigma"))
+    curves = _scaled(line_curves(camera, ends_of(rows)), scale)
+    bars = _scaled(sigma_bars(camera, ends_of(rows), numbers(rows, "sigma")), scale)
     tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas, curve, colour)
@@ -172,15 +207,15 @@ def _draw_lines(canvas: ByteArray, camera: Camera, match: FrameMatch, compared: 
         draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
 
 
-def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark]) -> None:
+def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
     """Edges, a circle at the top left corner, and ellipses of 20 standard deviations."""
     times = enlargement(canvas)
     circle = circle_on_floor((0.0, 0.0), 1.0, _POINTS)
     for row in found:
-        corners = np.array([(c.u, c.v) for c in row.corners])
+        corners = _scaled(np.array([(c.u, c.v) for c in row.corners]), scale)
         draw_curve(canvas, corners, LINE_COLOUR, closed=True)
         spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
-        for ellipse in ellipses(corners, spreads, _SIGMAS, _POINTS):
+        for ellipse in ellipses(corners, spreads, scale * _SIGMAS, _POINTS):
             draw_curve(canvas, ellipse, LINE_COLOUR, closed=True)
         draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
         draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
@@ -220,7 +255,7 @@ def _unseen(camera: Camera) -> BoolArray:
 
 
 def enlargement(canvas: ByteArray) -> int:
-    """Factor on strokes and text, so that they are visible when the whole picture is shown."""
+    """Factor on text and marks, so that they are visible when the whole picture is shown."""
     return max(1, round(int(canvas.shape[1]) / _COLUMNS))
 
 
@@ -230,7 +265,7 @@ def draw_curve(
     """Draw a curve through (N, 2) points u, v, unless one is not finite."""
     if np.all(np.abs(points) < _FARTHEST_PX):
         fixed = np.rint(points * (1 << _SUBPIXEL_BITS)).astype(np.int32)
-        width = enlargement(canvas)
+        width = max(1, enlargement(canvas) // 2)
         cv2.polylines(canvas, [fixed], closed, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
@@ -289,11 +324,11 @@ def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -
     return with_legend(canvas, words, 190, 0.38)
 
 
-def draw_candidates(picture: ByteArray, found: MarkerDetections) -> ByteArray:
-    """The picture with rejected candidates for markers, and the reasons for rejection below it."""
+def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> ByteArray:
+    """A picture with rejected candidates for markers, and the reasons for rejection below it."""
     for candidate in found.candidates:
         if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
-            draw_curve(picture, candidate.outline, _CANDIDATE_COLOUR, closed=True)
+            draw_curve(picture, _scaled(candidate.outline, scale), _CANDIDATE_COLOUR, closed=True)
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
     return with_legend(picture, words, 210, 0.36)

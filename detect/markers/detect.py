@@ -150,9 +150,7 @@ class _Marker(NamedTuple):
 
 
 def detect_markers(
-    image: GreyImage,
-    settings: MarkerSettings,
-    camera: Camera | None = None,
+    image: GreyImage, settings: MarkerSettings, camera: Camera | None = None
 ) -> MarkerDetections:
     """Find the square markers in one grey image (RAWSEEDS deliverable D2.1 part 2).
 
@@ -255,13 +253,13 @@ def _marker_at(
     if not likely:
         return NO_PATTERN
     looks = [
-        (fit_marker(picture, refined, templates, template, first_look=True), template)
+        (look, template)
         for template in likely
+        if (look := fit_marker(picture, refined, templates, template, first_look=True)) is not None
     ]
-    possible = [(look, template) for look, template in looks if look is not None]
-    if not possible:
+    if not looks:
         return NOT_FITTED
-    first, template = max(possible, key=lambda look: look[0].explained)
+    first, template = max(looks, key=lambda look: look[0].explained)
     if first.explained < settings.least_explained - _FIRST_LOOK_SLACK:
         return UNEXPLAINED
     fit = fit_marker(picture, refined._replace(corners=first.corners), templates, template)
@@ -271,13 +269,15 @@ def _marker_at(
     if isinstance(quality, str):
         return quality
     best: RefinedQuadrangle | PatternFit = fit
-    if side >= _LEAST_BENT_PX and fit.blur_px <= _SHARP_BLURS * templates.border * side:
+    sharp = fit.blur_px <= _SHARP_BLURS * templates.border * side
+    if side >= _LEAST_BENT_PX and sharp and fit.surrounded:
         capture_px = _CAPTURE_PX + 2.0 * fit.blur_px
         edges = refine_quadrangle(
             picture, fit.corners, templates.border, capture_px, settings, _PARTS
         )
-        if not isinstance(edges, str) and _contradicts(edges, fit):
-            best = edges
+        if not isinstance(edges, str):
+            edges = edges._replace(corners=edges.corners - fit.toned)
+            best = edges if _contradicts(edges, fit) else fit
     number, turns = templates.turned_id(template)
     printed = (np.arange(4) - turns) % 4
     corners, covariance = best.corners[printed], best.covariance[printed]

@@ -26,6 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from detect.errors import DetectError
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
+from redetect.messages import no_such
 
 #: ARToolKitPlus' simple code: a number of 9 bits is stored four times, each time scrambled.
 _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
@@ -72,12 +73,15 @@ def dictionary_names() -> tuple[str, ...]:
 
 @functools.cache
 def marker_dictionary(name: str) -> MarkerDictionary:
-    """A set of markers by its name, one of `dictionary_names`; else a DetectError."""
-    if name not in dictionary_names():
-        raise DetectError(
-            f"{name!r:.60}: no such dictionary of markers: expected one of "
-            f"{', '.join(dictionary_names())}"
-        )
+    """A set of markers by its name, one of `dictionary_names`; else a DetectError.
+
+    Other programs' names are accepted, too: DICT_4X4_50, tag36h11, 36h11.
+    """
+    given, plain = name, name.lower().removeprefix("dict_").removeprefix("tag")
+    listed = dictionary_names()
+    name = next((each for each in (plain, f"apriltag_{plain}") if each in listed), "")
+    if not name:
+        raise DetectError(no_such("no such dictionary of markers:", given, listed))
     # Width of a marker in cells, and the number of cells before the sampled grid.
     if name == "rawseeds":
         patterns, cells, first = np.pad(simple_patterns(), ((0, 0), (0, 1), (1, 0))), 12, 2.5

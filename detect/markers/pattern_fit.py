@@ -40,13 +40,15 @@ from redetect.array_types import FloatArray, IntArray
 
 #: Width of the margin around the marker that is fitted: blurs and pixels, at most a cell's size.
 _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
+#: If squared residuals in the margin are this many times those inside, the fit excludes it and
+#: this depth inside the marker: blurs, at most a share of a cell's size.
+_SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 2.0, 2.0, 0.5
 #: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
 #: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
-
 #: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
 #: and of the tone curve's curvature; the largest of the latter.
-_SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _LARGEST_TONE = 0.3, 0.15, 0.15, 0.6
+_SLOPE_SIGMA, _BEND_SIGMA, _TONE_SIGMA, _TONES = 0.3, 0.15, 0.15, (-0.6, 3.0)
 #: Limits of the variance of the blur along any direction, px^2; the lower is about a pixel's own.
 _LEAST_VARIANCE, _LARGEST_VARIANCE = 0.07, 60.0
 _CLOSE_ENOUGH_PX = 2e-3
@@ -56,8 +58,6 @@ _OUTLIER = 3.0
 _LEAST_NOISE = 0.3
 #: Least number of pixels in excess of the number of parameters.
 _SPARE_PIXELS = 12
-
-
 #: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
 #: decide whether it may be that marker.
 _FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
@@ -75,6 +75,8 @@ class PatternFit(NamedTuple):
     explained: float  # share of the grey values' variance that is explained, noise aside
     blur_px: float  # mean standard deviation of the blur
     blur_cells: float  # the larger one along the marker's axes, in cells
+    surrounded: bool  # whether there is enough white around it for its outer edges to be used
+    toned: FloatArray  # (4, 2) shifts of corners by the centroids of edges, due to the tone curve
 
 
 def fit_marker(
@@ -96,18 +98,26 @@ def fit_marker(
     pattern = pattern_of(templates.lines, templates.blackness(template))
     near = _SEAM_BLURS * blur_px + _SEAM_PX
     reach = min(near, max(_LEAST_SEAM_PX, cell_px))
-    samples = _samples(picture, corners, pattern.lines, reach, near, most_pixels)
-    if samples is None or len(samples.grey) < PARAMETERS + _SPARE_PIXELS:
-        return None
     noise = max(picture.noise, _LEAST_NOISE)
     reach_px = max(_REACH_PX, _REACH_CELLS * cell_px)
     centre = corners.mean(axis=0)
     start = start._replace(corners=corners - centre)
-    solution = _solved(samples, pattern, start, noise, reach_px, steps)
-    if solution is None:
+    samples = solution = None
+    surrounded = False
+    for margin in (reach, -min(_DEPTH_BLURS * blur_px, _DEPTH_CELLS * cell_px)):
+        some = _samples(picture, corners, pattern.lines, margin, near, most_pixels)
+        if some is None or len(some.grey) < PARAMETERS + _SPARE_PIXELS:
+            break
+        found = _solved(some, pattern, start, noise, reach_px, steps)
+        if found is None:
+            break
+        samples, solution = some, found
+        surrounded = margin > 0.0 and not _seam_differs(found[1])
+        if surrounded:
+            break
+    if samples is None or solution is None:
         return None
     p, left, inverse = solution
-
     energy = left.weight * left.residual**2
     variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
     homography = _homography_of(p)
@@ -122,6 +132,11 @@ def fit_marker(
         sigma = np.sqrt(variance / squares)
     outside = np.ones(cells.shape, dtype=bool)
     outside[templates.grid, templates.grid] = False
+    # Concave tone curves move centroids of edges towards black; a convex one is ink that spread.
+    blur = np.median([left.at.sigma_x, left.at.sigma_y], axis=1)
+    inset = max(p[TONE], 0.0) / (1.0 + 0.5 * max(p[TONE], 0.0)) / math.sqrt(math.pi) * blur
+    inner = np.diag([*(1.0 - 2.0 * inset), 1.0])
+    inner[:2, 2] = inset
     contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
     unexplained = float(np.mean(left.residual**2)) - picture.noise**2
     return PatternFit(
@@ -133,7 +148,9 @@ def fit_marker(
         misfit=math.sqrt(variance - noise**2) / contrast,
         explained=1.0 - max(0.0, unexplained) / max(float(np.var(samples.grey)), 1e-9),
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
-        blur_cells=_blur_along_axes(homography, p[BLUR]) / templates.dictionary.cell,
+        blur_cells=float(blur.max()) / templates.dictionary.cell,
+        surrounded=surrounded,
+        toned=corners_of(homography @ inner) - corners_of(homography),
     )
 
 
@@ -180,13 +197,23 @@ def _solved(
         off = corners_of(_homography_of(p)) - corners
         if not np.hypot(*off.T).max() <= reach_px:
             return None
-        p[TONE] = min(max(p[TONE], -_LARGEST_TONE), _LARGEST_TONE)
+        p[TONE] = min(max(p[TONE], _TONES[0]), _TONES[1])
         # The blur's variances are clamped in all directions.
         values, vectors = np.linalg.eigh(p[BLUR][[0, 1, 1, 2]].reshape(2, 2))
         largest = min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE)
         confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
         p[BLUR] = confined.flat[[0, 1, 3]]
     return p, left, inverse
+
+
+def _seam_differs(left: Linearised) -> bool:
+    """Whether the surroundings are not as white as the model although the marker is as modelled."""
+    x, y = np.abs(left.at.x - 0.5) - 0.5, np.abs(left.at.y - 0.5) - 0.5
+    seam = (x > left.at.sigma_x) | (y > left.at.sigma_y)
+    squares, inside = left.residual**2, (x < 0.0) & (y < 0.0)
+    return bool(
+        squares[seam].sum() * inside.sum() > _SEAM_RATIO * squares[inside].sum() * seam.sum()
+    )
 
 
 def robust_sigma(residual: FloatArray, least: float) -> float:
@@ -206,15 +233,6 @@ def _homography_of(p: FloatArray) -> FloatArray:
     return np.append(p[HOMOGRAPHY], 1.0).reshape(3, 3)
 
 
-def _blur_along_axes(homography: FloatArray, blur: FloatArray) -> float:
-    """Larger standard deviation of the blur along the axes at the marker's centre, in widths."""
-    w = homography[2] @ [0.5, 0.5, 1.0]
-    middle = homography[:2] @ [0.5, 0.5, 1.0] / w
-    widths_per_px = np.linalg.inv((homography[:2, :2] - np.outer(middle, homography[2, :2])) / w)
-    covariance = widths_per_px @ blur[[0, 1, 1, 2]].reshape(2, 2) @ widths_per_px.T
-    return float(np.sqrt(np.diag(covariance).max()))
-
-
 def _inflation(pixel: IntArray, left: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
@@ -223,9 +241,7 @@ def _inflation(pixel: IntArray, left: Linearised) -> float:
     correlation is considered.
     """
     weighted = left.residual * np.sqrt(left.weight)
-    energy = float(np.mean(weighted**2))
-    if energy <= 0.0:
-        return 1.0
+    energy = max(float(np.mean(weighted**2)), 1e-12)
     column, row = (pixel - pixel.min(axis=0)).T
     image = np.full((row.max() + 1, column.max() + 1), np.nan)
     image[row, column] = weighted
@@ -233,19 +249,13 @@ def _inflation(pixel: IntArray, left: Linearised) -> float:
     for products in (image[:, 1:] * image[:, :-1], image[1:] * image[:-1]):
         known = products[np.isfinite(products)]
         if len(known) > 20:
-            rho = float(known.mean()) / energy - 2.0 / math.sqrt(len(known))
-            rho = min(max(rho, 0.0), 0.8)
+            rho = np.clip(known.mean() / energy - 2.0 / math.sqrt(len(known)), 0.0, 0.8)
             factor *= (1.0 + rho) / (1.0 - rho)
     return factor
 
 
 def _samples(
-    picture: Picture,
-    corners: FloatArray,
-    lines: FloatArray,
-    reach: float,
-    near: float,
-    most: int,
+    picture: Picture, corners: FloatArray, lines: FloatArray, reach: float, near: float, most: int
 ) -> Samples | None:
     """Pixels of a marker and of a margin of `reach` pixels around it; None if it leaves the image.
 
@@ -258,7 +268,7 @@ def _samples(
     last = np.array(picture.grey.shape[::-1]) - 1
     if not (np.all(low >= 0.0) and np.all(high <= last)):
         return None
-    pad = 1.5 * reach + 2.0
+    pad = 1.5 * max(reach, 0.0) + 2.0
     begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
     # Every n-th pixel is used, and far from boundaries every 10 n-th, chosen by a hash.
     area = abs(signed_area(corners))
@@ -276,10 +286,7 @@ def _samples(
     q = projected[:, 2:]
     place = projected[:, :2] / q
     # Widths of the marker per pixel, along its axes.
-    widths = np.hypot(
-        inverse[:2, 0] - place * inverse[2, 0], inverse[:2, 1] - place * inverse[2, 1]
-    )
-    widths /= q
+    widths = np.hypot(*(inverse[:2, k] - place * inverse[2, k] for k in (0, 1))) / q
     inside = np.abs(place - 0.5) <= np.minimum(0.5 + reach * widths, 1.5)
     used = np.all(inside & (q > 0.0), axis=1)
     if expected > most:

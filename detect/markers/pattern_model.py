@@ -193,14 +193,15 @@ def linearise(
     dark = p[BLACK] @ terms
     contrast = p[WHITE] @ terms - dark
     light = 1.0 - black
-    toned = light + p[TONE] * light * black
+    bent = 1.0 + p[TONE] * light
+    toned = (1.0 + p[TONE]) * light / bent
     seen, grey = dark + contrast * toned, samples.grey
     residual = grey - seen
     with np.errstate(divide="ignore"):
         weight = np.where(np.abs(residual) > outlier, (outlier / residual) ** 2, 1.0)
 
     # d(value)/d(blackness), and then the chain rule.
-    slope = -contrast * (1.0 + p[TONE] * (1.0 - 2.0 * light))
+    slope = -contrast * (1.0 + p[TONE]) / bent**2
     gu = slope * (by_x * x_u + by_y * y_u)
     gv = slope * (by_x * x_v + by_y * y_v)
     # sigma_x^2, sigma_y^2 and their covariance are linear in those of the blur.
@@ -219,7 +220,7 @@ def linearise(
         2.0 * (fx * x_u * x_v + fy * y_u * y_v) + fxy * (x_u * y_v + x_v * y_u),
         fx * x_v**2 + fy * y_v**2 + fxy * x_v * y_v,
     )
-    jacobian[TONE] = contrast * light * black
+    jacobian[TONE] = contrast * light * black / bent**2
     # A clipped grey value is only a lower (upper) bound of the light.
     clipped = (grey > 254.5) & (seen > 255.0 - _CLIP_ZONE) | (grey < 0.5) & (seen < _CLIP_ZONE)
     residual[clipped], weight[clipped], jacobian[:, clipped] = 0.0, 1.0, 0.0

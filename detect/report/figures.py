@@ -4,18 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from io import BytesIO
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
 from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
 from detect.row_files import SeenRows
 from detect.seen import summed_steps
 from redetect.array_types import FloatArray
-from redetect.landmarks import circle_arrays, is_positive_definite
-from redetect.plane import apply, ellipses
+from redetect.landmarks import (
+    CircleArrays,
+    associate,
+    circle_arrays,
+    is_positive_definite,
+    squared_mahalanobis,
+)
+from redetect.plane import apply, ellipses, rotation
 from redetect.reporting.page import Part, figure_file, image_part
 
 #: Colours distinguishable in print and by the colour-blind; line styles differ as well.
@@ -30,6 +39,17 @@ _MOST_DOTS = 4000
 _SIGMAS, _CORNERS = 3.0, 32
 #: Matplotlib cannot scale axes to any number.
 _FARTHEST_M = 1e12
+#: Variance on the floor above which discs of different frames are not paired.
+_VAGUE_M2 = 0.05
+
+
+class Repeatability(NamedTuple):
+    """Differences of rows of one disc beyond the step's error: rms, and as the rows state (m)."""
+
+    pairs: int
+    rms_m: float
+    stated_m: float
+    per_dof: float  # mean squared normalised difference with the covariances of rows and steps
 
 
 def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
@@ -109,20 +129,30 @@ def floor_figure(pairs: DiscPairs) -> Part:
 def bearings_figure(pairs: LinePairs) -> Part:
     """Errors over bearing: dots, medians, 95 % quantiles."""
     at, error = np.degrees(pairs.bearing_rad), np.degrees(np.abs(pairs.error_rad))
+    words = "Absolute bearing errors of matched verticals over bearing: each vertical,"
+    return _spread(words, "bearing / deg, positive to the left", "error / deg", at, error)
+
+
+def sigma_figure(discs: CircleArrays) -> Part:
+    """Stated standard deviations of rows on the floor, in the worst direction, over distance."""
+    sigma = 1e3 * np.sqrt(np.maximum(np.linalg.eigvalsh(discs.covariance)[:, 1], 0.0))
+    words = f"Stated {SIGMA} of discs on the floor, in the worst direction: each row,"
+    return _spread(words, "distance / m", f"{SIGMA} / mm", np.hypot(*discs.xy.T), sigma)
+
+
+def _spread(words: str, x: str, y: str, at: FloatArray, values: FloatArray) -> Part:
+    """Values on a logarithmic scale, with medians and quantiles."""
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
-        _dots(axes, at, error, REFERENCE)
-        middle, half, most = binned(at, error)
+        _dots(axes, at, values, REFERENCE)
+        middle, half, most = binned(at, values)
         axes.plot(middle, half, "o-", color=DATA, lw=1.4, ms=4, label="median")
         axes.plot(middle, most, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
-        if (error > 0.0).any():
+        if (values > 0.0).any():
             axes.set_yscale("log")
-        _finish(axes, "bearing / deg, positive to the left", "error / deg")
+        _finish(axes, x, y)
         axes.legend(fontsize=8)
-    words = (
-        "Absolute bearing errors of matched verticals over bearing: each vertical, medians and "
-        "95 % quantiles in bins of equal counts."
-    )
+    words += " medians and 95 % quantiles in bins of equal counts."
     return _part(words, content, 2.8)
 
 
@@ -167,11 +197,11 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
 
 
-def floor_map(rows: Sequence[SeenRows]) -> Part | None:
+def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
     """Map of the discs found and of the reference, along the path summed from the steps.
 
-    Forward at the start is up, left is left. None if there are no discs; a note if some are too far
-    away for a figure.
+    Forward at the start is up, left is left. The caption ends with `unmatched`, on discs without a
+    reference row. None if there are no discs; a note if some are too far away for a figure.
     """
     seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
     if not any(found.circles for found, _ in seen):
@@ -189,7 +219,9 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
     ahead = np.array([1.0, -1.0])  # X is to the left, Y backward
     with figure_file((_WIDE, _WIDE), "svg") as (figure, content):
         axes = figure.subplots()
-        axes.plot(*(ahead * poses[:, :2]).T, color=REFERENCE, lw=1.0, label="path by the odometry")
+        if poses.any():
+            path = (ahead * poses[:, :2]).T
+            axes.plot(*path, color=REFERENCE, lw=1.0, label="path by the odometry")
         if len(marks):
             axes.plot(*(ahead * marks).T, "+", color=MARK, ms=6, mew=0.7, label="reference")
         closed = outline[:, [*range(_CORNERS), 0]]
@@ -199,11 +231,49 @@ def floor_map(rows: Sequence[SeenRows]) -> Part | None:
         axes.invert_xaxis()
         _finish(axes, "to the left / m", "forward / m")
         axes.legend(fontsize=8)
-    words = (
-        f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
-        "each frame, along the path summed from the odometry."
-    )
-    return _part(words, content, _WIDE)
+    along = "along the path summed from the odometry" if poses.any() else "as seen from the robot"
+    words = f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
+    return _part(f"{words}each frame, {along}.{unmatched}", content, _WIDE)
+
+
+def repeated(rows: Sequence[SeenRows]) -> Repeatability | None:
+    """How well discs in successive frames agree, the latter moved by the odometry's step.
+
+    Discs are paired within five standard deviations, unless these are too large to identify them.
+    The step's error is common to all pairs of two frames, and estimated from them. None without
+    pairs, or if all steps are zeros.
+    """
+    left, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
+    frames = [each.circles for each in rows]
+    still = not summed_steps(frame.step for frame in frames if frame is not None).any()
+    for one, other in () if still else pairwise(frames):
+        if one is None or other is None:
+            continue
+        first, second, s = circle_arrays(one.circles), circle_arrays(other.circles), other.step
+        turn = rotation(s.dphi)
+        lever = second.xy @ turn.T
+        offset = np.add(lever, (s.dx, s.dy)) - first.xy[:, None]
+        of_rows = first.covariance[:, None] + turn @ second.covariance @ turn.T
+        by_step = np.tile(np.eye(2, 3), (len(lever), 1, 1))
+        by_step[:, :, 2] = lever @ [[0.0, 1.0], [-1.0, 0.0]]
+        of_step = [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]]
+        both = of_rows + by_step @ of_step @ by_step.swapaxes(1, 2)
+        cost = np.full(both.shape[:2], np.inf)
+        usable = is_positive_definite(of_rows) & (np.trace(both, axis1=2, axis2=3) < _VAGUE_M2)
+        cost[usable] = squared_mahalanobis(offset[usable], both[usable])
+        pairs = associate(cost, cost <= 25.0)
+        i, j = pairs.first, pairs.second
+        jacobian, residual = by_step[j].reshape(-1, 3), offset[i, j].ravel()
+        covariance = block_diag(*of_rows[i, j]) if len(i) else np.zeros((0, 0))
+        weight = np.linalg.inv(covariance + jacobian @ of_step @ jacobian.T)
+        squared += float(residual @ weight @ residual)
+        left.append(covariance @ weight @ residual)
+        stated.append(np.diag(covariance @ weight @ covariance))
+    apart, variance = np.concatenate(left), np.concatenate(stated)
+    if not len(apart):
+        return None
+    rms_m, stated_m = np.sqrt([2.0 * np.mean(apart**2), 2.0 * variance.mean()]).tolist()
+    return Repeatability(len(apart) // 2, rms_m, stated_m, squared / len(apart))
 
 
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatArray, FloatArray]:

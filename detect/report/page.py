@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -10,23 +11,37 @@ import numpy as np
 
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
-from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison, number
-from detect.drawing.frame import draw_rows, picture_name
+from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
+from detect.drawing.frame import draw_rows, picture_name, processed
 from detect.errors import DetectError, FrameError
+from detect.line_settings import LineSettings
 from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
-from detect.seen import Sight
+from detect.seen import Sight, summed_steps
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect import __version__
+from redetect.landmarks import circle_arrays
+from redetect.messages import counted
 from redetect.reporting.page import Part, Section, image_part, page_of
 from redetect.storage import demand_place, write_bytes
 
 _NAMES = {
     "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
 }  # fmt: skip
+_KEY = (
+    ("#ffaa00", f"disc's edge; ±1 {figures.SIGMA} of a vertical"),
+    ("#3cc83c", "outlines; vertical"),
+    ("#ff3cff", "matches no reference row"),
+    ("#ff3c3c", "missed reference row"),
+)
+_LABELS = (
+    "Beside a disc: quality, distance to its reference row in the image. Below a vertical: error "
+    "of the bearing in standard deviations."
+)
+_LISTED = 10
 _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file named by {}."
 
 
@@ -106,45 +121,118 @@ def perform(options: Report) -> int:
 
 def report_page(inputs: ReportInputs, worst: int) -> bytes:
     """The whole page, UTF-8, with `worst` frames shown; the same inputs give the same bytes."""
-    detected = inputs.files.detected
-    sections = [Section("summary", "What was found", _summary(inputs))]
-    if "circles" in detected:
-        sections.append(Section("discs", "Discs against the reference", _discs(inputs)))
-    if "lines" in detected:
-        sections.append(Section("verticals", "Verticals against the reference", _lines(inputs)))
-    sections.append(_frames(inputs, worst))
-    if "tilt" in detected:
-        sections.append(Section("tilt", "Tilt", _tilt(inputs)))
-    sections.append(Section("settings", "Effective configuration", _settings(inputs)))
+    tables, shown = _shown_frames(inputs, worst)
+    frames: dict[str, RunFrame] = {}
+    for frame in inputs.run.frames:  # once, since a video is decoded each time
+        if frame.step.prefix in shown:
+            frames.setdefault(frame.step.prefix, frame)
+    pictures = [
+        frame_picture(inputs, frames[prefix], f"Frame {picture_name(prefix)} ({why})")
+        for prefix, why in shown.items()
+    ]
+    steps = tuple((step,) for step in _next_steps(inputs))
+    sections = [
+        Section("summary", "What was found", _summary(inputs, pictures[:1])),
+        Section("next", "What to do next", [Part("list", rows=steps)] if steps else []),
+        Section("discs", "Discs against the reference", _discs(inputs.discs)),
+        Section("verticals", "Verticals against the reference", _lines(inputs.lines)),
+        Section("uncertainty", "Stated covariances of discs", _uncertainty(inputs)),
+        Section("frames", f"{'Worst' if tables else 'Some'} frames", [*tables, *pictures[1:]]),
+        Section("tilt", "Tilt", _tilt(inputs)),
+        Section("settings", "Effective configuration", _settings(inputs)),
+    ]
     return page_of(f"Detections of {inputs.run.name}", sections)
 
 
-def _summary(inputs: ReportInputs) -> list[Part]:
-    shown = [("frames", str(len(inputs.rows)))]
+def _summary(inputs: ReportInputs, pictures: list[Part]) -> list[Part]:
+    """Sentences and figures, a picture, and the map of the floor."""
+    done = sum(map(processed, inputs.rows))
+    shown, beside = [("frames", done)], ""
+    if done < len(inputs.rows):
+        shown.append(("not processed", len(inputs.rows) - done))
     for kind in inputs.files.detected:
         frames = [frame for seen in inputs.rows if (frame := getattr(seen, kind)) is not None]
         count = len(frames) if kind == "tilt" else sum(len(getattr(f, kind)) for f in frames)
-        shown.append((_NAMES[kind], str(count)))
-    for name, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
-        if result is not None:
-            shown.append((f"recall of {name}", number(result.recall, 3)))
-            shown.append((f"precision of {name}", number(result.precision, 3)))
-    parts = [Part("figures", rows=tuple(shown))]
-    if len(inputs.rows) < 2:
-        return parts
-    plan = figures.floor_map(inputs.rows)
-    return parts if plan is None else [*parts, plan]
+        shown.append((_NAMES[kind], count))
+    results = [result for result in (inputs.discs, inputs.lines) if result is not None]
+    for c in results:
+        shown += [(f"{c.what} found", c.found), (f"{c.what} missed", c.missed)]
+        if c.on_lookalikes is not None:
+            shown += [("look-alikes", c.on_lookalikes), ("clutter", c.extra - c.on_lookalikes)]
+        else:
+            shown.append((f"{c.what} matching nothing", c.extra))
+        shown.append((f"{c.what} set aside", c.set_aside))
+    if (discs := inputs.discs) is not None:
+        beside = (
+            f" Ellipses without a cross: {discs.set_aside} on discs that the reference does not "
+            f"list (set aside), {discs.extra} on look-alikes or clutter."
+        )
+    plan = figures.floor_map(inputs.rows, beside) if len(inputs.rows) > 1 else None
+    return [
+        *(Part("text", " ".join(result.sentences())) for result in results),
+        Part("figures", rows=tuple((name, str(count)) for name, count in shown)),
+        *pictures,
+        *([Part("key", rows=_KEY), Part("note", _LABELS)] if results else []),
+        *([] if plan is None else [plan]),
+    ]
+
+
+def _next_steps(inputs: ReportInputs) -> Iterator[str]:
+    """What the run lacks, and what to do about it."""
+    files, without = inputs.files, _without_tilt(inputs)
+    if left := len(inputs.rows) - sum(map(processed, inputs.rows)):
+        yield f"{counted(left, 'frame')} not processed: no file has rows of them."
+    for kind, flag in (("circles", "--reference"), ("lines", "--reference-lines")):
+        if kind in files.detected and kind not in files.reference:
+            yield _NO_REFERENCE.format(f"map.{kind}", flag)
+    if "tilt" in files.detected and without:
+        yield f"{counted(len(without), 'frame')} without a tilt by verticals: see Tilt."
+    frames = [seen.circles for seen in inputs.rows if seen.circles is not None]
+    if not frames:
+        return
+    if not summed_steps(frame.step for frame in frames).any():
+        yield "No odometry: the steps are zeros. Detect with --odometry; maps need it."
+    if 3 * (count := sum(len(frame.circles) for frame in frames)) < len(frames):
+        yield f"Few discs: {count} in {counted(len(frames), 'frame')}. Ask `detect explain` why."
+    if isinstance(inputs.run, Run) and inputs.run.camera.covariance is None:
+        px = files.circle_settings.calibration_px
+        yield f"The calibration has no covariance: its error is assumed to be {px:g} px."
+    if "tilt" not in files.detected:
+        yield "No tilts: `detect all` finds them, and levels the discs by them."
+
+
+def _without_tilt(inputs: ReportInputs) -> list[str]:
+    """The processed frames in which too few verticals agree for a tilt."""
+    least = LineSettings.least_lines
+    rows = [(name, seen) for name, seen in zip(inputs.names, inputs.rows) if processed(seen)]
+    return [name for name, seen in rows if seen.tilt is None or seen.tilt.lines < least]
+
+
+def _uncertainty(inputs: ReportInputs) -> list[Part]:
+    """The stated sigmas over distance, and how well they predict differences between frames."""
+    discs = circle_arrays([row for s in inputs.rows if s.circles for row in s.circles.circles])
+    if len(discs.xy) < 2:
+        return []
+    parts = [figures.sigma_figure(discs)]
+    if (found := figures.repeated(inputs.rows)) is not None:
+        words = (
+            f"Repeatability: {found.pairs} pairs of rows of one disc in successive frames, chained "
+            f"by the odometry, differ by {1e3 * found.rms_m:.1f} mm (rms) beyond the step's error, "
+            f"with {1e3 * found.stated_m:.1f} mm stated. The mean squared normalised difference is "
+            f"{found.per_dof:.2f}: 1 if covariances are right, less if frames share errors."
+        )
+        parts.append(Part("text", words))
+    return parts
 
 
 # -- against the reference --------------------------------------------------------------------
 
 
-def _discs(inputs: ReportInputs) -> list[Part]:
+def _discs(result: DiscComparison | None) -> list[Part]:
     """Rates and errors of discs, and consistency of the covariances."""
-    result = inputs.discs
     if result is None:
-        return [Part("note", _NO_REFERENCE.format("map.circles", "--reference"))]
-    parts = [*_summary_of(result)]
+        return []
+    parts = [_all_figures(result)]
     quality = [row.quality for match in result.frames for row in match.detected]
     if len(set(quality)) > 1:
         levels = np.linspace(min(quality), max(quality), 41)
@@ -156,25 +244,19 @@ def _discs(inputs: ReportInputs) -> list[Part]:
     return [*parts, *_consistency(result, "two components for each matched disc")]
 
 
-def _lines(inputs: ReportInputs) -> list[Part]:
-    """Rates and errors of verticals, and consistency of the standard deviations."""
-    result = inputs.lines
+def _lines(result: LineComparison | None) -> list[Part]:
+    """Errors of verticals, and consistency of the standard deviations."""
     if result is None:
-        return [Part("note", _NO_REFERENCE.format("map.lines", "--reference-lines"))]
-    return [
-        *_summary_of(result),
-        *_consistency(result, "one for each matched vertical"),
-        *([figures.bearings_figure(result.pairs)] if result.matched else []),
-    ]
+        return []
+    bearings = [figures.bearings_figure(result.pairs)] if result.matched else []
+    consistency = _consistency(result, "one for each matched vertical")
+    return [_all_figures(result), *consistency, *bearings]
 
 
-def _summary_of(result: Comparison) -> list[Part]:
-    """The sentences and figures of `detect compare`."""
-    rows = tuple(summary_rows(result).items())
-    table = Part(
-        "details", "All figures, by their names in the JSON", ("what", "value"), rows, left=(0, 1)
-    )
-    return [Part("text", " ".join(result.sentences())), table]
+def _all_figures(result: Comparison) -> Part:
+    """The figures of `detect compare`."""
+    rows, head = tuple(summary_rows(result).items()), ("what", "value")
+    return Part("details", "All figures, by their names in the JSON", head, rows, left=(0, 1))
 
 
 def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Part]:
@@ -193,54 +275,51 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
 # -- frames, tilt, settings -------------------------------------------------------------
 
 
-def _frames(inputs: ReportInputs, worst: int) -> Section:
-    """The worst frames, or some frames if there is no reference to rank them."""
+def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:
+    """Tables of the worst frames, and the frames to be shown with the reasons.
+
+    The first one has most discs. Without a reference to rank them, the others are some frames.
+    """
+    done = {name: seen for name, seen in zip(inputs.names, inputs.rows) if processed(seen)}
     named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}
-    for kind, result in (("discs", inputs.discs), ("verticals", inputs.lines)):
+    if done:
+        most = max(done, key=lambda name: _sizes(done[name]))
+        shown[most] = f"most {'discs' if _sizes(done[most])[0] else 'rows'}"
+    for result in (inputs.discs, inputs.lines):
         if result is None:
             continue
-        matches = result.worst_frames(worst)
+        kind = result.what
         table = worst_frames_table(result, worst)
         parts.append(Part("table", f"{table.caption}: {kind}", table.head, table.rows))
-        for rank, match in enumerate(matches, 1):
+        for rank, match in enumerate(result.worst_frames(worst), 1):
             prefix, place = named[match.name], f"number {rank} of {kind}"
             shown[prefix] = f"{shown[prefix]}, {place}" if prefix in shown else place
-    if parts:
-        key = (
-            ("#ffaa00", f"disc's edge; ±1 {figures.SIGMA} of a vertical"),
-            ("#3cc83c", "outlines; vertical"),
-            ("#ff3cff", "matches no reference row"),
-            ("#ff3c3c", "missed reference row"),
-        )
-        words = (
-            "Above a disc: quality, distance to its reference row in the image. Below a "
-            "vertical: error of the bearing in standard deviations."
-        )
-        parts += [Part("key", rows=key), Part("note", words)]
-    else:
-        count = min(worst, len(inputs.names))
-        for k in np.unique(np.linspace(0, len(inputs.names) - 1, count).astype(int)):
-            shown[inputs.names[k]] = "no reference rows"
-    title = "Worst frames" if parts else "Some frames"
-    frames: dict[str, RunFrame] = {}
-    for frame in inputs.run.frames:  # once, since a video is decoded each time
-        if frame.step.prefix in shown:
-            frames.setdefault(frame.step.prefix, frame)
-    parts += [
-        frame_picture(inputs, frames[prefix], f"Frame {picture_name(prefix)} ({why})")
-        for prefix, why in shown.items()
-    ]
-    return Section("frames", title, parts)
+    if not parts:
+        names = tuple(done)
+        for k in np.unique(np.linspace(0, len(names) - 1, min(worst, len(names))).astype(int)):
+            shown.setdefault(names[k], "no reference rows")
+    return parts, shown
+
+
+def _sizes(seen: SeenRows) -> list[int]:
+    """Numbers of discs, verticals and markers in a frame."""
+    kinds = ("circles", "lines", "markers")
+    return [len(getattr(getattr(seen, kind), kind, ())) for kind in kinds]
 
 
 def _tilt(inputs: ReportInputs) -> list[Part]:
+    if "tilt" not in inputs.files.detected:
+        return []
     tilts = [seen.tilt for seen in inputs.rows if seen.tilt is not None]
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
     lines = np.median([t.lines for t in tilts])
     words = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)."
+    if without := [picture_name(name) for name in _without_tilt(inputs)]:
+        others = f" and {len(without) - _LISTED} more" if len(without) > _LISTED else ""
+        words += f" Too few agree in {', '.join(without[:_LISTED])}{others}."
     figure = [figures.tilt_figure(inputs.rows)] if len(tilts) > 1 else []
     return [*figure, Part("note", words)]
 

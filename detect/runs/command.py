@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from camera import Camera
 from detect.errors import DetectError, FrameError, WorkerError
 from detect.line_settings import LineSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -17,6 +18,7 @@ from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
+from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run, read_image
 from detect.sources.opening import demand_recording, open_run, open_source
@@ -28,9 +30,11 @@ from redetect.messages import counted
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
-#: Runs of at least `_FEWEST_FRAMES` frames get a warning if hardly any discs are found, and if the
-#: logarithms of the likely and the given radius differ by `_OTHER_RADIUS`.
+#: Runs of at least `_FEWEST_FRAMES` frames get a warning if few discs are found and the logarithms
+#: of the likely and the given radius differ by `_OTHER_RADIUS`.
 _FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
+#: Other settings are worth mentioning if they find this many times as many discs.
+_MANY = 3
 #: Number of images in which the discs' size is compared with their radius, and the difference of
 #: logarithms that is reported: .06 on run e, whose camera leans by 2.5 degrees.
 _COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
@@ -84,8 +88,9 @@ def _circles(command: Circles, run: Run) -> Job:
     if command.json is not None:
         places["json"] = command.json
     settings = _with_radius(command.detector, run) if command.find_radius else command.detector
-    plan = FramePlan(run.camera, circles=settings)
-    tilts = None if command.tilt is None else read_tilts(command.tilt)
+    bare = command.tilt == Path("none")
+    plan = FramePlan(run.camera, circles=settings, levelling="none" if bare else "frame")
+    tilts = None if bare or command.tilt is None else read_tilts(command.tilt)
     return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
 
 
@@ -246,6 +251,12 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "no image of this run is in the files of known tilts or IDs, or they have no rows: "
             "were they made from other images?"
         )
+    others = summary.rejected["no matching pattern"]
+    if plan.markers and not found["markers"] and others >= summary.frames:
+        yield (
+            f"{others} squares look like markers, but not of the dictionary "
+            f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
+        )
     if camera is None:
         return
     if plan.lines is not None and not found["lines"]:
@@ -262,16 +273,16 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
     seen = summary.frames - summary.failed
-    hardly_any = 3 * found["discs"] < seen and (seen >= _FEWEST_FRAMES or not found["discs"])
     run, settings = job.run, plan.circles
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
-    if hardly_any:
-        yield from _hints_on_discs(run, settings, summary)
-    elif found["discs"] >= seen >= _FEWEST_FRAMES:
+    leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
+    if not found["discs"] or (found["discs"] < seen >= _FEWEST_FRAMES):
+        yield from _hints_on_discs(run, leaning, settings, summary)
+    elif seen >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii
 
-        ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), run.camera, settings)
+        ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), leaning, settings)
         if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
             yield (
                 f"the discs look {ratio:.2f} times as large as with a radius of "
@@ -281,36 +292,42 @@ def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
             )
 
 
-def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
+def _hints_on_discs(
+    run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
+) -> Iterator[str]:
+    """Why a run has less than one disc per frame; nothing if no other settings find more."""
     from detect.discs.radius import find_radius
     from detect.discs.unfound import why_none
 
-    images = list(_some_images(run))
+    images, number = list(_some_images(run)), summary.found["discs"]
+    in_images = f"in {len(images)} of the images"
     discs = (
-        f"{counted(summary.found['discs'], 'disc')} of radius {settings.radius_m:g} m in "
+        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in "
         f"{counted(summary.frames, 'frame')}. "
     )
-    if not summary.found["discs"]:
-        discs += f"{why_none(images, run.camera, settings)} "
+    if not number:
+        discs += f"{why_none(images, camera, settings)} "
     if summary.frames < _FEWEST_FRAMES:
         yield discs + (
             "If discs are visible, try --radius-m auto, which estimates their radius, and check "
             "the calibration against the images (`detect draw`)."
         )
         return
-    likely = find_radius(images, run.camera, replace(settings, polarity="any"))
-    if likely is None:
-        yield discs + (
-            f"Other radii find no more in {len(images)} of the images: is the calibration that of "
-            "this camera (`detect draw` shows outlines), are discs visible?"
-        )
-    elif abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
+    likely = find_radius(images, camera, replace(settings, polarity="any"))
+    if likely and likely.discs <= _MANY * len(images) * number / summary.frames:
+        likely = None  # not worth mentioning
+    if likely and abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
         yield discs + (
             f"Their radius seems to be {likely.radius_m:.3f} m: {likely.discs} of them are found "
-            f"in {len(images)} of the images. Try --radius-m {likely.radius_m:.3f}."
+            f"{in_images}. Try --radius-m {likely.radius_m:.3f}; if they are not that "
+            f"{'small' if likely.radius_m < settings.radius_m else 'large'}, the camera has "
+            "another height or pitch, or the calibration is not its own (`detect draw` shows "
+            "outlines)."
         )
-    elif settings.polarity != "any":
+    elif likely and settings.polarity != "any":
+        yield discs + f"--polarity any finds {likely.discs} {in_images}."
+    elif _MANY * number < summary.frames:
         yield discs + (
-            f"With both polarities, {likely.discs} are found in {len(images)} of the images: "
-            "try --polarity any."
+            f"Other radii find no more {in_images}: is the calibration that of this camera "
+            "(`detect draw` shows outlines; are its rows full or half?), are discs visible?"
         )

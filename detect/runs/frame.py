@@ -20,11 +20,7 @@ from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.discs.identity import ids_of_rows
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import FrameError
-from detect.levelling import (
-    as_calibrated,
-    common_covariance,
-    levelled,
-)
+from detect.levelling import as_calibrated, common_covariance, levelled
 from detect.lines import LineDetections, carry_ids, detect_lines
 from detect.runs.plan import (
     FramePlan,

@@ -8,12 +8,7 @@ from itertools import islice
 import numpy as np
 
 from camera import Camera
-from detect.levelling import (
-    common_covariance,
-    common_tilt_variance,
-    level_discs,
-    tilt_arrays,
-)
+from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
 from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import FrameRows, Lean, RunSummary
@@ -52,9 +47,7 @@ def searched_lean(tilt: RunTilt) -> Lean | None:
     return pitch, roll
 
 
-def _tilts_of(
-    frames: Iterable[Mapping[str, str]],
-) -> tuple[list[_Tilted], FrameTilts, FrameTilts]:
+def _tilts_of(frames: Iterable[Mapping[str, str]]) -> tuple[list[_Tilted], FrameTilts, FrameTilts]:
     """The tilts in the rows of frames, and as arrays those from verticals and from outlines."""
     own: list[_Tilted] = []
     outlines: list[FrameTilt | None] = []

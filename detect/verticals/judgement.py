@@ -47,13 +47,7 @@ class Fate(IntEnum):
 FATES = tuple(fate.name.lower().replace("_", " ") for fate in Fate)
 
 #: Tracks with these fates might be lines if tracked again,
-_DOUBTFUL = (
-    Fate.NO_MAXIMUM,
-    Fate.OFF_THE_TRACK,
-    Fate.NOT_STRAIGHT,
-    Fate.UNCERTAIN,
-    Fate.SOFT,
-)
+_DOUBTFUL = (Fate.NO_MAXIMUM, Fate.OFF_THE_TRACK, Fate.NOT_STRAIGHT, Fate.UNCERTAIN, Fate.SOFT)
 #: and those with at least this share of the evidence threshold might exceed it.
 _NEARLY = 0.7
 

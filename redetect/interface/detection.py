@@ -45,8 +45,8 @@ class Landmarks(Table):
 
     def __getitem__(self, chosen: Any) -> Any:
         """One, by its number, with its values as attributes; some, by a slice, numbers or mask."""
-        own = {name: values[chosen] for name, values in vars(self).items()}
-        return SimpleNamespace(**own) if isinstance(chosen, Integral) else type(self)(**own)
+        kind = SimpleNamespace if isinstance(chosen, Integral) else type(self)
+        return kind(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -28,8 +28,8 @@ class Part(NamedTuple):
     """A part of a section; the template renders it by its kind.
 
     `words` are the text or the caption. Rows of figures are names and values, those of a key
-    colours and labels. `left` are the columns of a table that contain text, `bold` the rows to
-    emphasise. Details are a collapsed table.
+    colours and labels, those of a list its points. `left` are the columns of a table that contain
+    text, `marked` rows and columns of cells out of their range. Details are a collapsed table.
     """
 
     kind: str
@@ -37,7 +37,7 @@ class Part(NamedTuple):
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     left: tuple[int, ...] = (0,)
-    bold: tuple[int, ...] = ()
+    marked: tuple[tuple[int, int], ...] = ()
     address: str = ""
     width: int = 0
     height: int = 0
@@ -58,7 +58,7 @@ def image_part(words: str, content: bytes, kind: str, width: float, height: floa
 
 
 def page_of(title: str, sections: Sequence[Section]) -> bytes:
-    """The whole page, UTF-8; all text is escaped."""
+    """The whole page, UTF-8; all text is escaped, sections without parts are left out."""
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, finalize=printable
     )

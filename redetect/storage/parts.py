@@ -35,6 +35,8 @@ class OutputExistsError(FileExistsError):
 
 def demand_place(path: Path, *, overwrite: bool) -> None:
     """Reject a path that cannot be a result's, or has one that must not be replaced."""
+    if str(path) == "-":
+        raise OSError("-: expected the name of a file: only --json writes to standard output")
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     if path.is_dir():

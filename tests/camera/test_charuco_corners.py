@@ -55,6 +55,15 @@ def test_markers_close_to_the_corners_do_not_draw_them_away(height: int, allowed
     assert np.all(np.abs(error.mean(axis=0)) < 0.25 * allowed_px)
 
 
+def test_the_lens_bends_the_edges_of_large_squares() -> None:
+    lens = (0.0, -0.25, 0.0, 0.3, 0.0)
+    camera = Camera(960, 720, 780.0, 780.0, 481.5, 356.0, lens, IDENTITY)
+    R, near = pose((0.1, -0.2, 0.15)), T * [1.0, 1.0, 0.7]
+    indices, pixels = find_charuco(render_board(rays_of(camera), BOARD, R, near), BOARD)
+    error = pixels - camera.project(BOARD.points @ R.T + near)[indices]
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.03
+
+
 def test_corners_of_markers_that_were_not_read_are_found(
     picture: tuple[NDArray[np.uint8], FloatArray],
 ) -> None:

@@ -79,13 +79,14 @@ def test_json_and_drawings(small_run: Path, tmp_path: Path) -> None:
         image = read_grey(small_run / "images" / name)
         drawn = cv2.imread(str(drawings / name), cv2.IMREAD_COLOR)
         assert drawn is not None
-        # Words follow below the image.
-        marked = changed(np.asarray(drawn[: len(image)], np.uint8), image)
+        # The picture is twice as large as the image; words follow below it.
+        marked = changed(np.asarray(drawn[: 2 * len(image)], np.uint8), image)
         assert marked.any() == bool(frame["discs"])
         for disc in frame["discs"]:
-            u, v = disc["pixel"]
-            assert marked[v - 40 : v + 41, u - 60 : u + 61].sum() > 100
-            marked[v - 40 : v + 41, u - 60 : u + 61] = False
+            u, v = 2 * disc["pixel"][0], 2 * disc["pixel"][1]
+            around = slice(v - 80, v + 82), slice(u - 120, u + 182)
+            assert marked[around].sum() > 200
+            marked[around] = False
         assert not marked.any()
 
 

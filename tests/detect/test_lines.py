@@ -325,8 +325,8 @@ def test_drawn_lines_lie_on_the_edges() -> None:
     rows = np.arange(40, 120)
     for bearing in truth():
         u = np.rint(edge_columns(CAMERA, bearing, rows.astype(np.float64))).astype(int)
-        assert np.mean([green[v, c - 1 : c + 2].any() for v, c in zip(rows, u)]) > 0.9
-    assert picture.shape[1:] == (240, 3)
+        assert np.mean([green[2 * v, 2 * c - 1 : 2 * c + 3].any() for v, c in zip(rows, u)]) > 0.9
+    assert picture.shape[1:] == (480, 3)
 
 
 def test_drawn_tracks_name_their_fates() -> None:

@@ -150,6 +150,25 @@ def test_the_demos_camera_comes_back(project_root: Path, tmp_path: Path, capsys:
     assert main(command) == 1  # nothing is overwritten unasked
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("height_m", [1.1, 1.3])
+def test_a_height_far_off_is_estimated_or_left(
+    project_root: Path, tmp_path: Path, capsys: Captured, height_m: float
+) -> None:
+    """At 1.1 instead of 1.5 m, only look-alikes are as large as discs should be."""
+    run = project_root / "images" / "e"
+    wrong = (run / "e.cam").read_text().replace("1.50354", f"{height_m}")
+    (tmp_path / "wrong.cam").write_text(wrong)
+    output = tmp_path / "level.cam"
+    assert (
+        main(["level", str(run), "--camera", str(tmp_path / "wrong.cam"), "-o", str(output)]) == 0
+    )
+    left = "its height is unchanged: too few discs of that radius" in capsys.readouterr().out
+    assert left == (height_m == 1.1)
+    expected = height_m if left else 1.50354
+    assert read_camera(output).centre[2] == pytest.approx(expected, abs=0.02)
+
+
 def test_images_of_another_size_are_told_once(
     project_root: Path, tmp_path: Path, capsys: Captured
 ) -> None:

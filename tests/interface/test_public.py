@@ -344,10 +344,17 @@ def test_every_disc_that_is_found_is_explained(
     assert "data:image/png" in why._repr_html_()
 
 
-def test_the_wrong_polarity_is_named(demo_image: Path, demo_camera: rd.Camera) -> None:
+def test_the_wrong_polarity_is_named(
+    found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
+) -> None:
     why = rd.explain(demo_image, demo_camera, polarity="dark")
     assert any("--polarity any finds" in words for words in why.suggestions)
     assert any(row.stage == "polarity" for row in why.candidates)
+    clearest = int(np.argmax(found.discs.evidence))
+    at = float(found.discs.u[clearest]), float(found.discs.v[clearest])
+    why = rd.explain(demo_image, demo_camera, at, polarity="dark")
+    assert why.suggestions[0] == "--polarity any finds 1 there."
+    assert not any("--radius-m" in words for words in why.suggestions)
 
 
 @pytest.mark.long

@@ -197,3 +197,15 @@ def test_below_a_file_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(NotADirectoryError):
         demand_writable(tmp_path / "file" / "rows")
+
+
+def test_standard_output_is_no_name_of_a_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with (
+        pytest.raises(OSError, match="expected the name of a file"),
+        write_whole(Path("-"), overwrite=False),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())

@@ -78,6 +78,12 @@ def perform(options: Laser) -> int:
         f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
         f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
     )
+    if track.outline_moved_m:
+        warn(
+            f"the outline in robot.json is some {1e3 * abs(track.outline_moved_m):.0f} mm too "
+            f"{'small' if track.outline_moved_m > 0.0 else 'large'} on each side: one that fits "
+            "the readings was used"
+        )
     share = seen_through(track)
     if share > _MOST_SEEN_THROUGH:
         warn(
@@ -102,7 +108,7 @@ def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) ->
     """Warn of scans that seem to be of one moment, although the robot moves during them."""
     if any(scanner.sweep_s for scanner in scanners) or len(sets) < 2:
         return
-    turn = max((s.readings - 1) * s.angle_step_rad for s in scanners) / (2.0 * np.pi)
+    turn = max((s.readings - 1) * abs(s.angle_step_rad) for s in scanners) / (2.0 * np.pi)
     sweep_s = turn * float(np.median(np.diff(sets.times_s)))
     moved_m = 0.5 * sweep_s * robot.largest_speed_m_s
     if moved_m > _LARGEST_SWEEP_M:
@@ -171,6 +177,7 @@ def describe(
     counts = np.bincount(track.status, minlength=len(STATUS)).tolist()
     return {
         "sets": {status: count for status, count in zip(STATUS, counts) if count},
+        "outline_moved_m": track.outline_moved_m,
         "segments": segments,
         COMMON: (shared.mean(axis=0) if len(shared) else np.zeros((3, 3))).tolist(),
         "scanners": entries,

@@ -27,6 +27,10 @@ from redetect.storage import write_bytes
 
 #: Scanners this many standard deviations from their measured pose are reported.
 _FAR_OFF_SIGMA = 5.0
+#: Offsets of walls from the map above which a warning is printed (m).
+_NOTED_M = 0.001
+#: Share of readings on walls of the map below which a warning is printed.
+_LEAST_ON_MAP = 0.5
 #: Steps of the ICP that the picture shows.
 _ICP_STEPS = 30
 
@@ -78,6 +82,12 @@ def perform(options: Lasers) -> int:
     drawn = draw_alignment(measured, alignment, points, building, by_step)
     write_bytes(picture, drawn, overwrite=options.force)
     _print_differences(measured, alignment, far_off)
+    for one, seen, matched in zip(alignment.scanners, points, alignment.matched):
+        if matched < _LEAST_ON_MAP * len(seen):
+            warn(
+                f"scanner {one.name}: only {100.0 * matched / len(seen):.0f} % of its readings lie "
+                f"on walls of {map_file}: expected the map of this place, in metres"
+            )
     return 0
 
 
@@ -93,10 +103,10 @@ def _print_differences(
             f"{1e3 * sigma[1]:.2f} mm, {np.degrees(sigma[2]):.4f} deg; {alignment.matched[k]} "
             f"beams on the map, rms {1e3 * alignment.rms_m[k]:.2f} mm"
         )
-    if alignment.map_sigma_m > 0.0:
+    if alignment.map_sigma_m > _NOTED_M:
         warn(
-            f"the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm: the "
-            "scanners were aligned with it as one body, and their errors are common to all"
+            f"the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm: this was "
+            "estimated, too, and the scanners' errors are common to all"
         )
     for name in far_off:
         warn(f"scanner {name}: was measured wrong, or another place of the map is similar")

@@ -1,27 +1,24 @@
 """The robot's clock: time offset, drift and angle offset, segment by segment.
 
-The headings of odometry and ground truth are those of one robot; the offset and the rate between
-their clocks minimise the squared difference, with the angle between their axes eliminated in closed
-form (RAWSEEDS D2.1 part 2). That search is global within a second and derivative-free; farther
-offsets are found before, from movements over seconds (`redetect.groundtruth.fusion.coarse_offset`).
-But odometry's heading drifts, which a sum of squares would partly explain by a time offset. So the
-clock is then refined by maximising the likelihood of the measured poses, given odometry's movements
-and their errors: once for the headings of the ground truth alone, and once for its full poses, if
-they have covariances, so that curves of the path and changes of speed contribute, too. The more
-certain result is used.
+Odometry and ground truth describe the path of one robot (RAWSEEDS D2.1 part 2 compares its
+headings). Offsets to a tenth of a second are found from movements over seconds
+(`redetect.groundtruth.fusion.coarse_offset`). Then the likelihood of the measured poses, given
+odometry's movements and their errors, is maximised: once for the headings of the ground truth
+alone, and once for its full poses, if they have covariances, so that curves of the path and changes
+of speed contribute, too. The more certain result is used.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import Bounds, direct, minimize, minimize_scalar
+from scipy.optimize import Bounds, minimize, minimize_scalar
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -36,19 +33,18 @@ from redetect.groundtruth.trajectories.streams import (
     last_of_each_time,
     segments_between_gaps,
 )
-from redetect.landmarks import wrap_angle
 
 _FEWEST_SAMPLES = 20
 _MOST_SAMPLES = 400
-_SLOWEST_INTERPOLATED_S = 0.25
 # Deviation of a position that was not measured (m).
 _UNKNOWN_M = 1e4
 _LEAST_WAY_M = 1.0
 _SMOOTHED_SAMPLES, _SMOOTHED_S = 5, 0.5
 _ROUNDS = 2
-# Steps of the search (s, at the middle and at the ends) and of derivatives (standard deviations).
+# Steps of the search (s, at the middle and at the ends). Of the parabola at its minimum: its grid,
+# its rise at the ends of that, the widest one (of the bounds), and shares of it that are tried.
 _STEP_S = 0.005
-_DERIVATIVE_STEP = 0.7
+_GRID, _RISE, _WIDEST, _SHRUNK = (-1.0, -0.5, 0.0, 0.5, 1.0), 15.0, 0.5, (1.0, 0.3, 0.1)
 # Ratio of the errors in simulated sessions to the deviations from the likelihood's curvature, since
 # errors of wheels do not follow the model exactly.
 _SIGMA_FACTOR = 2.0
@@ -105,13 +101,12 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
-    odometry = _smoothed(odometry)
     groundtruth, _ = with_jitter_covered(groundtruth)
     parts = [
         groundtruth.only(part)
         for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
     ]
-    search = OffsetSearch(odometry, parts, bounds.largest_offset_s)
+    search = OffsetSearch(_smoothed(odometry), parts, bounds.largest_offset_s)
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
     near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))
@@ -162,12 +157,9 @@ def _if_matching(
 
 
 def _segment(
-    odometry: PlanarPoses,
-    segment: PlanarPoses,
-    bounds: SyncSettings,
-    start_s: float,
+    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
     jumps_left: int,
-) -> list[ClockSegment]:
+) -> list[ClockSegment]:  # fmt: skip
     """One segment's clock; several parts if the clock was set within it.
 
     `start_s`: an offset from which the refinement by whole poses also starts.
@@ -176,30 +168,27 @@ def _segment(
     # Means of ten, with less noise.
     means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
     turned = float(np.sum(np.abs(np.diff(means))))
-    # The part covered by odometry, for all offsets within the bounds.
     reach = bounds.largest_offset_s + bounds.largest_drift * float(np.ptp(segment.times_s))
-    measured = segment.only(
-        segment.during(odometry.times_s[0] + reach, odometry.times_s[-1] - reach)
-    )
-    own = odometry.only(
-        odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
-    )
-    if min(len(measured), len(own)) < _FEWEST_SAMPLES:
+    near = odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
+    if np.count_nonzero(near) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
-    pair = HeadingPair.of(own, measured, reach)
-    # By least squares of headings; by maximum likelihood of headings; and of whole poses.
-    clock = _search(pair, bounds)
-    jittered = _with_jitter(measured, own)
-    best = _most_likely_clock(own, _headings_alone(jittered), pair.reference_s, clock, bounds)
+    own = _smoothed(odometry.only(near))
+    # The part covered by odometry, for all offsets within the bounds.
+    measured = segment.only(segment.during(own.times_s[0] + reach, own.times_s[-1] - reach))
+    if len(measured) < _FEWEST_SAMPLES:
+        return [_undetermined(segment, turned, _NO_ODOMETRY)]
+    # By maximum likelihood of headings, and of whole poses.
+    reference_s, start = float(np.mean(measured.times_s)), np.array([start_s, 0.0])
+    jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
+    best = _most_likely_clock(own, _headings_alone(jittered), reference_s, start, bounds)
     if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
     if measured.covariances is not None and driven >= _LEAST_WAY_M:
         # Headings of a robot that hardly turns are a poor start.
-        starts = [best.clock]
-        if abs(start_s - best.clock[0]) > _ANOTHER_START_S:
-            starts.append(np.array([start_s, 0.0]))
-        fits = [_most_likely_clock(own, jittered, pair.reference_s, at, bounds) for at in starts]
+        far = abs(start_s - best.clock[0]) > _ANOTHER_START_S
+        starts = [best.clock, start] if far else [best.clock]
+        fits = [_most_likely_clock(own, jittered, reference_s, at, bounds) for at in starts]
         maxima = [fit for fit in fits if fit is not None]
         moving = min(maxima, key=lambda fit: fit.deviance, default=best)
         if moving.uncertainty(measured) < best.uncertainty(measured):
@@ -213,21 +202,17 @@ def _segment(
             parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
+    offset_s, drift = best.clock.tolist()
+    times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
+    angles = measured.poses[:, 2] - np.interp(times_s, own.times_s, np.unwrap(own.poses[:, 2]))
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
     return [
         ClockSegment(
-            from_s=float(segment.times_s[0]),
-            to_s=float(segment.times_s[-1]),
-            reference_s=pair.reference_s,
-            offset_s=float(best.clock[0]),
-            rate=1.0 + float(best.clock[1]),
-            angle_rad=_mean_angle(pair.differences(best.clock)),
-            sigma_offset_s=float(best.sigmas[0]),
-            sigma_rate=float(best.sigmas[1]),
-            turned_rad=turned,
-            status="at a bound" if at_bound else "ok",
+            float(segment.times_s[0]), float(segment.times_s[-1]), reference_s, offset_s,
+            1.0 + drift, float(np.angle(np.mean(np.exp(1j * angles)))), float(best.sigmas[0]),
+            float(best.sigmas[1]), turned, "at a bound" if at_bound else "ok",
         )
-    ]
+    ]  # fmt: skip
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
@@ -235,70 +220,6 @@ def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
     if clock.status != "ok":
         return clock
     return replace(clock, status="jump", note=f"the clock was set near {time_s:.2f} s")
-
-
-@dataclass(frozen=True, eq=False)
-class HeadingPair:
-    """The headings of two streams, the second of which is interpolated."""
-
-    times_s: FloatArray  # (N,)
-    headings: FloatArray  # (N,)
-    other_s: FloatArray  # (M,)
-    other: FloatArray  # (M,): continuous
-    reference_s: float
-    sign: int  # 1 where the ground truth's headings are the N
-
-    @classmethod
-    def of(cls, odometry: PlanarPoses, groundtruth: PlanarPoses, reach_s: float) -> HeadingPair:
-        """Interpolate the smoother, faster stream, at some samples of the other one.
-
-        Within `reach_s` of its ends, the ground truth may be outside the other stream's time.
-        """
-        inside = odometry.during(
-            groundtruth.times_s[0] + reach_s, groundtruth.times_s[-1] - reach_s
-        )
-        streams = [(one.times_s, np.unwrap(one.poses[:, 2])) for one in (groundtruth, odometry)]
-        slow = [np.median(np.diff(times)) > _SLOWEST_INTERPOLATED_S for times, _ in streams]
-        rough = [roughness(headings) for _, headings in streams]
-        sampled = int(slow[1] if slow[0] != slow[1] else rough[1] > rough[0])
-        if np.count_nonzero(inside) < _FEWEST_SAMPLES:
-            sampled = 0
-        times, headings = streams[sampled]
-        if sampled:
-            times, headings = times[inside], headings[inside]
-        stride = 1 + len(times) // _MOST_SAMPLES
-        return cls(
-            times[::stride],
-            headings[::stride],
-            *streams[1 - sampled],
-            float(np.mean(groundtruth.times_s)),
-            -1 if sampled else 1,
-        )
-
-    def differences(self, clock: FloatArray) -> FloatArray:
-        """(N,) heading of the ground truth minus heading of the odometry, by a clock (2,)."""
-        offset_s, drift = clock
-        if self.sign > 0:
-            times = self.times_s + offset_s + drift * (self.times_s - self.reference_s)
-        else:
-            times = (self.times_s - offset_s + drift * self.reference_s) / (1.0 + drift)
-        return np.asarray(self.sign * (self.headings - np.interp(times, self.other_s, self.other)))
-
-
-def _mean_angle(differences: FloatArray) -> float:
-    return float(np.angle(np.mean(np.exp(1j * differences))))
-
-
-def _search(pair: HeadingPair, bounds: SyncSettings) -> FloatArray:
-    """(2,) offset (s) and drift with the least squared differences, the angle eliminated."""
-    largest = np.array(bounds.largest)
-
-    def squared(x: FloatArray) -> float:
-        differences = pair.differences(x * largest)
-        return float(np.mean(np.square(wrap_angle(differences - _mean_angle(differences)))))
-
-    found = direct(squared, Bounds([-1.0, -1.0], [1.0, 1.0]), maxfun=1500, maxiter=1000)
-    return np.asarray(found.x * largest)
 
 
 class ClockFit(NamedTuple):
@@ -326,12 +247,9 @@ class ClockFit(NamedTuple):
 
 
 def _most_likely_clock(
-    odometry: PlanarPoses,
-    measured: PlanarPoses,
-    reference_s: float,
-    start: FloatArray,
+    odometry: PlanarPoses, measured: PlanarPoses, reference_s: float, start: FloatArray,
     bounds: SyncSettings,
-) -> ClockFit | None:
+) -> ClockFit | None:  # fmt: skip
     """The most likely clock near a start and within the bounds; None without a maximum."""
     largest = np.array(bounds.largest)
     half = 0.5 * float(np.ptp(measured.times_s))
@@ -347,30 +265,34 @@ def _most_likely_clock(
         prior = 3.0 * float(np.sum(np.square(clock / largest)))
         return problem_at(clock).innovations(noise).deviance + prior
 
-    clock, unit = start, np.array([_STEP_S, _STEP_S / half])
+    unit = np.minimum([_STEP_S, _STEP_S / half], largest)
+    clock, found = np.clip(start, -0.999 * largest, 0.999 * largest), None
     for _ in range(_ROUNDS):
         problem = problem_at(clock)
         noise = maximum_likelihood_noise(problem)
         noise *= math.sqrt(variance_inflation(problem, noise))
-        clock, unit = np.clip(clock, -0.999 * largest, 0.999 * largest), np.minimum(unit, largest)
-        inward = np.where(clock > 0.0, -unit, unit)
-        found = minimize(
-            lambda x, unit: deviance(x * unit),
-            clock / unit,
-            (unit,),
-            method="Nelder-Mead",
-            bounds=Bounds(-largest / unit, largest / unit),
-            options={
-                "xatol": 0.01,
-                "fatol": 0.01,
-                "initial_simplex": (clock + np.vstack([np.zeros(2), np.diag(inward)])) / unit,
-            },
-        )
-        clock = found.x * unit
-        deviations = _deviations(deviance, clock, _DERIVATIVE_STEP * unit)
-        if deviations is None:
+        if found is None:
+            inward = np.where(clock > 0.0, -unit, unit)
+            clock = (
+                unit
+                * minimize(
+                    lambda x, unit: deviance(x * unit),
+                    clock / unit,
+                    (unit,),
+                    method="Nelder-Mead",
+                    bounds=Bounds(-largest / unit, largest / unit),
+                    options={
+                        "xatol": 0.05,
+                        "fatol": 0.1,
+                        "initial_simplex": (clock + np.vstack([np.zeros(2), np.diag(inward)]))
+                        / unit,
+                    },
+                ).x
+            )
+        found = _parabola(deviance, clock, unit, largest)
+        if found is None:
             return None
-        unit = deviations
+        clock, unit = found
     sigmas = _SIGMA_FACTOR * unit
     # If the drift is not determined, it is 0.
     if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
@@ -385,26 +307,51 @@ def _most_likely_clock(
     return ClockFit(clock, sigmas, problem_at, noise)
 
 
-def _deviations(
-    deviance: Callable[[FloatArray], float], at: FloatArray, step: FloatArray
-) -> FloatArray | None:
-    """(2,) deviations of two unknowns, from the curvature of minus twice the log-likelihood."""
-    e, f = np.diag(step)
-    here = deviance(at)
-    curvature = np.diag([deviance(at + d) + deviance(at - d) - 2.0 * here for d in (e, f)])
-    if not np.all(np.diag(curvature) > 0.0):
-        return None
-    cross = 0.25 * (
-        deviance(at + e + f) - deviance(at + e - f) - deviance(at - e + f) + deviance(at - e - f)
-    )
-    # If a gate opens or closes, a step may look like curvature.
-    if cross**2 < np.prod(np.diag(curvature)):
-        curvature[0, 1] = curvature[1, 0] = cross
-    return np.asarray(step * np.sqrt(2.0 * np.diag(np.linalg.inv(curvature))))
+def _parabola(
+    deviance: Callable[[FloatArray], float], at: FloatArray, step: FloatArray, largest: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Minimum (2,) of minus twice the log-likelihood of two unknowns, and deviations (2,).
+
+    Between samples odometry's path is interpolated, so that the likelihood has kinks: the parabola
+    is fitted over a range in which it rises by much more than these. What it leaves is included in
+    the deviations.
+    """
+    here, steps = deviance(at), np.minimum(step, _WIDEST * largest)
+    for k, axis in enumerate(np.eye(2)):
+        while steps[k] < _WIDEST * largest[k]:
+            rise = 0.5 * sum(deviance(at + sign * steps * axis) for sign in (-1.0, 1.0)) - here
+            if rise > _RISE:
+                break
+            steps[k] = min(1.6 * steps[k], _WIDEST * largest[k])
+    grid = np.array(list(product(_GRID, repeat=2)))
+    x, y = grid.T
+    design = np.column_stack([x, y, 0.5 * x * x, x * y, 0.5 * y * y, np.ones(len(x))])
+    inverse = np.linalg.inv(design.T @ design)
+    for scale in _SHRUNK:
+        values = np.array([deviance(at + scale * steps * point) for point in grid])
+        c = inverse @ design.T @ values
+        curvature = np.array([[c[2], c[3]], [c[3], c[4]]])
+        if np.linalg.eigvalsh(curvature)[0] > 0.0:
+            root = np.linalg.inv(curvature)
+            kinks = float(np.sum((values - design @ c) ** 2)) / (len(x) - len(c))
+            sigmas = np.sqrt(np.diag(2.0 * root + kinks * root @ inverse[:2, :2] @ root))
+            minimum = np.clip(-root @ c[:2], -1.0, 1.0)
+            return at + scale * steps * minimum, scale * steps * sigmas
+    return None
 
 
-def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
-    """Measured poses with odometry's own jitter added to their covariances.
+def _rounding(odometry: PlanarPoses) -> FloatArray:
+    """(3,) standard deviations of x, y and the heading that are due to their rounding."""
+    found = np.zeros(3)
+    for k, levels in enumerate(np.unique(np.round(values, 9)) for values in odometry.poses.T):
+        step = min(np.diff(levels), default=0.0)
+        if step > 0.0 and np.all(np.abs(levels - step * np.rint(levels / step)) < 0.01 * step):
+            found[k] = step / math.sqrt(12.0)
+    return found
+
+
+def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatArray) -> PlanarPoses:
+    """Measured poses with odometry's own jitter and rounding added to their covariances.
 
     A localisation jitters from sample to sample, and this error does not accumulate.
     """
@@ -415,7 +362,7 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
     jitter = np.array([roughness(values) for values in columns])
     # Between two samples odometry's path is unknown by the sag of what it bends.
     sag = np.array([np.sqrt(np.mean(np.square(np.diff(values, 2)))) / 8.0 for values in columns])
-    own = np.tile(np.diag(jitter**2 + sag**2), (len(measured), 1, 1))
+    own = np.tile(np.diag(jitter**2 + sag**2 + rounding**2), (len(measured), 1, 1))
     return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 
 
@@ -438,9 +385,8 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
 def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
     """Poses with known headings only."""
     assert measured.covariances is not None
-    covariances = np.tile(np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]), (len(measured), 1, 1))
-    covariances[:, 2, 2] = measured.covariances[:, 2, 2]
-    return PlanarPoses(measured.times_s, measured.poses, covariances)
+    unknown = np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0])
+    return PlanarPoses(measured.times_s, measured.poses, measured.covariances + unknown)
 
 
 def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
@@ -482,14 +428,8 @@ def _differ(parts: list[ClockSegment]) -> bool:
 
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
-    return ClockSegment(
-        from_s=float(segment.times_s[0]),
-        to_s=float(segment.times_s[-1]),
-        reference_s=float(np.mean(segment.times_s)),
-        turned_rad=turned_rad,
-        status="no turns",
-        note=note,
-    )
+    from_s, to_s, at_s = (float(f(segment.times_s)) for f in (np.min, np.max, np.mean))
+    return ClockSegment(from_s, to_s, at_s, turned_rad=turned_rad, status="no turns", note=note)
 
 
 def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:

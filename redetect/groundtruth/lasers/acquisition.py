@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.icp import fit_outline, moved, nearest_on_segments
+from redetect.groundtruth.lasers.icp import face_normals, fit_outline, moved, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
@@ -197,10 +197,11 @@ def load_session(
     return scanners, robot, fixed, sets_of_scans(scans)
 
 
-def outline_faces(outline: ArrayLike) -> FloatArray:
+def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
-    `outline`: corners (k, 2) in order, in either direction (m). Raises `GroundTruthError` if two
+    `outline`: corners (k, 2) in order, in either direction (m); `outward_m`: by how much all faces
+    are moved. Raises `GroundTruthError` if two
     consecutive corners coincide, faces cross, or the outline encloses no area.
     """
     corners = np.asarray(outline, dtype=np.float64)
@@ -212,6 +213,10 @@ def outline_faces(outline: ArrayLike) -> FloatArray:
         raise GroundTruthError(f"outline: encloses {abs(area):g} m2")
     if area < 0.0:
         corners = corners[::-1]
+    normals = face_normals(np.hstack([corners, np.roll(corners, -1, axis=0)]))
+    before = np.roll(normals, 1, axis=0)
+    shared = 1.0 + np.sum(normals * before, axis=1, keepdims=True)
+    corners = corners + outward_m * (normals + before) / shared
     faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
     for i in range(len(faces)):
         for j in range(i + 2, len(faces) - (i == 0)):
@@ -270,13 +275,9 @@ def _cross(a: FloatArray, b: FloatArray) -> bool:
 
 
 def refine(
-    seen: NewReadings,
-    start: FloatArray,
-    fixed: FixedScanners,
-    body: Body,
-    settings: LaserSettings,
-    prior_m: float,
-) -> OutlinePose:
+    seen: NewReadings, start: FloatArray, fixed: FixedScanners, body: Body,
+    settings: LaserSettings, prior_m: float,
+) -> OutlinePose:  # fmt: skip
     """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
     s = settings
     fit = OutlineFit(
@@ -286,9 +287,11 @@ def refine(
     return refine_outline(seen, body.faces, start, fixed.origins, fixed.sigmas_m, fit)
 
 
-def robot_body(outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m) -> Body:
-    """Prepare an outline (k, 2); raises `GroundTruthError` if it is not valid."""
-    faces = outline_faces(outline)
+def robot_body(
+    outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m, outward_m: float = 0.0
+) -> Body:
+    """Prepare an outline (k, 2), moved outward; raises `GroundTruthError` if it is not valid."""
+    faces = outline_faces(outline, outward_m)
     corners = faces[:, :2]
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     radius = float(np.max(np.hypot(*(corners - middle).T)))
@@ -343,13 +346,9 @@ def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[Flo
 
 
 def _search(
-    place: FloatArray,
-    seen: NewReadings,
-    scans: ScanSet,
-    fixed: FixedScanners,
-    body: Body,
+    place: FloatArray, seen: NewReadings, scans: ScanSet, fixed: FixedScanners, body: Body,
     settings: LaserSettings,
-) -> list[tuple[float, FloatArray]]:
+) -> list[tuple[float, FloatArray]]:  # fmt: skip
     """Poses that explain the beams, with a score: beams that agree less those that disagree."""
     found: list[tuple[float, FloatArray]] = []
     tried: list[FloatArray] = []

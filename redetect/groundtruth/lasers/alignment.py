@@ -2,12 +2,14 @@
 
 The steps are those of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners are aligned by ICP;
 their scans are merged one after the other; each scanner is aligned again with the others' merged
-scans, in rounds until none moves; finally all as one body, then each scanner, with the map.
+scans, in rounds until none moves; finally all as one body with the map, then each, together with
+the walls' offsets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -18,13 +20,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import (
-    FLOOR_M,
-    WallFit,
-    body_on_inexact_map,
-    fit_to_walls,
-    still_scan,
-)
+from redetect.groundtruth.lasers.walls import MapProblem, StillScan, still_scan
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 
@@ -39,11 +35,16 @@ _ROUNDS = 50
 #: Standard deviations of readings, wall and map together, as the fit to the map narrows (m).
 _NARROWING_M = (0.2, 0.1, 0.05, 0.03, 0.02, 0.01, 0.005)
 _WEAK_M = 0.02
-_MOST_STEPS = 500
 # Start headings of the pairs, relative to the measured ones.
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
-# Largest consistent distance between a scanner's position on the map and among the scanners.
-_INCONSISTENT_M = 0.05
+# Decrease of the share of a scan that others explain, by its pose on the map, that is noticed.
+_MUCH_WORSE = 0.1
+# Walls farther than this from what scanners see, by their measured poses, are ignored (m).
+_AROUND_M = 5.0
+# A scanner's start on the map is found with standard deviations down to this (m).
+_COARSE_M = 0.02
+# Standard deviations of measured poses (m, rad): without a covariance, and the least.
+_UNKNOWN_SIGMA, _LEAST_SIGMA = 0.5, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Alignment:
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
     # (3 scanners, 3 scanners): covariance of their poses, jointly
     covariance: FloatArray
-    # Standard deviation of the walls' offsets from the map (m); 0 if it is exact to a millimetre.
+    # Standard deviation of the offsets of the walls' ends from the map (m); 0 if it is exact.
     map_sigma_m: float
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
@@ -101,53 +102,75 @@ def align_scanners(
             )
     scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
     measured = np.stack([scanner.pose for scanner in scanners])
+    # Only walls that a scanner can see; drawings may show a whole city.
+    reach = max(float(still.range_m.max()) for still in stills) + _AROUND_M
+    low, high = measured[:, :2].min(axis=0) - reach, measured[:, :2].max(axis=0) + reach
+    ends = building.reshape(-1, 2, 2)
+    building = building[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
+    if not len(building):
+        raise GeometryError("no wall of the map is near the scanners: expected some")
     steps: dict[str, FloatArray] = {}
     shares, relative = _pairs(scans, measured, s)
-    steps["pairs"] = _chained(measured, shares, relative)
-    steps["merged"] = _merged(scans, steps["pairs"], shares, s)
+    steps["pairs"], order = _chained(measured, shares, relative)
+    # One scan after the other, the best overlapping first, with those merged already.
+    targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
+    gates = np.geomspace(s.gate_m, 0.08, 8)
+    steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = _round(scans, steps["merged"], s)
     steps["together"] = _together(scans, steps["realigned"], s)
-    whole = _whole_to_map(scans, steps["together"], measured, building, s)
+    narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
+    whole = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
-    narrowing = (*(n for n in _NARROWING_M if n <= s.gate_m), FLOOR_M)
-    fits: list[WallFit | None] = []
-    failed: GeometryError | None = None
-    origin = np.zeros((1, 3))
-    for scanner, still, start in zip(scanners, stills, whole):
+    priors = [_prior(scanner) for scanner in scanners]
+    starts, others = [], []
+    for one, still, pose, prior in zip(scanners, stills, whole, priors):
+        coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
         try:
-            fits.append(
-                fit_to_walls([still], origin, building, start, s.gate_m, narrowing, _WEAK_M)
-            )
+            lone = MapProblem([still], one.pose[None], prior, building)
+            start, other = lone.likely_pose(pose, coarse)
         except GeometryError as error:
-            fits.append(None)
-            failed = failed or GeometryError(f"scanner {scanner.name}: {error}")
-    body = body_on_inexact_map(stills, fits, whole, building, narrowing, s.gate_m, _WEAK_M)
-    if body is None and failed is not None:
-        raise failed
-    poses = np.stack([start if fit is None else fit.pose for start, fit in zip(whole, fits)])
-    steps["each to the map"] = poses
-    far = np.hypot(*(poses - whole)[:, :2].T) > _INCONSISTENT_M
-    if body is not None:
-        poses, covariance, map_sigma_m = body.poses, body.covariance, body.map_sigma_m
-        fits = [fit or body.fit._replace(used=0) for fit in fits]
-    found = [fit for fit in fits if fit is not None]
-    if body is None:
-        covariance, map_sigma_m = block_diag(*(fit.covariance for fit in found)), 0.0
+            raise GeometryError(f"scanner {one.name}: {error}") from None
+        starts.append(start)
+        others.append(other)
+    problem = MapProblem(stills, measured, block_diag(*priors), building)
+    fit = problem.fit(np.stack(starts), narrowing, _WEAK_M)
+    steps["each to the map"] = fit.poses
+    covariance = fit.covariance + block_diag(*others)
     blocks = [covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(scanners))]
-    return Alignment(
-        scanners=tuple(
-            replace(scanner, pose=pose, covariance=block)
-            for scanner, pose, block in zip(scanners, poses, blocks)
-        ),
-        steps=steps,
-        pairs=shares,
-        matched=np.array([fit.used for fit in found]),
-        rms_m=np.array([fit.rms_m for fit in found]),
-        covariance=covariance,
-        map_sigma_m=map_sigma_m,
-        undetermined=tuple(one.name for one, fit in zip(scanners, found) if fit.open_directions),
-        inconsistent=tuple(one.name for one, is_far in zip(scanners, far) if is_far),
+    elsewhere = np.array([np.trace(other[:2, :2]) for other in others]) > _WEAK_M**2
+    is_open = (fit.open_directions > 0) | elsewhere
+    wrong = [_contradicts(scans, fit.poses, steps["together"], k) for k in range(len(scanners))]
+    undetermined, inconsistent = (
+        tuple(one.name for one, noted in zip(scanners, which) if noted)
+        for which in (is_open, wrong)
     )
+    placed = tuple(
+        replace(scanner, pose=pose, covariance=block)
+        for scanner, pose, block in zip(scanners, fit.poses, blocks)
+    )
+    return Alignment(
+        placed, steps, shares, fit.used, fit.rms_m, covariance, fit.map_sigma_m, undetermined,
+        inconsistent,
+    )  # fmt: skip
+
+
+def _prior(scanner: Scanner) -> FloatArray:
+    """(3, 3) information of a scanner's measured pose; of an unknown accuracy, hardly any."""
+    if not np.any(scanner.covariance):
+        return np.eye(3) / _UNKNOWN_SIGMA**2
+    return np.asarray(np.linalg.inv(scanner.covariance + np.eye(3) * _LEAST_SIGMA**2))
+
+
+def _contradicts(scans: list[Scan], poses: FloatArray, aligned: FloatArray, k: int) -> bool:
+    """Whether a scan fits the others much worse by its pose on the map than when aligned."""
+    others = [m for m in range(len(scans)) if m != k]
+    if not others:
+        return False
+    on_map, best = (
+        explained(scans[k].points, _merge(scans, where, others), where[k], _JUDGED_M)
+        for where in (poses, aligned)
+    )
+    return best - on_map > _MUCH_WORSE
 
 
 def _pairs(
@@ -175,8 +198,8 @@ def _chained(
     measured: FloatArray,
     shares: dict[tuple[int, int], float],
     relative: dict[tuple[int, int], FloatArray],
-) -> FloatArray:
-    """Poses chained along the best-matching pairs, from the first scanner, which stays fixed."""
+) -> tuple[FloatArray, list[int]]:
+    """Poses chained along the best-matching pairs, from the first scanner, and in which order."""
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):
@@ -187,7 +210,7 @@ def _chained(
         a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
         poses[b] = compose(poses[a], a_from_b)
         placed.append(b)
-    return poses
+    return poses, placed
 
 
 def _merge(scans: list[Scan], poses: FloatArray, members: Iterable[int]) -> Scan:
@@ -198,37 +221,24 @@ def _merge(scans: list[Scan], poses: FloatArray, members: Iterable[int]) -> Scan
     )
 
 
-def _align_one(
-    scans: list[Scan], poses: FloatArray, k: int, target: Scan, gates: FloatArray, kept: float
-) -> FloatArray:
-    pose = align_scans(scans[k].points, target, poses[k], gates, kept, 1e-7)
-    return pose if np.isfinite(pose).all() else poses[k]
-
-
-def _merged(
-    scans: list[Scan], poses: FloatArray, shares: dict[tuple[int, int], float],
-    s: AlignmentSettings,
+def _realigned(
+    scans: list[Scan], poses: FloatArray, targets: Iterable[tuple[int, list[int]]],
+    gates: FloatArray, kept: float,
 ) -> FloatArray:  # fmt: skip
-    """Align one scan after the other, the best overlapping first, with those merged already."""
+    """Align scanners, one after the other, with the merged scans of others."""
     poses = poses.copy()
-    members = [0]
-    gates = np.geomspace(s.gate_m, 0.08, 8)
-    while len(members) < len(scans):
-        outside = [k for k in range(len(scans)) if k not in members]
-        k = max(outside, key=lambda k: max(shares[min(k, m), max(k, m)] for m in members))
-        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, members), gates, s.keep)
-        members.append(k)
+    for k, others in targets:
+        target = _merge(scans, poses, others)
+        pose = align_scans(scans[k].points, target, poses[k], gates, kept, 1e-7)
+        poses[k] = pose if np.isfinite(pose).all() else poses[k]
     return poses
 
 
 def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
     """Align each scanner but the first again with the merged scans of all others."""
-    poses = poses.copy()
-    gates = np.geomspace(0.15, 0.06, 4)
-    for k in range(1, len(scans)):
-        others = [m for m in range(len(scans)) if m != k]
-        poses[k] = _align_one(scans, poses, k, _merge(scans, poses, others), gates, s.keep)
-    return poses
+    count = len(scans)
+    targets = ((k, [m for m in range(count) if m != k]) for k in range(1, count))
+    return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), s.keep)
 
 
 def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
@@ -242,23 +252,19 @@ def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> Flo
 
 
 def _whole_to_map(
-    scans: list[Scan], poses: FloatArray, measured: FloatArray, building: FloatArray,
-    s: AlignmentSettings,
+    stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    narrowing_m: list[float],
 ) -> FloatArray:  # fmt: skip
     """Align all scanners, as one rigid body, with the map, from their measured poses."""
     if len(poses) > 1:
         body = fitted(poses[:, :2], measured[:, :2])
     else:
         body = compose(measured[0], invert(poses[0]))
-    everything = _merge(scans, poses, range(len(scans))).points
-    from_map = invert(body)
-    for gate in (2.0 * s.gate_m, s.gate_m, 0.5 * s.gate_m, 0.25 * s.gate_m, 0.1):
-        from_map, _, count = fit_outline(
-            everything, building, from_map, gate, s.keep, 1e-5, _MOST_STEPS
-        )
-        if count < 3:
-            raise GeometryError(f"{count} readings near the map: expected 3 or more")
-    return compose(np.broadcast_to(invert(from_map), poses.shape), poses)
+    prior = np.eye(3) / _UNKNOWN_SIGMA**2
+    problem = MapProblem(stills, body[None], prior, building, mounts=poses)
+    with suppress(GeometryError):  # then each scanner's start is searched around its measured pose
+        body = problem.fit(body[None], narrowing_m, _WEAK_M).poses[0]
+    return compose(np.broadcast_to(body, poses.shape), poses)
 
 
 def icp_by_step(

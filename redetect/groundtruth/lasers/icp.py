@@ -133,6 +133,12 @@ def explained(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float
     return float(np.mean(np.exp(-0.5 * np.concatenate([there, back**2]) / sigma_m**2)))
 
 
+def face_normals(faces: FloatArray) -> FloatArray:
+    """(k, 2) outward normals of counter-clockwise faces (k, 4)."""
+    along = faces[:, 2:] - faces[:, :2]
+    return np.asarray(np.stack([along[:, 1], -along[:, 0]], -1) / np.hypot(*along.T)[:, None])
+
+
 @kernel()
 def nearest_on_segments(
     points: FloatArray, segments: FloatArray
@@ -204,14 +210,9 @@ def moved(points: FloatArray, pose: FloatArray) -> FloatArray:
 
 @kernel()
 def fit_outline(
-    points: FloatArray,
-    faces: FloatArray,
-    start: FloatArray,
-    gate_m: float,
-    kept: float,
-    threshold_m: float,
-    most_steps: int,
-) -> tuple[FloatArray, float, int]:
+    points: FloatArray, faces: FloatArray, start: FloatArray, gate_m: float, kept: float,
+    threshold_m: float, most_steps: int,
+) -> tuple[FloatArray, float, int]:  # fmt: skip
     """Trimmed ICP of segments to points: pose, root mean square error, number of pairs used.
 
     The pose moves the segments onto the points.

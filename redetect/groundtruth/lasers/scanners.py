@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.bounds import ABOVE_0, FINITE, NotNegative, Positive, demand_fields, whole
+from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
@@ -59,7 +59,8 @@ class Scanner:
     covariance: FloatArray
     # Beam i points to first_angle + i step in the scanner's frame.
     first_angle_rad: Annotated[float, FINITE]
-    angle_step_rad: Positive
+    # Negative where it is mounted upside down
+    angle_step_rad: Annotated[float, NOT_0]
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
     max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)
@@ -70,7 +71,7 @@ class Scanner:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", self.name):
             raise GroundTruthError(f"{place}: expected a name of letters, digits, '-', '_', '.'")
         demand_fields(self, GroundTruthError)
-        if (self.readings - 1) * self.angle_step_rad > 2.0 * np.pi + 1e-6:
+        if (self.readings - 1) * abs(self.angle_step_rad) > 2.0 * np.pi + 1e-6:
             raise GroundTruthError(
                 f"{place}: {self.readings} readings {self.angle_step_rad!r} rad apart: expected "
                 "one turn or less"
@@ -367,7 +368,9 @@ def _read_rows(
     for line, words in read_rows(path, _LARGEST_FILE_BYTES):
         if not rows and words[0].lower() in ("t", "t_s", "time"):
             continue
-        # Some scanners have the largest float for beams without a return.
+        # Some scanners have infinity or the largest float for beams without a return.
+        lead = 1 if readings is None else len(words) - readings
+        words[lead:] = ["0" if word.lower() == "inf" else word for word in words[lead:]]
         values = np.array(parse_numbers(path, line, words, below=np.inf))
         if readings is not None and len(values) == readings + 2:
             values = values[1:]

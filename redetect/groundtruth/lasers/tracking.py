@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import convolve1d
+from scipy.stats import trim_mean
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
-from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking_kernels import (
     BeamCounts,
@@ -30,7 +31,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, compose
+from redetect.plane import apply, compose, invert
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
@@ -40,7 +41,10 @@ _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 
 _VELOCITY_WINDOW_S = 0.3
 _LARGEST_CHI2 = 9.0
-_FRONT_SAMPLE = 60
+# An outline is moved if readings are farther from it on average (m), or more than half of their
+# standard deviation, and at most by this share of its radius.
+_OUTLINE_M, _MOST_MOVED, _TRIMMED, _OUTLINE_ROUNDS = 0.003, 0.25, 0.1, 6
+_SAMPLE = 60
 # A scanner is suspect if the others contradict its pose by more, in standard deviations and in m
 # and rad.
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
@@ -77,40 +81,30 @@ class LaserTrack:
     corrections: FloatArray
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
+    # By how much each face of the given outline was moved outward to fit the readings (m)
+    outline_moved_m: float = 0.0
 
 
 class Tracker:
     """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
 
     def __init__(
-        self,
-        sets: ScanSets,
-        fixed: FixedScanners,
-        body: Body,
-        largest_speed_m_s: float,
+        self, sets: ScanSets, fixed: FixedScanners, body: Body, largest_speed_m_s: float,
         settings: LaserSettings,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.sets, self.fixed, self.body = sets, fixed, body
         self.speed, self.settings = largest_speed_m_s, settings
         n, scanners = len(sets), len(fixed.origins)
         self.track = LaserTrack(
             sets.times_s,
-            status=np.full(n, LOST),
-            segment=np.full(n, -1),
-            poses=np.full((n, 3), np.nan),
-            covariances=np.full((n, 3, 3), np.nan),
-            noise=np.full((n, 3, 3), np.nan),
-            motion=np.zeros((n, 3)),
-            readings=np.zeros(n, dtype=np.int64),
-            rms_m=np.full(n, np.nan),
-            chi2=np.full(n, np.nan),
-            beams=np.zeros((n, 6)),
-            weak=np.zeros((n, 3)),
-            reasons={},
+            status=np.full(n, LOST), segment=np.full(n, -1),
+            poses=np.full((n, 3), np.nan), covariances=np.full((n, 3, 3), np.nan),
+            noise=np.full((n, 3, 3), np.nan), motion=np.zeros((n, 3)),
+            readings=np.zeros(n, dtype=np.int64), rms_m=np.full(n, np.nan),
+            chi2=np.full(n, np.nan), beams=np.zeros((n, 6)), weak=np.zeros((n, 3)), reasons={},
             corrections=np.full((scanners, 3), np.nan),
-            correction_sigma=np.full((scanners, 3), np.nan),
-            fronts={},
-        )
+            correction_sigma=np.full((scanners, 3), np.nan), fronts={},
+        )  # fmt: skip
         self.prior_m = np.full(n, 0.02)
         self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
@@ -260,6 +254,19 @@ class Tracker:
         self.information += found.information
         self.gradient += found.gradient
 
+    def outside_m(self) -> float:
+        """Mean distance of most readings from the outline, outward, in a sample of the sets (m)."""
+        rows = np.flatnonzero(np.isin(self.track.status, (OK, REACQUIRED)))
+        normals, off = face_normals(self.body.faces), [np.zeros(0)]
+        for i in rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(np.int64)]:
+            pose = self.track.poses[i]
+            seen = apply(invert(pose), self._points(i, pose, self.track.motion[i], 0.0).points)
+            nearest, face, squared = nearest_on_segments(seen, self.body.faces)
+            across = np.sum((seen - nearest) * normals[face], axis=1)
+            off.append(across[squared < self.settings.gate_m**2])
+        whole = np.concatenate(off)
+        return float(trim_mean(whole, _TRIMMED)) if len(whole) else 0.0
+
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
@@ -269,7 +276,7 @@ class Tracker:
         if len(self.body.symmetries) == 0:
             return "outline"
         choices = [np.zeros(3), *self.body.symmetries]
-        sample = rows[np.unique(np.linspace(0, len(rows) - 1, _FRONT_SAMPLE).astype(np.int64))]
+        sample = rows[np.unique(np.linspace(0, len(rows) - 1, _SAMPLE).astype(np.int64))]
         costs = np.array([[self._cost(i, choice) for choice in choices] for i in sample.tolist()])
         best = int(np.argmin(costs.mean(axis=0)))
         worse = np.delete(costs, best, axis=1) - costs[:, best : best + 1]
@@ -353,19 +360,28 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
 def track_by_lasers(
     sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings | None = None
 ) -> LaserTrack:
-    """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`)."""
+    """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`).
+
+    If the readings are outside or inside of the outline on all sides, it was drawn too small or too
+    large: then its faces are moved, as `outline_moved_m` says.
+    """
     settings = LaserSettings() if settings is None else settings
-    body = robot_body(robot.outline, settings.symmetry_m)
-    return Tracker(sets, fixed, body, robot.largest_speed_m_s, settings).run()
+    allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0
+    for _ in range(_OUTLINE_ROUNDS):
+        body = robot_body(robot.outline, settings.symmetry_m, moved_m)
+        tracker = Tracker(sets, fixed, body, robot.largest_speed_m_s, settings)
+        track, off_m = tracker.run(), tracker.outside_m()
+        track = replace(track, outline_moved_m=moved_m)
+        if abs(off_m) <= allowed_m or abs(moved_m + off_m) > _MOST_MOVED * body.radius_m:
+            break
+        moved_m += off_m
+    return track
 
 
 def track_without_suspects(
-    sets: ScanSets,
-    fixed: FixedScanners,
-    robot: Robot,
-    scanners: tuple[Scanner, ...],
+    sets: ScanSets, fixed: FixedScanners, robot: Robot, scanners: tuple[Scanner, ...],
     settings: LaserSettings | None = None,
-) -> tuple[LaserTrack, dict[str, FloatArray]]:
+) -> tuple[LaserTrack, dict[str, FloatArray]]:  # fmt: skip
     """Follow the robot, excluding scanners whose readings disagree with the others'.
 
     They are excluded one at a time, the worst first, and only while at least three scanners remain.

@@ -153,15 +153,9 @@ def new_points(
 
 @kernel()
 def _face_of(
-    x: float,
-    y: float,
-    bx: float,
-    by: float,
-    range_m: float,
-    faces: FloatArray,
-    normal: FloatArray,
-    gate_m: float,
-) -> int:
+    x: float, y: float, bx: float, by: float, range_m: float, faces: FloatArray,
+    normal: FloatArray, gate_m: float,
+) -> int:  # fmt: skip
     """The face that a reading at (x, y) belongs to, -1 for none; (bx, by) is its beam's direction.
 
     Of faces turned to the scanner that which the beam meets first; where its range is not given
@@ -237,15 +231,9 @@ class _NormalEquations(NamedTuple):
 
 @kernel()
 def _normal_equations(
-    seen: NewReadings,
-    faces: FloatArray,
-    normal: FloatArray,
-    pose: FloatArray,
-    origins: FloatArray,
-    sigmas_m: FloatArray,
-    fit: OutlineFit,
-    nearest: bool,
-) -> _NormalEquations:
+    seen: NewReadings, faces: FloatArray, normal: FloatArray, pose: FloatArray,
+    origins: FloatArray, sigmas_m: FloatArray, fit: OutlineFit, nearest: bool,
+) -> _NormalEquations:  # fmt: skip
     """The normal equations at a pose; `nearest`: readings belong to the nearest faces."""
     points, scanner, direction, range_m = seen
     many = sigmas_m.size
@@ -297,13 +285,9 @@ def _normal_equations(
 
 @kernel()
 def refine_outline(
-    seen: NewReadings,
-    faces: FloatArray,
-    start: FloatArray,
-    origins: FloatArray,
-    sigmas_m: FloatArray,
-    fit: OutlineFit,
-) -> OutlinePose:
+    seen: NewReadings, faces: FloatArray, start: FloatArray, origins: FloatArray,
+    sigmas_m: FloatArray, fit: OutlineFit,
+) -> OutlinePose:  # fmt: skip
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
@@ -350,17 +334,9 @@ def refine_outline(
         covariance = turned @ np.ascontiguousarray(turn_world.T)
         calibration = -turned @ at.cross
     return OutlinePose(
-        pose,
-        covariance,
-        calibration,
-        at.used,
-        at.chi2,
-        open_count,
-        rms,
-        weak,
-        at.information,
+        pose, covariance, calibration, at.used, at.chi2, open_count, rms, weak, at.information,
         at.gradient,
-    )
+    )  # fmt: skip
 
 
 @kernel()

@@ -1,41 +1,49 @@
 """Scans of an area at rest, and the pose of scanners from the walls of the building.
 
-Drawings differ from buildings by centimetres. Single scanners fit such a map too well: they see a
-few walls only, and readings of the others look like those of objects. So if the walls are off the
-map, all scanners are aligned with it as one body, whose shape is that of their mutual alignment.
-All readings of a wall share its error.
+Drawings differ from buildings by centimetres. Scanners would fit the few walls that they see too
+well, and readings of the others would look like those of objects. So the walls' offsets from the
+map are estimated with the poses of all fixed scanners.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from contextlib import suppress
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.sparse import csr_array
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.lasers.tracking_kernels import NewReadings, OutlineFit, refine_outline
-from redetect.plane import apply, compose, invert, rotation
+from redetect.groundtruth.trajectories.streams import pose_differences
+from redetect.landmarks import wrap_angle
+from redetect.plane import compose, rotation
 
 #: Least joint standard deviation of readings, wall and map (m).
 FLOOR_M = 0.001
-_LONE_STEPS = 30
-# Walls are compared with the map by readings this near them, this number on each at least.
-_NEAR_WALL_M = 0.15
-_LEAST_ON_WALL = 4
-_MOST_READINGS = 0.8
-# A map is not exact if, with each scanner fitted to it by itself, not even most readings are on
-# walls that are less off than this.
-_EXACT_MAP_M = 0.001
-# Least share of readings near walls if a scanner cannot be fitted by itself.
-_LEAST_NEAR = 0.6
-# A fit rejects what is this many of the walls' deviations off, divided by three.
-_WALL_SIGMAS = 1.5
+# Of the fit of scanners to the map: the gate of readings, the lower bound of the cosine between
+# beam and normal, and the fewest readings.
+_GATE_SIGMA, _LEAST_COSINE, _LEAST_READINGS = 3.0, 0.25, 10
+# Standard deviations of the walls' offsets that are tried, what is assumed while the gate narrows
+# (m), the least decrease of the deviance by walls that are off, and the largest factor on the
+# covariance where few walls determine it.
+_MAP_SIGMAS_M, _LIKELY_MAP_SIGMA_M = np.geomspace(1e-4, 0.3, 80), 0.02
+_MAP_EVIDENCE, _MOST_INFLATED = 7.0, 9.0
+# Steps at each gate, most steps afterwards, and the change (m, rad) that ends them.
+_STEPS_PER_GATE, _MOST_STEPS, _SETTLED = 3, 15, 1e-6
+_SIGMA_PER_MEDIAN = 1.4826  # Of a normal distribution
+# Of the grid of starts: standard deviations from the measured pose, number of readings, largest
+# cost of that deviation, and the difference (m, rad) up to which poses are the same.
+_START_SIGMAS, _COARSE_READINGS, _LARGEST_PRIOR_COST, _SAME_POSE = 1.5, 240, 50.0, 2e-3
+# Change of a mount (m, rad) for derivatives.
+_DIFFERENCE = 1e-5
+# Length (m) that a turn of a radian corresponds to, where directions are compared.
+_TURN_ARM_M = 3.0
 
 
 class StillScan(NamedTuple):
@@ -73,87 +81,6 @@ def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
     return StillScan(mean, direction, max(scanner.sigma_m, 0.003) / math.sqrt(readings))
 
 
-class WallFit(NamedTuple):
-    """Pose of rigidly connected scanners, from the walls that they see."""
-
-    pose: FloatArray  # (3,): of their common frame on the map
-    covariance: FloatArray  # (3, 3): from the residuals' size and the geometry
-    by_mounts: FloatArray  # (3, 3 scanners): derivative of the pose by theirs in the common frame
-    used: int  # Number of readings used
-    rms_m: float  # Of their distances from the walls
-    open_directions: int  # Number of directions that the walls do not determine
-
-
-def fit_to_walls(
-    scans: Sequence[StillScan],
-    mounts: FloatArray,
-    walls: FloatArray,
-    start: FloatArray,
-    gate_m: float,
-    narrowing_m: Sequence[float],
-    weak_sigma_m: float,
-) -> WallFit:
-    """Most likely pose of scanners on the map, near a start.
-
-    A reading belongs to the wall that its beam meets first. Readings of objects in front of a wall
-    are far from the wall that the beam would hit, and are excluded as the fit narrows.
-
-    Parameters
-    ----------
-    scans : sequence of StillScan
-        One of each scanner.
-    mounts : (scanners, 3) float64
-        Poses of the scanners in their common frame.
-    walls : (S, 4) float64
-        Pieces of wall on the map, seen from both sides (m).
-    start : (3,) float64
-        Of the common frame on the map.
-    gate_m : float
-        Largest distance of a reading from its wall at first.
-    narrowing_m : sequence of float
-        Joint standard deviations of readings, wall and map as the fit narrows; readings farther
-        away than three of them are rejected. In the last step the residuals determine it.
-    weak_sigma_m : float
-        Directions along which the standard deviation would be larger are undetermined, and are
-        held at the start.
-
-    Raises
-    ------
-    GeometryError
-        If fewer than ten readings match walls.
-    """
-    # The kernel moves faces onto points: here the map into the scanners' frame.
-    faces = np.vstack([walls, walls[:, [2, 3, 0, 1]]])
-    seen = NewReadings(
-        np.concatenate([apply(mount, scan.points) for mount, scan in zip(mounts, scans)]),
-        np.repeat(np.arange(len(scans)), [len(scan.range_m) for scan in scans]),
-        np.concatenate([s.direction @ rotation(m[2]).T for m, s in zip(mounts, scans)]),
-        np.concatenate([scan.range_m for scan in scans]),
-    )
-    origins, sigmas = mounts[:, :2].copy(), np.array([scan.sigma_m for scan in scans])
-    pose, ratio = invert(start), 1.0
-    for floor in (*narrowing_m, None):
-        floor = max(FLOOR_M, narrowing_m[-1] * math.sqrt(ratio)) if floor is None else floor
-        fit = OutlineFit(floor, 0.25, 3.0, gate_m, 0.5, weak_sigma_m, 1.0, _LONE_STEPS)
-        found = refine_outline(seen, faces, pose, origins, sigmas, fit)
-        if found.used < 10:
-            raise GeometryError(f"{found.used} readings lie on the map: expected 10 or more")
-        pose, ratio = found.pose, found.chi2 / (found.used - 3.0)
-    world = invert(pose)
-    # The inverse's derivatives: x' = -R' t and theta' = -theta.
-    c, s = math.cos(world[2]), math.sin(world[2])
-    jacobian = np.array([[-c, s, world[1]], [-s, -c, -world[0]], [0.0, 0.0, -1.0]])
-    covariance = max(ratio, 0.1) * jacobian @ found.covariance @ jacobian.T
-    return WallFit(
-        world,
-        0.5 * (covariance + covariance.T),
-        jacobian @ found.by_scanner,
-        found.used,
-        found.rms_m,
-        found.open_directions,
-    )
-
-
 def first_walls(
     origin: FloatArray, directions: FloatArray, walls: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -173,92 +100,221 @@ def first_walls(
     return far[rows, first], first, cosines
 
 
-class WallOffsets(NamedTuple):
-    """By how much walls are off the map, according to the readings that they reflect."""
+class MapFit(NamedTuple):
+    """Poses of scanners, or of a body with scanners, on a map whose walls may be off."""
 
-    # What the offsets do not exceed for most readings, and their root mean square (m); 0 if no wall
-    # is seen well.
-    most_m: float
-    rms_m: float
-    near: float  # Share of the readings that are near walls
-    readings_per_wall: float  # Mean number of readings on the wall of a reading
+    poses: FloatArray  # (poses, 3)
+    covariance: FloatArray  # (3 poses, 3 poses): jointly
+    map_sigma_m: float  # Standard deviation of the offsets of the walls' ends; 0 if exact
+    used: IntArray  # (poses,): number of readings on walls
+    rms_m: FloatArray  # (poses,): of their distances from the walls
+    open_directions: IntArray  # (poses,): number of directions that walls do not determine
+    by_mounts: FloatArray  # (3, 3 scanners): derivative of a body's pose by its scanners' mounts
 
 
-def wall_offsets(scans: Sequence[StillScan], poses: FloatArray, walls: FloatArray) -> WallOffsets:
-    """Compare the map with readings of scanners at poses (scanners, 3) on it.
+class _OnWalls(NamedTuple):
+    """Readings of scanners that lie on walls of a map, at given poses."""
 
-    `walls` (S, 4). A reading belongs to the wall that its beam meets first; readings far off are of
-    other things.
+    cost: float  # Squared normalised distances of all readings, those of others as at the gate
+    body: IntArray  # (N,): index of the pose
+    wall: IntArray  # (N,)
+    share: FloatArray  # (N,): of the wall's length, from its first end
+    error_m: FloatArray  # (N,): distances from the walls
+    rest_m: FloatArray  # (N,): from the walls moved by their offsets
+    weight: FloatArray  # (N,): inverse variances
+    by_pose: FloatArray  # (N, 3): derivatives of the distances by the pose
+
+
+class _Solution(NamedTuple):
+    """Least squares of poses and the offsets of walls, at one linearisation."""
+
+    step: FloatArray  # (poses, 3)
+    offsets_m: FloatArray  # (S, 2)
+    map_sigma_m: float
+    covariance: FloatArray  # (3 poses, 3 poses)
+
+
+class MapProblem(NamedTuple):
+    """Scanners at rest on a map whose walls may be off.
+
+    Readings of a wall share its error: the offsets of each wall's two ends, along its normal, are
+    unknowns of the same adjustment, with a standard deviation that is estimated as well. All
+    scanners are fitted together, since they see the same walls.
     """
-    wall, off = [], []
-    for scan, pose in zip(scans, poses):
-        far, first, cosines = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, walls)
-        wall.append(first)
-        off.append((scan.range_m - far) * cosines)
-    walls_met, offs = np.concatenate(wall), np.concatenate(off)
-    near = np.abs(offs) < _NEAR_WALL_M
-    walls_met, offs = walls_met[near], offs[near]
-    counts = np.bincount(walls_met)
-    seen = np.flatnonzero(counts >= _LEAST_ON_WALL)
-    if not len(seen):
-        return WallOffsets(0.0, 0.0, 0.0, 1.0)
-    medians = np.array([abs(float(np.median(offs[walls_met == k]))) for k in seen])
-    order = np.argsort(medians)
-    weights = counts[seen][order].astype(np.float64)
-    weights = np.cumsum(weights / weights.sum())
-    most = medians[order][np.searchsorted(weights, _MOST_READINGS)]
-    return WallOffsets(
-        float(most),
-        float(np.sqrt(np.average(medians**2, weights=counts[seen]))),
-        float(np.mean(near)),
-        float(np.sum(counts**2) / np.sum(counts)),
-    )
+
+    scans: Sequence[StillScan]  # One of each scanner
+    measured: FloatArray  # (poses, 3): measured by hand
+    prior: FloatArray  # (3 poses, 3 poses): information of the measured poses
+    walls: FloatArray  # (S, 4): pieces of wall, seen from both sides (m)
+    # (scanners, 3): poses on one body, the only pose; otherwise each scanner has a pose.
+    mounts: FloatArray | None = None
+
+    def fit(self, starts: FloatArray, narrowing_m: Sequence[float], weak_sigma_m: float) -> MapFit:
+        """The most likely poses near starts.
+
+        Parameters
+        ----------
+        starts : (poses, 3) float64
+            Where the fit begins.
+        narrowing_m : sequence of float
+            Joint standard deviations of readings and walls as the fit narrows; readings farther
+            away than three of them are rejected.
+        weak_sigma_m : float
+            Directions along which the readings leave a larger standard deviation are undetermined.
+
+        Raises
+        ------
+        GeometryError
+            If fewer than ten readings match walls.
+        """
+        poses, offsets, _ = self._narrowed(starts, narrowing_m)
+        # Walls are not straight to a millimetre everywhere.
+        usual = np.median(np.abs(self._on_walls(poses, offsets, min(narrowing_m)).rest_m))
+        floor = max(FLOOR_M, _SIGMA_PER_MEDIAN * float(usual))
+        for _ in range(_MOST_STEPS):
+            on = self._on_walls(poses, offsets, floor)
+            found = self._solved(on, poses, None)
+            poses, offsets = poses + found.step, found.offsets_m
+            if np.abs(found.step).max() < _SETTLED:
+                break
+        # Again with the weights that the residuals suggest.
+        ratio = float(np.sum(on.weight * on.rest_m**2)) / max(len(on.rest_m) - poses.size, 1)
+        found = self._solved(on._replace(weight=on.weight / max(ratio, 0.1)), poses, None)
+        used = np.bincount(on.body, minlength=len(poses))
+        squares = np.bincount(on.body, weights=on.rest_m**2, minlength=len(poses))
+        by_mounts = []
+        for change in _DIFFERENCE * np.eye(0 if self.mounts is None else self.mounts.size):
+            moved = self._replace(mounts=self.mounts + change.reshape(-1, 3))
+            on = moved._on_walls(poses, offsets, floor)
+            by_mounts.append(self._solved(on, poses, found.map_sigma_m).step.ravel() / _DIFFERENCE)
+        scale, parts = np.array([1.0, 1.0, _TURN_ARM_M]), range(0, poses.size, 3)
+        of_readings = [
+            np.linalg.inv(found.covariance[k : k + 3, k : k + 3]) - self.prior[k : k + 3, k : k + 3]
+            for k in parts
+        ]
+        values = np.linalg.eigvalsh(np.array(of_readings) / np.outer(scale, scale))
+        poses[:, 2] = wrap_angle(poses[:, 2])
+        rms, is_open = np.sqrt(squares / np.maximum(used, 1)), values < 1.0 / weak_sigma_m**2
+        covariance, of_mounts = found.covariance, np.array(by_mounts).T
+        return MapFit(
+            poses, covariance, found.map_sigma_m, used, rms, is_open.sum(axis=1), of_mounts
+        )
+
+    def likely_pose(
+        self, aligned: FloatArray, narrowing_m: Sequence[float]
+    ) -> tuple[FloatArray, FloatArray]:
+        """The pose (3,) near which readings and measured pose of the only scanner are most likely.
+
+        From a grid of starts around the measured pose, and the one by which it is `aligned` with
+        others (3,). Also returns the covariance (3, 3) of other places that are about as likely.
+        """
+        scan, measured = self.scans[0], self.measured[0]
+        every = max(1, len(scan.range_m) // _COARSE_READINGS)
+        thin = StillScan(scan.range_m[::every], scan.direction[::every], scan.sigma_m)
+        coarse = self._replace(scans=[thin])
+        wide = _START_SIGMAS / np.sqrt(np.diag(self.prior))
+        grid = [measured + wide * shift for shift in product((0.0, -1.0, 1.0), repeat=3)]
+        found: list[tuple[float, FloatArray]] = []
+        for start in (aligned, *grid):
+            with suppress(GeometryError):
+                poses, _, cost = coarse._narrowed(start[None], narrowing_m)
+                if not any(np.allclose(poses[0], other, atol=_SAME_POSE) for _, other in found):
+                    found.append((cost, poses[0]))
+        if not found:
+            raise GeometryError("hardly any readings lie on the map")
+        best, pose = min(found, key=lambda entry: entry[0])
+        weights = np.exp([0.5 * (best - cost) for cost, _ in found])
+        apart = pose_differences(np.stack([other for _, other in found]), pose)
+        return pose, (weights[:, None] * apart).T @ apart / weights.sum()
+
+    def _narrowed(
+        self, starts: FloatArray, narrowing_m: Sequence[float]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Poses, offsets of the walls' ends, and cost, as the gate of readings narrows."""
+        poses, offsets, cost = starts, np.zeros((len(self.walls), 2)), math.inf
+        for floor in np.repeat(narrowing_m, _STEPS_PER_GATE):
+            on = self._on_walls(poses, offsets, floor)
+            # Walls may be off meanwhile, or what is on them would be rejected.
+            likely = min(floor, _LIKELY_MAP_SIGMA_M)
+            found = self._solved(on, poses, likely)
+            poses, offsets = poses + found.step, found.offsets_m
+            missing = pose_differences(poses, self.measured).ravel()
+            cost = on.cost + float(np.sum(offsets**2)) / likely**2
+            cost += min(float(missing @ self.prior @ missing), _LARGEST_PRIOR_COST)
+        return poses, offsets, cost
+
+    def _on_walls(self, poses: FloatArray, offsets_m: FloatArray, floor_m: float) -> _OnWalls:
+        """Readings on the walls that their beams meet first, moved by `offsets_m` (S, 2)."""
+        found: list[list[NDArray[Any]]] = []
+        cost = 0.0
+        for k, scan in enumerate(self.scans):
+            body = k if self.mounts is None else 0
+            pose = poses[body] if self.mounts is None else compose(poses[0], self.mounts[k])
+            rays = scan.direction @ rotation(pose[2]).T
+            far, first, cosines = first_walls(pose[:2], rays, self.walls)
+            along = self.walls[first, 2:] - self.walls[first, :2]
+            length = np.hypot(*along.T)
+            normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / length[:, None]
+            points = pose[:2] + scan.range_m[:, None] * rays
+            apart, arm = points - self.walls[first, :2], points - poses[body, :2]
+            share = np.clip(np.sum(apart * along, axis=1) / length**2, 0.0, 1.0)
+            error = np.sum(apart * normal, axis=1)
+            rest = error - (1.0 - share) * offsets_m[first, 0] - share * offsets_m[first, 1]
+            weight = 1.0 / ((scan.sigma_m * np.maximum(cosines, _LEAST_COSINE)) ** 2 + floor_m**2)
+            squared = np.where(np.isfinite(far), weight * rest**2, np.inf)
+            cost += float(np.sum(np.minimum(squared, _GATE_SIGMA**2)))
+            turn = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
+            rows = (np.full(len(first), body), first, share, error, rest, weight)
+            near = squared < _GATE_SIGMA**2
+            found.append([v[near] for v in (*rows, np.column_stack([normal, turn]))])
+        columns = [np.concatenate(column) for column in zip(*found)]
+        if len(columns[0]) < _LEAST_READINGS:
+            raise GeometryError(
+                f"{len(columns[0])} readings lie on the map: expected {_LEAST_READINGS} or more"
+            )
+        return _OnWalls(cost, *columns)
+
+    def _solved(self, on: _OnWalls, poses: FloatArray, map_sigma_m: float | None) -> _Solution:
+        """Solve for poses and offsets of the seen walls; without `map_sigma_m`, for that too."""
+        missing = pose_differences(poses, self.measured).ravel()
+        seen, index = np.unique(on.wall, return_inverse=True)
+        count, rows = poses.size, np.arange(len(on.error_m))
+        columns = [*(3 * on.body + c for c in range(3)), count + 2 * index, count + 2 * index + 1]
+        values = [*on.by_pose.T, on.share - 1.0, -on.share]
+        jacobian = csr_array(
+            (np.concatenate(values), (np.tile(rows, 5), np.concatenate(columns))),
+            shape=(len(rows), count + 2 * len(seen)),
+        )
+        weighted = jacobian.multiply(on.weight[:, None]).T.tocsr()
+        h, g = (weighted @ jacobian).toarray(), weighted @ on.error_m
+        own = np.linalg.inv(h[:count, :count] + self.prior)
+        of_poses = own @ (g[:count] + self.prior @ missing)
+        by_offsets = own @ h[:count, count:]
+        rest = h[count:, count:] - h[count:, :count] @ by_offsets
+        gradient = g[count:] - h[count:, :count] @ of_poses
+        inflation = 1.0
+        if map_sigma_m is None:
+            map_sigma_m, inflation = _map_sigma(rest, gradient)
+        of_offsets = np.linalg.inv(rest + np.eye(len(rest)) / max(map_sigma_m, 1e-6) ** 2)
+        offsets = np.zeros((len(self.walls), 2))
+        offsets[seen] = -(of_offsets @ gradient).reshape(-1, 2)
+        step = -of_poses - by_offsets @ offsets[seen].ravel()
+        covariance = own + inflation * by_offsets @ of_offsets @ by_offsets.T
+        return _Solution(step.reshape(-1, 3), offsets, map_sigma_m, covariance)
 
 
-class BodyOnMap(NamedTuple):
-    """All scanners on a map that is not exact."""
+def _map_sigma(h: FloatArray, g: FloatArray) -> tuple[float, float]:
+    """The most likely standard deviation of offsets (m), and a factor on covariances due to it.
 
-    map_sigma_m: float  # Standard deviation of the walls' offsets from the map
-    poses: FloatArray  # (scanners, 3)
-    covariance: FloatArray  # (3 scanners, 3 scanners): of their poses, jointly
-    fit: WallFit  # Of the body
-
-
-def body_on_inexact_map(
-    scans: Sequence[StillScan],
-    alone: Sequence[WallFit | None],
-    whole: FloatArray,
-    walls: FloatArray,
-    narrowing_m: Sequence[float],
-    gate_m: float,
-    weak_sigma_m: float,
-) -> BodyOnMap | None:
-    """The scanners' poses as one body, if the walls are off the map; None if the map is exact.
-
-    `alone`: each scanner fitted to the map by itself; None if that failed. `whole` (scanners, 3):
-    poses of their mutual alignment, after an alignment with the map as one body. The others as for
-    `fit_to_walls`.
+    `h`, `g`: normal equations of the offsets whatever the poses (restricted maximum likelihood).
     """
-    offsets = wall_offsets(scans, whole, walls)
-    sigma = offsets.rms_m
-    fitted = [fit for fit in alone if fit is not None]
-    if len(fitted) == len(scans):
-        by_itself = wall_offsets(scans, np.stack([fit.pose for fit in fitted]), walls)
-        if by_itself.most_m < _EXACT_MAP_M:
-            return None
-        sigma = max(sigma, by_itself.rms_m)
-    elif offsets.near < _LEAST_NEAR or sigma < _EXACT_MAP_M:
-        # Then the measured poses are wrong, and not the map.
-        return None
-    wide = [one for one in narrowing_m if one > _WALL_SIGMAS * sigma]
-    fit = fit_to_walls(
-        scans, whole, walls, np.zeros(3), gate_m, (*wide, _WALL_SIGMAS * sigma), weak_sigma_m
-    )
-    poses = compose(np.broadcast_to(fit.pose, whole.shape), whole)
-    arms = poses[:, :2] - fit.pose[:2]
-    derivatives = np.tile(np.eye(3), (len(scans), 1, 1))
-    derivatives[:, 0, 2], derivatives[:, 1, 2] = -arms[:, 1], arms[:, 0]
-    stacked = derivatives.reshape(-1, 3)
-    common = stacked @ (offsets.readings_per_wall * fit.covariance) @ stacked.T
-    own = [np.zeros((3, 3)) if one is None else one.covariance for one in alone]
-    return BodyOnMap(sigma, poses, common + block_diag(*own), fit)
+    values, vectors = np.linalg.eigh(h)
+    values, variances = np.maximum(values, 0.0), _MAP_SIGMAS_M[:, None] ** 2
+    gain = variances / (1.0 + variances * values)
+    deviance = np.sum(np.log1p(variances * values) - (vectors.T @ g) ** 2 * gain, axis=1)
+    best = int(np.argmin(deviance))
+    if deviance[best] > -_MAP_EVIDENCE:
+        return 0.0, 1.0
+    # Few walls hardly determine it: then errors have Student's distribution.
+    freedom = float(np.sum(gain[best] * values))
+    return float(_MAP_SIGMAS_M[best]), freedom / max(freedom - 2.0, freedom / _MOST_INFLATED)

@@ -8,7 +8,7 @@ with which most others agree determines the wrong markers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -228,10 +228,10 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
     settings = problem.settings
-    found = _refined(problem, _starts(problem)[:1])
+    found = _distinct(refined_poses(problem, _starts(problem)[:1]))
     # Least squares may not have reached the right minimum from the solver's start.
     if not found or np.any(_disagreeing(found[0], settings)):
-        found = _refined(problem, _starts(problem) + _own_poses(problem))
+        found = _distinct(refined_poses(problem, _starts(problem) + _own_poses(problem)))
     if found and not np.any(_disagreeing(found[0], settings)):
         views = np.ones(problem.views, dtype=np.bool_)
     else:
@@ -239,7 +239,7 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
         found = [refined]
     alone = problem.only(views)
     starts = _starts(alone)[:1] + _mirrored(alone)
-    minima = _distinct(found + _refined(alone, starts))
+    minima = _distinct(found + refined_poses(alone, starts))
     best = minima[0]
     # Squared residuals may be larger than their covariances imply.
     inflation = max(1.0, best.cost / max(1, best.degrees_of_freedom))
@@ -283,12 +283,8 @@ def _mirrored(problem: PoseProblem) -> list[FloatArray]:
     return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
 
 
-def _refined(problem: PoseProblem, starts: Sequence[FloatArray]) -> list[RefinedPose]:
-    """Distinct minima below the starts, the best first."""
-    return _distinct(refined_poses(problem, starts))
-
-
 def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
+    """Those that differ, the best first."""
     kept: list[RefinedPose] = []
     for pose in sorted(minima, key=lambda pose: pose.cost):
         if np.abs(pose.world_from_robot).max() < _FARTHEST_M and not any(

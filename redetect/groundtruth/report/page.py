@@ -21,8 +21,8 @@ from redetect.groundtruth.report.pictures import (
     stages_figure,
 )
 from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
+from redetect.groundtruth.validation import scoring
 from redetect.groundtruth.validation.reference_poses import Dimension, SurveyedFiducials
-from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, score_poses, sigma_of
 from redetect.plane import apply, fitted
 from redetect.reporting.page import Part, Section, image_part, page_of
 
@@ -36,6 +36,7 @@ _LOOKS: dict[str, tuple[str, tuple[float, ...]]] = {
     "truth": ("#222222", (1, 3)),
 }
 _MOST_ROWS = 40
+_NEES_COLUMN = 9
 _ELLIPSES = 60
 # Width and height of the validation's plots on the page.
 _VALIDATION_PX = (864, 410)
@@ -109,7 +110,9 @@ def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
     ]
     head = ("dimension", "drawn / m", "measured / m", "drawn minus measured / mm")
     caption = "Dimensions in the drawing and measured in the building"
-    words = f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma_of(off):.1f} mm, "
+    words = (
+        f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {scoring.sigma_of(off):.1f} mm, "
+    )
     words += f"worst {np.abs(off).max():.1f} mm."
     return [table(caption, head, rows), Part("text", words)]
 
@@ -210,7 +213,7 @@ def _errors(inputs: Inputs) -> list[Part]:
             Part("note", "No truth in the session: give it by --truth to see errors over time.")
         ]
     rows: list[tuple[str, ...]] = []
-    place, turn, faults = [], [], []
+    place, turn, faults, outside = [], [], [], []
     compared = [
         (STREAMS.get(name, name), name, in_visits(poses, inputs.visits))
         for name, poses in _all_streams(inputs).items()
@@ -225,7 +228,11 @@ def _errors(inputs: Inputs) -> list[Part]:
             rows.append((label, "0", *("-",) * 9))
             faults.append(Part("problem", f"{label}: {fault}"))
             continue
-        rows.append((label, *_score_words(score_poses(mine, theirs))))
+        score = scoring.score_poses(mine, theirs)
+        low, high = scoring.normalised_band(max(score.normalised, 1))
+        if score.normalised and not low <= score.normalised_error <= high:
+            outside.append((len(rows), _NEES_COLUMN))
+        rows.append((label, *_score_words(score)))
         if name:
             error = pose_differences(mine.poses, theirs.poses)
             look = (label, *_LOOKS[name], mine.times_s)
@@ -239,11 +246,11 @@ def _errors(inputs: Inputs) -> list[Part]:
     if inputs.odometry is not None:
         caption += "; odometry is aligned with the truth in each visit"
     words = (
-        "NEES / 3 is 1 if covariances are right. Errors of neighbouring poses are correlated, "
-        "so it scatters more than the number of poses suggests."
+        "NEES / 3 is 1 if covariances are right; marked outside of the 95 % interval of "
+        "independent errors. Those of neighbouring poses are correlated, so it scatters more."
     )
     return [
-        table(caption, head, rows),
+        table(caption, head, rows)._replace(marked=tuple(outside)),
         *faults,
         Part("note", words),
         series_figure("Position error over time by visit.", "mm", place, inputs.visits),
@@ -251,7 +258,7 @@ def _errors(inputs: Inputs) -> list[Part]:
     ]
 
 
-def _score_words(score: PoseScore) -> tuple[str, ...]:
+def _score_words(score: scoring.PoseScore) -> tuple[str, ...]:
     return (
         str(score.poses),
         *(f"{1e3 * v:.2f}" for v in (score.position_mean_m, score.position_sigma_m,
@@ -278,7 +285,7 @@ def _validation(inputs: Inputs) -> list[Part]:
               ("angle_mean_rad", "angle_sigma_rad", "angle_max_rad")),
         )
     ]  # fmt: skip
-    for p in PUBLISHED:
+    for p in scoring.PUBLISHED:
         linear = (f"{1e3 * p.position_mean_m:.0f}", f"{1e3 * p.position_sigma_m:.0f}", "-")
         rows.append(
             (f"{p.name} (published)", *linear, f"{p.angle_mean_deg:+.2f}",
@@ -345,19 +352,12 @@ def _clock(inputs: Inputs) -> list[Part]:
     if inputs.clock is None:
         return [Part("note", "No clock.json: all times are assumed to be of one clock.")]
     rows = [
-        (
-            f"{s.from_s:.2f}",
-            f"{s.to_s:.2f}",
-            f"{1e3 * s.offset_s:+.2f}",
-            _number(s.sigma_offset_s, 1e3),
-            f"{1e6 * (s.rate - 1.0):+.1f}",
-            _number(s.sigma_rate, 1e6, 1),
-            f"{math.degrees(s.angle_rad):+.3f}",
-            f"{math.degrees(s.turned_rad):.0f}",
-            s.status,
-        )
+        (f"{s.from_s:.2f}", f"{s.to_s:.2f}", f"{1e3 * s.offset_s:+.2f}",
+         _number(s.sigma_offset_s, 1e3), f"{1e6 * (s.rate - 1.0):+.1f}",
+         _number(s.sigma_rate, 1e6, 1), f"{math.degrees(s.angle_rad):+.3f}",
+         f"{math.degrees(s.turned_rad):.0f}", s.status)
         for s in inputs.clock.segments[:_MOST_ROWS]
-    ]
+    ]  # fmt: skip
     head = (
         "from / s", "to / s", "offset / ms", "sigma", "drift / ppm", "sigma", "angle / deg",
         "turned / deg", "status",
@@ -374,7 +374,7 @@ def _clock(inputs: Inputs) -> list[Part]:
         content.append(clock_figure(words, inputs.clock, inputs.ptpd))
     ptpd = inputs.documents.get("clock.json", {}).get("ptpd")
     if isinstance(ptpd, dict):
-        figures = ", ".join(f"{k} {_value(v)}" for k, v in ptpd.items())
+        figures = ", ".join(f"{k} {_value(v, 3)}" for k, v in ptpd.items())
         content.append(Part("text", f"ptpd: {figures}."))
     return content
 
@@ -417,8 +417,11 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
     content = []
     for name, document in inputs.documents.items():
         # In a file of scanners, this is the version of the format.
-        words = f"{name}: version {_value(document.get('version'))}, "
-        content.append(Part("text", words + f"settings {_value(document.get('settings'))}."))
+        settings = _entry(document, "settings", dict).items()
+        content += [
+            Part("text", f"{name}: version {_value(document.get('version'))}"),
+            Part("list", rows=tuple((f"{k}: {_value(v)}",) for k, v in settings)),
+        ]
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
 
@@ -434,7 +437,9 @@ def _entry(document: dict[str, Any], key: str, kind: type) -> Any:
     return value if isinstance(value, kind) else kind()
 
 
-def _value(value: Any) -> str:
+def _value(value: Any, digits: int = 6) -> str:
+    if isinstance(value, float):
+        return f"{value:.{digits}g}"
     return value if isinstance(value, str) else json.dumps(value)[:2000]
 
 

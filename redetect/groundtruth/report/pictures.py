@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from redetect import plane
 from redetect.array_types import FloatArray
@@ -25,9 +26,6 @@ from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.onboard import OF_A_WALL_M
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 _WIDE_IN, _TALLEST_IN, _SERIES_HIGH_IN = 7.9, 7.9, 2.9
 _MOST_POINTS, _MOST_STAGE_POINTS = 1500, 400
@@ -127,16 +125,13 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
     """(count, P, 2) outlines of evenly spaced 3 sigma ellipses, and their magnification."""
     assert poses.covariances is not None
     chosen = np.unique(np.linspace(0, len(poses) - 1, count).astype(np.int64))
-    values, vectors = np.linalg.eigh(poses.covariances[chosen][:, :2, :2])
-    axes = 3.0 * np.sqrt(np.maximum(values, 0.0))
-    typical = float(np.median(axes[:, 1])) * inches_per_m
+    covariances = poses.covariances[chosen][:, :2, :2]
+    largest = np.maximum(np.linalg.eigvalsh(covariances)[:, 1], 0.0)
+    typical = 3.0 * float(np.median(np.sqrt(largest))) * inches_per_m
     factors = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
     # About a centimetre on the page.
     factor = max((f for f in factors if typical > 0.0 and f * typical <= 0.19), default=1.0)
-    angle = np.linspace(0.0, 2.0 * np.pi, 33)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    outlines = np.einsum("nij,pj->npi", vectors * (factor * axes)[:, None, :], circle)
-    return poses.poses[chosen, None, :2] + outlines, factor
+    return plane.ellipses(poses.poses[chosen, :2], covariances, 3.0 * factor, 32), factor
 
 
 def _area(
@@ -289,12 +284,9 @@ def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
 
 
 def draw_alignment(
-    measured: tuple[Scanner, ...],
-    alignment: Alignment,
-    clouds: list[FloatArray],
-    building: FloatArray,
-    icp_rms_m: list[FloatArray],
-) -> bytes:
+    measured: tuple[Scanner, ...], alignment: Alignment, clouds: list[FloatArray],
+    building: FloatArray, icp_rms_m: list[FloatArray],
+) -> bytes:  # fmt: skip
     """Draw scanners' points on the map for measured and aligned poses; returns a PNG's bytes.
 
     Beside them, `icp_rms_m`: for each scanner, the distances from the map (m) after each step of an

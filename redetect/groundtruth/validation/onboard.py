@@ -22,7 +22,7 @@ from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import StillScan, first_walls, fit_to_walls, still_scan
+from redetect.groundtruth.lasers.walls import MapProblem, StillScan, first_walls, still_scan
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
@@ -33,11 +33,12 @@ ScanStatus = Literal["used", "undetermined", "disagrees", "no scans", "not asked
 
 # The robot is assumed at rest for this long before and after the time of the distances.
 _STILL_S = 0.5
-# Of the fit to the walls (m): its first gate, the standard deviations by which the gate narrows (to
-# three times these), and the largest standard deviation of a direction that is determined.
-_GATE_M = 0.2
+# Of the fit to the walls (m): the standard deviations by which the gate narrows (to three times
+# these), the largest standard deviation of a direction that is determined, and that by which the
+# pose from distances holds the fit, before both are combined (m, rad).
 _NARROWING_M = (0.2 / 3.0, 0.1 / 3.0, 0.05 / 3.0)
 _WEAK_SIGMA_M = 0.05
+_FREE_SIGMA = 0.5
 # Distances and walls disagree if the probability of their difference is below this.
 _DISAGREEMENT_PROBABILITY = 1e-4
 #: Readings farther than this from the wall that their beam meets, and points farther from every
@@ -169,17 +170,17 @@ def refined_by_walls(
     """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
     prior, covariance = distances.pose, distances.covariance
     try:
-        found = fit_to_walls(
-            still.scans, still.mounts, segments, prior, _GATE_M, _NARROWING_M, _WEAK_SIGMA_M
-        )
+        free = np.eye(3) / _FREE_SIGMA**2
+        problem = MapProblem(still.scans, prior[None], free, segments, still.mounts)
+        found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:
         return _unrefined(distances, "no scans", str(error))
-    if found.open_directions:
+    if found.open_directions[0]:
         reason = "the walls do not determine a direction"
         return _unrefined(distances, "undetermined", reason, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
-    apart = pose_differences(found.pose, prior)
+    apart = pose_differences(found.poses[0], prior)
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
     if chdtrc(3, misfit) < _DISAGREEMENT_PROBABILITY:
         reason = (
@@ -193,7 +194,9 @@ def refined_by_walls(
     # Joseph's form remains symmetric and positive definite.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return ReferencePose(distances, pose, combined, "used", "", found.used, found.rms_m, still)
+    return ReferencePose(
+        distances, pose, combined, "used", "", int(found.used[0]), float(found.rms_m[0]), still
+    )
 
 
 class RefinedMounts(NamedTuple):

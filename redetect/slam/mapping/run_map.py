@@ -127,6 +127,7 @@ class LeftOut:
     # Lines without enough parallax in rows of their own, or whose position is lost later.
     lines_without_parallax: int
     line_rows: int  # rows of these lines
+    line_ids: tuple[int, ...]  # their identifiers
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,11 +407,13 @@ def _check_usable(
 def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:
     lines = recording.lines
     identified = sum(map(bool, lines.ids))
+    unused = np.setdiff1d(np.append(placed.ids, placed.unplaced), graph.line_ids)
     return LeftOut(
         rows_without_id=int(np.sum(recording.circles.ids < 0)) + len(lines) - identified,
         discs_seen_once=int(np.sum(graph.disc_row_counts == 1)),
-        lines_without_parallax=len(placed.unplaced) + len(placed.ids) - len(graph.line_ids),
+        lines_without_parallax=len(unused),
         line_rows=identified - len(graph.line_pose),
+        line_ids=tuple(unused.tolist()),
     )
 
 

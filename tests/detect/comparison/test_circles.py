@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,9 +68,13 @@ def test_rows_on_what_is_known_besides_are_told_apart() -> None:
     text = " ".join(format_text(found).split())
     assert "4 of 5 discs of the reference are found, 1 missed, in 2 frames." in text
     assert "1 are on things known to look like a disc, and 1 on nothing known." in text
+    assert "4 of 6 detected rows" in text
+    assert "1 more is on discs that the reference does not list." in text
+    assert re.search(r"largest error mm .* e\.0000 \d \d \d \d+\.\d", text)
     assert "set aside 1" in text
     without = compare(REFERENCE, detected, STANDARD)
     assert (without.extra, without.set_aside, without.on_lookalikes) == (3, 0, None)
+    assert " more " not in without.sentences()[1]
 
 
 def test_a_reference_row_comes_before_an_unlisted_one() -> None:

@@ -105,6 +105,19 @@ def test_another_radius_is_offered(run: Path, capsys: Captured) -> None:
     assert offered == pytest.approx(0.06, rel=0.02)
 
 
+def test_the_other_polarity_is_offered(run: Path, capsys: Captured) -> None:
+    assert main(["circles", str(run), "--radius-m", "0.06", "--polarity", "dark"]) == 0
+    assert "--polarity any finds 48 in 12 of the images" in capsys.readouterr().err
+
+
+def test_a_lower_camera_is_suspected(run: Path, published_cam_text: str, capsys: Captured) -> None:
+    (run / "s.cam").write_text(published_cam_text.replace("1.50354", "1.0"))
+    assert main(["circles", str(run), "--radius-m", "0.06"]) == 0
+    said = capsys.readouterr().err
+    assert number_in(said, "radius seems to be") == pytest.approx(0.06 / 1.50354, rel=0.05)
+    assert "if they are not that small, the camera has another height" in said
+
+
 @pytest.mark.parametrize("radius_m", [0.06, 0.0545, 0.066])
 def test_discs_that_look_larger_or_smaller_are_told(
     run: Path, capsys: Captured, radius_m: float

@@ -91,11 +91,11 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
         reference_lines=Frame(STEP, (vertical(published_camera, -0.4, 0.002),)),
     )
     canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, "x.0001")
-    assert canvas.shape[0] > 288
-    assert canvas[288:].any()
+    assert canvas.shape[0] > 576
+    assert canvas[576:].any()
 
     def colour_at(place: FloatArray) -> NDArray[np.uint8]:
-        u, v = np.rint(place).astype(int)
+        u, v = np.rint(2.0 * place + 0.5).astype(int)
         return np.asarray(canvas[v, u].astype(int))
 
     project = published_camera.project_floor
@@ -122,9 +122,8 @@ def test_without_reference_nothing_is_missed_or_extra(
 ) -> None:
     rows = SeenRows(circles=Frame(STEP, discs((0.2, -1.3))))
     canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS).astype(int)
-    edge = np.rint(published_camera.project_floor(np.array([0.2, -1.3]) + ring(0.1, 32))).astype(
-        int
-    )
+    seen = published_camera.project_floor(np.array([0.2, -1.3]) + ring(0.1, 32))
+    edge = np.rint(2.0 * seen + 0.5).astype(int)
     apart = np.abs(canvas[edge[:, 1], edge[:, 0]] - (0, 170, 255)).sum(axis=1)
     assert np.median(apart) < 120
 
@@ -156,8 +155,7 @@ def test_rows_are_drawn_without_detecting_again(small_run: Path, tmp_path: Path)
         picture = cv2.imread(str(tmp_path / "d" / name))
         grey = read_grey(small_run / "images" / name)
         assert picture is not None
-        marked = changed(np.asarray(picture[:288], np.uint8), grey)
-        assert marked.any() == (name == "s.0001.png")
+        assert changed(np.asarray(picture[:576], np.uint8), grey).any() == (name == "s.0001.png")
     again = tmp_path / "again"
     assert main(["draw", str(small_run), "-o", str(again)]) == 0
     assert (again / "s.0001.png").read_bytes() == (tmp_path / "d" / "s.0001.png").read_bytes()
@@ -197,7 +195,7 @@ def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path
     assert main(["draw", str(small_run), "-o", str(tmp_path / "d"), "--frames", "1"]) == 0
     picture = cv2.imread(str(tmp_path / "d" / "s.0000.png"))
     assert picture is not None
-    green = np.abs(picture[50, 110:150].astype(int) - (60, 220, 60)).sum(axis=1)
+    green = np.abs(picture[101, 221:300].astype(int) - (60, 220, 60)).sum(axis=1)
     assert np.median(green) < 60
 
 

@@ -22,19 +22,22 @@ def marked(canvas: NDArray[np.uint8], above: int = 0) -> tuple[int, int]:
     return int(np.sum(rows > above)), int(np.sum(columns > above))
 
 
-@pytest.mark.parametrize(("columns", "times"), [(320, 1), (768, 1), (2000, 1), (4000, 3)])
+@pytest.mark.parametrize(
+    ("columns", "times"), [(320, 1), (768, 1), (1536, 2), (2250, 3), (4000, 5)]
+)
 def test_strokes_and_words_grow_with_the_picture(columns: int, times: int) -> None:
     canvas = np.zeros((200, columns, 3), np.uint8)
     assert enlargement(canvas) == times
     draw_curve(canvas, np.array([[20.0, 100.0], [200.0, 100.0]]), WHITE)
-    assert times <= marked(canvas, HALF)[0] <= times + 2
+    wide = max(1, times // 2)
+    assert wide <= marked(canvas, HALF)[0] <= wide + 2
     canvas[:] = 0
     draw_text(canvas, "0.98", (20, 100), WHITE)
     small = np.zeros((200, 320, 3), np.uint8)
     draw_text(small, "0.98", (20, 100), WHITE)
     draw_text(small, "far outside", (1e300, -1e300), WHITE)
     for large, usual in zip(marked(canvas), marked(small)):
-        assert large == pytest.approx(times * usual, rel=0.15)
+        assert large == pytest.approx(times * usual, rel=0.2)
 
 
 def test_so_do_legends() -> None:
@@ -44,8 +47,8 @@ def test_so_do_legends() -> None:
     assert np.any(small[9 : 9 + 16, 190:])
     assert not np.any(small[9 + 16 :, 190:])
     large = with_legend(np.zeros((9, 4000, 3), np.uint8), words, 190, 0.38)
-    assert large.shape == (9 + 3 * (14 + 4), 4000, 3)  # one row of them, three times as large
-    assert marked(large)[0] == pytest.approx(3 * marked(small[:25])[0], rel=0.15)
+    assert large.shape == (9 + 5 * (14 + 4), 4000, 3)  # one row of them, five times as large
+    assert marked(large)[0] == pytest.approx(5 * marked(small[:25])[0], rel=0.15)
     assert with_legend(np.zeros((9, 50, 3), np.uint8), [], 190, 0.38).shape == (13, 50, 3)
 
 

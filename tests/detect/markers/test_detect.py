@@ -132,6 +132,25 @@ def test_small_sharpened_tags_are_found(width: float) -> None:
         assert np.abs(found.corners[0] - corners).max() < 0.15
 
 
+def test_the_tone_curve_of_a_camera_moves_no_corner() -> None:
+    corners = view_corners(View(90.0, 35.0, 20.0, 33.0), (80.3, 69.8))
+    markers = [("6x6_250", 7, corners)]
+    light = render((160, 140), markers, dark=12.0, light=180.0, background=60.0, blur=0.8)
+    image = exposed(255.0 * (light / 255.0) ** (1.0 / 2.2), 2.0, np.random.default_rng(0))
+    found = detect_markers(image, ARUCO)
+    assert np.abs(found.corners[0] - corners).max() < 0.06
+    assert normalised_error(found, corners) < 3.0
+
+
+@pytest.mark.parametrize("quiet_cells", [0.2, 0.4])
+@pytest.mark.parametrize("background", [50.0, 110.0])
+def test_a_narrow_quiet_zone_moves_no_corner(quiet_cells: float, background: float) -> None:
+    image, corners = picture(quiet_cells=quiet_cells, background=background)
+    found = detect_markers(image, ARUCO)
+    assert np.abs(found.corners[0] - corners).max() < 0.08
+    assert normalised_error(found, corners) < 3.0
+
+
 def test_sixty_pixels_wide_at_noise_three() -> None:
     errors = []
     for seed in range(20):

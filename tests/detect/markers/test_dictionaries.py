@@ -100,5 +100,14 @@ def test_expected_markers_can_be_chosen() -> None:
     np.testing.assert_array_equal(chosen.patterns[1], marker_dictionary("rawseeds").patterns[31])
     with pytest.raises(DetectError, match="marker 512: not in rawseeds"):
         marker_dictionary("rawseeds").only((512,))
-    with pytest.raises(DetectError, match="no such dictionary"):
-        marker_dictionary("quadratic")
+
+
+def test_names_of_other_programs_are_known() -> None:
+    for name in ("DICT_APRILTAG_36h11", "tag36h11", "36H11"):
+        assert marker_dictionary(name).name == "apriltag_36h11"
+    assert marker_dictionary("DICT_4X4_50").name == "4x4_50"
+    with pytest.raises(
+        DetectError,
+        match=r"no such dictionary of markers: 'aprltag_36h11': did you mean apriltag_36h11\?",
+    ):
+        marker_dictionary("aprltag_36h11")

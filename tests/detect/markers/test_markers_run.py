@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -84,6 +85,11 @@ def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
     summary = detect_run(Job(run, plan, {"markers": folder / "detected.markers"}))
     assert summary.found["markers"] == 3
     assert summary.frames == 3
+
+
+def test_markers_of_another_dictionary_are_told(folder: Path, capsys: Captured) -> None:
+    assert main(["markers", str(folder), "--dictionary", "apriltag_36h11"]) == 0
+    assert re.search("3 squares look like markers, but not of", capsys.readouterr().err)
 
 
 def test_wrong_dictionaries_are_told_before_any_work(folder: Path, capsys: Captured) -> None:

@@ -17,13 +17,22 @@ from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.options import CompareOptions, RowFiles
-from detect.report.figures import binned, rates_over, whitened
+from detect.report.figures import binned, rates_over, repeated, whitened
 from detect.report.page import gather, report_page
+from detect.row_files import SeenRows
 from detect.seen import Sight
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_source
 from detect.sources.poses import SomeFrames
-from redetect.landmarks import CircleLandmark, Frame, Landmark, LineLandmark, Step, read_frames
+from redetect.landmarks import (
+    CircleLandmark,
+    Frame,
+    Landmark,
+    LineLandmark,
+    Step,
+    circle_landmarks,
+    read_frames,
+)
 from tests.detect.commands import Captured, assert_refused, in_browser
 
 GATE = CompareOptions(gate_m=0.1)
@@ -238,8 +247,9 @@ def test_unlisted_verticals_are_no_errors(project_root: Path, tmp_path: Path) ->
     (run / "unlisted.lines").write_text("\n".join(listed) + "\n")
     words = " ".join(reported(run, tmp_path / "with.html").words)
 
-    assert re.search(r"precision of verticals\s+0\.[67]", without)
-    assert re.search(r"precision of verticals\s+1\.000", words)
+    assert re.search(r"precision\s+0\.[67]", without)
+    assert re.search(r"precision\s+1\s", words)
+    assert re.search(r"verticals set aside\s+[1-9]", words)
 
 
 def test_steps_too_long_for_a_map(judged_run: Path, tmp_path: Path) -> None:
@@ -262,8 +272,52 @@ def test_page_without_reference_shows_some_frames(small_run: Path, tmp_path: Pat
     page = reported(small_run, tmp_path / "r.html")
     words = " ".join(" ".join(page.words).split())
     assert "No reference rows" in words
+    assert "Discs against the reference" not in words
     assert "Frame s.0002 (no reference rows)" in words
     assert "threshold 0.4" in words
+
+
+def test_what_a_run_without_truth_lacks(small_run: Path, tmp_path: Path) -> None:
+    """Steps of zeros, tilts, frames without rows in any file; no path then."""
+    step, row = "0 0 0 0 0 0 0 0 0\n", "LANDMARK_C 0.1 -1.2 0.9 1e-4 0 1e-4 -1\n"
+    found = f"STEP s.0000 {step}{row}STEP s.0002 {step}"
+    (small_run / "detected.circles").write_text(found)
+    tilts = "TILT s.0000 0.01 0.02 1e-6 0 1e-6 9\nTILT s.0002 0.01 0.02 1e-6 0 1e-6 1\n"
+    (small_run / "detected.tilt").write_text(tilts)
+    words = " ".join(" ".join(reported(small_run, tmp_path / "r.html").words).split())
+    assert "not processed 1 " in words
+    assert "1 frame not processed: no file has rows of them." in words
+    assert "No odometry: the steps are zeros." in words
+    assert "as seen from the robot" in words
+    assert "along the path" not in words
+    assert "Repeatability" not in words
+    assert "Too few agree in s.0002." in words
+
+
+def test_repeatability_is_that_of_the_rows() -> None:
+    """The step's error, common to all discs of two frames, is not attributed to the rows."""
+    rng = np.random.default_rng(3)
+    sigma, step_sigma = np.array([0.002, 0.005]), np.array([0.02, 0.02, 0.01])
+    variances = (step_sigma**2).tolist()
+    spread = (variances[0], 0.0, variances[1], 0.0, 0.0, variances[2])
+    xy = np.array([[x, y] for x in (-1.0, 0.0, 1.0) for y in (-4.0, -3.0, -2.0)])
+    rows = []
+    for k in range(200):
+        discs = xy + sigma * rng.standard_normal(xy.shape)
+        step = Step(f"s.{k}", *[*(step_sigma * rng.standard_normal(3)).tolist(), *spread])
+        covariance = np.tile(np.diag(sigma**2), (len(xy), 1, 1))
+        landmarks = circle_landmarks(discs, np.full(len(xy), 0.9), covariance)
+        rows.append(SeenRows(circles=Frame(step, landmarks)))
+    found = repeated(rows)
+    assert found is not None
+    assert found.pairs == 199 * len(xy)
+    assert found.per_dof == pytest.approx(1.0, abs=0.06)
+    assert found.rms_m == pytest.approx(found.stated_m, rel=0.05)
+    assert repeated([replace(row, circles=None) for row in rows]) is None
+    lost = [
+        replace(f, step=replace(f.step, cxx=1e6, cyy=1e6)) for row in rows if (f := row.circles)
+    ]
+    assert repeated([SeenRows(circles=frame) for frame in lost]) is None
 
 
 def test_a_source_is_read_twice_however_many_frames_are_shown(judged_run: Path) -> None:
@@ -296,9 +350,9 @@ def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path)
     page = reported(judged_run, tmp_path / "r.html")
     figures = [image["alt"] or "" for image in page.of("img")]
     assert [words.split(",")[0].split(" (")[0] for words in figures] == [
+        "Frame s.0000",
         "Positions of the same disc on the floor",
         "Residuals in units of the covariance that the rows state",
-        "Frame s.0000",
     ]
     words = " ".join(" ".join(page.words).split())
     assert "1 of 1 frames; 9 verticals agree" in words
@@ -328,7 +382,7 @@ def test_everything_from_files_is_escaped(hostile_run: tuple[Path, str], tmp_pat
     assert not page.of("b")
     words = " ".join(page.words)
     assert "<b>&run" in words
-    assert f"Frame {name} (number 1 of discs)" in words
+    assert f"Frame {name} (most discs, number 1 of discs)" in words
     assert any(name in (image["alt"] or "") for image in page.of("img"))
     assert f"</style>{HOSTILE}" in words
     assert "49" not in re.findall(r"\{*49\}*", words)

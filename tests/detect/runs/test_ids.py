@@ -63,6 +63,15 @@ def test_ids_of_rows_and_of_a_map(
     assert len(by_map.keys() & own.keys()) > 0.97 * len(own)
 
 
+def test_the_tilt_may_be_left_out(run: Path, tmp_path: Path) -> None:
+    heads = []
+    for number, flags in enumerate([[], ["--tilt", "none"]]):
+        file = tmp_path / f"{number}.circles"
+        assert main(["circles", str(run), "-o", str(file), *flags]) == 0
+        heads.append(file.read_text().partition("STEP e")[0])
+    assert ["tilt_sigma_deg=None" in head for head in heads] == [False, True]
+
+
 def test_files_of_another_run_are_noticed(
     small_run: Path, project_root: Path, tmp_path: Path, capsys: Captured
 ) -> None:

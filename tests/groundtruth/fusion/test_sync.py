@@ -72,6 +72,22 @@ def test_deviations_are_right() -> None:
     assert np.all(squared < 2.74)
 
 
+@pytest.mark.parametrize("rounded", [False, True])
+def test_slow_or_rounded_odometry_does_not_make_clocks_too_certain(rounded: bool) -> None:
+    """Its path between samples, or within rounding, is unknown: the likelihood has kinks."""
+    errors = []
+    for seed in range(4):
+        clocks = Clocks(offset_s=0.05 * seed, drift=0.0, walk=0.005)
+        odometry, groundtruth = simulate(clocks, seed)
+        poses = odometry.poses.copy()
+        if rounded:
+            poses = np.rint(poses / [0.01, 0.01, 0.01]) * 0.01
+        slow = PlanarPoses(odometry.times_s, poses).only(slice(None, None, 1 if rounded else 5))
+        (found,) = synchronise(slow, groundtruth)
+        errors.append((found.offset_s - clocks.offset_s) / found.sigma_offset_s)
+    assert np.sqrt(np.mean(np.square(errors))) < 1.7
+
+
 def test_a_segment_without_turns_cannot_be_synchronised() -> None:
     straight = simulate(Clocks(turns=False), seed=1)
     (found,) = synchronise(*straight)

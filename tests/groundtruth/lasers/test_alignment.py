@@ -142,6 +142,33 @@ def test_a_corridor_leaves_a_direction_open() -> None:
     assert found.scanners[0].covariance[0, 0] > 0.05**2
 
 
+def test_walls_drawn_slightly_askew_do_not_move_a_scanner_along_a_corridor() -> None:
+    """Where walls that are parallel were drawn as a wedge, some other place fits exactly."""
+    walls = np.array([[-30.0, 0.0, 30.0, 0.0], [-30.0, 3.0, 30.0, 3.0]])
+    drawn = walls + np.array([[0.0, 0.01, 0.0, -0.01], [0.0, 0.0, 0.0, 0.02]])
+    one = scanner("corridor", np.array([0.0, 1.0, 0.2]), max_range_m=12.0)
+    rng = np.random.default_rng(4)
+    empty = Scans(np.arange(50) / 75.0, np.stack([ranges_mm(one, walls, rng) for _ in range(50)]))
+    found = align_scanners(by_hand((one,), SHIFTS[:1]), [empty], drawn)
+    assert found.undetermined == ("corridor",)
+    assert not found.inconsistent
+    error = found.scanners[0].pose - one.pose
+    assert error @ np.linalg.solve(found.scanners[0].covariance, error) < 20.0
+
+
+def test_a_lone_scanner_notices_that_the_drawing_is_off() -> None:
+    """Its few walls could be fitted to a millimetre, by rejecting what contradicts."""
+    lone = (four_scanners()[0],)
+    squared = []
+    for seed in range(8):
+        drawn = ROOM + np.random.default_rng(seed).normal(0.0, 0.02, ROOM.shape)
+        found = align_scanners(by_hand(lone, SHIFTS[:1]), empty_scans(lone, 300 + seed), drawn)
+        assert found.map_sigma_m > 0.002
+        error = found.scanners[0].pose - lone[0].pose
+        squared.append(error @ np.linalg.solve(found.scanners[0].covariance, error) / 3.0)
+    assert float(np.mean(squared)) < 2.5
+
+
 def test_a_still_scan_leaves_out_what_moves() -> None:
     one = four_scanners()[0]
     empty = empty_scans((one,), 5)[0]
@@ -229,6 +256,9 @@ def test_a_drawing_that_is_centimetres_off_is_noticed(
     write_building(tmp_path / "building.csv", drawn)
     assert perform(Lasers(tmp_path)) == 0
     assert "the walls are off the map by some" in capsys.readouterr().err
+    write_building(tmp_path / "building.csv", 1000.0 * ROOM, overwrite=True)
+    assert perform(Lasers(tmp_path, output=tmp_path / "other.json")) == 0
+    assert "of its readings lie on walls of" in capsys.readouterr().err
     path = tmp_path / "aligned.json"
     joint_read = read_joint_covariance(path, read_scanners(path))
     assert joint_read is not None

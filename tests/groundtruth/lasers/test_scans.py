@@ -70,7 +70,7 @@ def test_beams_are_counted_counter_clockwise_from_the_first_angle() -> None:
     [
         ({"readings": 0}, "readings is 0"),
         ({"readings": 10**9}, "readings"),
-        ({"angle_step_rad": -0.01}, "angle_step_rad is -0.01"),
+        ({"angle_step_rad": 0.0}, "angle_step_rad is 0"),
         ({"angle_step_rad": 0.05}, "one turn or less"),
         ({"angle_step_rad": float("nan")}, "angle_step_rad is nan"),
         ({"first_angle_rad": float("inf")}, "first_angle_rad"),
@@ -230,6 +230,20 @@ def test_rows_in_metres_are_read(tmp_path: Path, packed: bool, numbered: bool) -
     np.testing.assert_array_equal(read.times_s, [5.25, 5.5])
     # 81.83 m is more than 65.535 m: none.
     np.testing.assert_array_equal(read.ranges_mm, [[1000, 0, 0], [2500, 3250, 65535]])
+
+
+def test_infinite_readings_are_no_returns_but_infinite_times_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.scans.csv"
+    path.write_text("5.0,1,inf,2\n")
+    np.testing.assert_array_equal(read_scans(path, 3).ranges_mm, [[1000, 0, 2000]])
+    path.write_text("inf,1,2,3\n")
+    with pytest.raises(GroundTruthError, match="'inf': expected a finite number"):
+        read_scans(path, 3)
+
+
+def test_a_scanner_mounted_upside_down_turns_the_other_way() -> None:
+    down = sick(first_angle_rad=np.pi / 2, angle_step_rad=-np.pi / 180)
+    np.testing.assert_allclose(down.angles_rad, -sick().angles_rad)
 
 
 def test_the_real_log_is_read(shared_data: Path) -> None:

@@ -442,10 +442,16 @@ def test_sets_are_averaged_over_a_time_not_over_a_number(
         assert usual_sets_per_pose(replace(track, times_s=slower * track.times_s)) == expected
 
 
-def test_an_outline_that_is_too_large_is_seen_through(
-    scanners: tuple[Scanner, ...], recorded: ScanSets, tables: FixedScanners
+@pytest.mark.parametrize("scale", [0.95, 1.06])
+def test_an_outline_of_a_wrong_size_is_moved_to_the_readings(
+    scale: float, recorded: ScanSets, tables: FixedScanners
 ) -> None:
     exact = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
-    large = track_by_lasers(recorded, tables, Robot(1.06 * FRONTED, 1.0, 1.0))
+    assert exact.outline_moved_m == 0.0
     assert seen_through(exact) < 0.05
-    assert seen_through(large) > 0.08
+    wrong = track_by_lasers(recorded, tables, Robot(scale * FRONTED, 1.0, 1.0))
+    # Its sides are 0.3 m and its ends 0.35 m from its middle.
+    assert wrong.outline_moved_m == pytest.approx(0.325 * (1.0 - scale), abs=0.006)
+    assert seen_through(wrong) < 0.08
+    assert np.array_equal(np.isfinite(exact.poses), np.isfinite(wrong.poses))
+    assert np.nanmedian(np.hypot(*(exact.poses - wrong.poses)[:, :2].T)) < 0.005

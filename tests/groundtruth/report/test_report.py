@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -349,6 +350,22 @@ def test_a_normalised_error_outside_its_band_is_marked(nees: float, marked: bool
     figures = {"normalised_error": nees, "normalised_band": [0.8, 1.2], "poses": 23}
     inputs = Inputs("s", documents={"validation.json": {"figures": figures}})
     assert ('class="problem">23 reference poses' in report_page(inputs, "1").decode()) == marked
+
+
+def test_covariances_that_are_too_small_are_marked(session: Path) -> None:
+    laser = stream(0.003, 0)
+    assert laser.covariances is not None
+    small = PlanarPoses(laser.times_s, laser.poses, laser.covariances / 4.0)
+    write_planar_poses(session / "laser.csv", small, overwrite=True)
+    page = report_page(gather(session), "1").decode()
+    assert len(re.findall(r'<td class="marked">[34]\.\d{3}</td>', page)) == 1
+    assert page.count('class="marked"') == 1
+
+
+def test_settings_are_a_list_of_rounded_numbers() -> None:
+    document = {"version": "1", "settings": {"rms_s": 0.0008657632668993772, "count": 3}}
+    page = report_page(Inputs("s", documents={"clock.json": document}), "1").decode()
+    assert "<li>rms_s: 0.000865763</li><li>count: 3</li>" in page
 
 
 def test_what_was_measured_in_the_building_and_on_board_is_shown(session: Path) -> None:
