@@ -31,8 +31,9 @@ from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
 from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable, VoteShape, VoteTable, cached_disc_table, cached_vote_table
-from lut.outlines import floor_positions
+from lut.outlines import fingerprint, floor_positions
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.tables import ByContent
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
@@ -50,8 +51,8 @@ _FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
 _numbers = lru_cache(maxsize=4)(camera_numbers)
 
 
-@dataclass(frozen=True)
-class CircleDetections:
+@dataclass(frozen=True, eq=False)
+class CircleDetections(ByContent):
     """The discs found in one image, in scan order of their pixels."""
 
     pixels: IntArray  #: (N, 2) pixel (u, v) of each local maximum of the quality
@@ -96,11 +97,16 @@ def detect_circles(
     FrameError
         If the image is not an 8-bit grey image of the camera's size.
     DetectError
-        If the table belongs to the other detector.
+        If the table is for another detector, camera or shape of the discs.
     """
-    if isinstance(table, DiscTable) == settings.refine:
-        owner = "the published detector" if settings.refine else "the default detector"
-        raise DetectError(f"the table is for {owner}: expected disc_table(camera, settings)")
+    kind, shape = (VoteTable, vote_shape) if settings.refine else (DiscTable, disc_shape)
+    if not isinstance(table, kind) or not np.array_equal(
+        table.made_for, fingerprint(camera, shape(settings))
+    ):
+        raise DetectError(
+            f"the {type(table).__name__} is for another detector, camera or other settings, such "
+            "as radius_m: expected disc_table(camera, settings)"
+        )
     image = plain_image(image, (camera.height, camera.width))
     if isinstance(table, DiscTable):
         return _by_quality(image, camera, table, settings)
@@ -172,13 +178,9 @@ def candidates_of(
 
 
 def judged(
-    image: GreyImage,
-    camera: Camera,
-    settings: CircleSettings,
-    candidates: HoughCandidates,
-    noise: float,
-    networks: Networks | None = None,
-) -> Judgement:
+    image: GreyImage, camera: Camera, settings: CircleSettings, candidates: HoughCandidates,
+    noise: float, networks: Networks | None = None,
+) -> Judgement:  # fmt: skip
     """Classify candidates (see `detect.discs.judgement`); parameters as for `candidates_of`.
 
     `networks` defaults to the trained ones.
@@ -250,15 +252,9 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     """The settings on which the table of outlines depends."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
     return DiscShape(
-        inner_radius_m=inner,
-        outer_radius_m=outer,
-        samples=settings.samples,
-        border_px=settings.border_px,
-        far_limit_m_per_px=settings.far_limit_m_per_px,
-        least_pairs=settings.least_pairs,
-        apart_px=settings.apart_px,
-        stride_m=settings.stride * (outer - inner),
-    )
+        inner, outer, settings.samples, settings.border_px, settings.far_limit_m_per_px,
+        settings.least_pairs, settings.apart_px, stride_m=settings.stride * (outer - inner),
+    )  # fmt: skip
 
 
 def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -278,13 +274,6 @@ def refined_covariance(
 
     The covariances of the fits, plus those due to standard deviations of pixels and of the tilt.
     """
-    return np.asarray(
-        refined_covariances(
-            _numbers(camera),
-            np.array(camera.centre, np.float64),
-            np.ascontiguousarray(floor_xy, np.float64),
-            np.ascontiguousarray(fitted, np.float64),
-            sigma_px**2,
-            tilt_sigma_rad**2,
-        )
-    )
+    floor_xy, fitted = (np.ascontiguousarray(each, np.float64) for each in (floor_xy, fitted))
+    centre, variances = np.array(camera.centre, np.float64), (sigma_px**2, tilt_sigma_rad**2)
+    return np.asarray(refined_covariances(_numbers(camera), centre, floor_xy, fitted, *variances))

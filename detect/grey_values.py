@@ -35,8 +35,8 @@ def plain_image(image: GreyImage, shape: tuple[int, int] | None = None) -> GreyI
     if image.ndim != 2 or image.dtype != np.uint8:
         raise FrameError(
             f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 of "
-            "shape (H, W); cv2.cvtColor converts colour, image >> 8 converts 16 bits, and files "
-            "of both are read as they are"
+            "shape (H, W); cv2.cvtColor converts colour, image >> 8 converts 16 bits (files of "
+            "both are read as they are), (255 * image).astype(np.uint8) converts 0.0 to 1.0"
         )
     if shape is not None and image.shape != shape:
         raise FrameError(

@@ -21,6 +21,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from detect.errors import DetectError
 from detect.grey_values import plain_image
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
@@ -34,6 +35,7 @@ from detect.verticals.tracking import NOTHING_BEFORE, Before, LineTracks, follow
 from lut.verticals import VerticalTable
 from redetect.array_types import GreyImage
 from redetect.landmarks import LineLandmark, wrap_angle
+from redetect.tables import ByContent
 
 #: Fates of tracks that are a line, or part of one.
 ACCEPTED, JOINED = FATES[:2]
@@ -42,7 +44,7 @@ _SAME_LINE_RAD = np.radians(0.5)
 
 
 @dataclass(frozen=True, eq=False)
-class LineDetections:
+class LineDetections(ByContent):
     """Detections in one image."""
 
     lines: Lines  # the leftmost is the first, here and elsewhere
@@ -104,9 +106,12 @@ def detect_lines(
     ------
     FrameError
         If the image is not an 8-bit grey image of the table's size.
+    DetectError
+        If the table is another one, such as `detect_circles` takes.
     """
-    height, width = table.column.shape
-    image = plain_image(image, (height, width))
+    if not isinstance(table, VerticalTable):
+        raise DetectError(f"the table is a {type(table).__name__}: expected a VerticalTable")
+    image = plain_image(image, table.column.shape)
     strip, window, band, steps, numbers = _prepared(table, settings)
     response = band_response(image, band, settings.regulariser)
     starts = line_starts(response, band, settings.threshold)

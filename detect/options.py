@@ -18,6 +18,7 @@ from redetect.bounds import (
     ABOVE_0,
     NOT_NEGATIVE,
     SHARE,
+    Bounded,
     MaybeFloat,
     MaybeInt,
     MaybePath,
@@ -25,7 +26,6 @@ from redetect.bounds import (
     MaybeStr,
     NotNegative,
     Positive,
-    demand_fields,
     whole,
 )
 
@@ -36,7 +36,7 @@ DetectorPreset = Literal["default", "published", "report"]
 
 
 @dataclass(frozen=True)
-class SourceOptions:
+class SourceOptions(Bounded, error=DetectError):
     """Options of a source besides its name."""
 
     #: Source of the steps, if not the image source itself: a TUM trajectory (.tum; rows t x y z qx
@@ -51,12 +51,9 @@ class SourceOptions:
     #: Stop after this many frames; 0 for all of them (with a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0, MOST_FRAMES)] = 0
 
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
-
 
 @dataclass(frozen=True, kw_only=True)
-class RunFlags:
+class RunFlags(Bounded, error=DetectError):
     """Options of all commands that process the frames of a run."""
 
     #: Run folder, folder or pattern of images, video or bag, as for `detect circles`.
@@ -65,9 +62,6 @@ class RunFlags:
     camera: MaybePath = None  #: Calibration, if not the one in the run folder.
     force: bool = False  #: Replace existing files.
     source: OmitArgPrefixes[SourceOptions] = field(default_factory=SourceOptions)
-
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +209,7 @@ class All(DetectorFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareOptions:
+class CompareOptions(Bounded, error=CompareError):
     """How detected and reference rows are matched, and which rows count."""
 
     #: Match discs on the floor within this distance, metres. By default they are matched in the
@@ -227,12 +221,9 @@ class CompareOptions:
     #: one are set aside, neither right nor wrong.
     only_identified: bool = False
 
-    def __post_init__(self) -> None:
-        demand_fields(self, CompareError)
-
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(Bounded, error=CompareError):
     """Compare detected rows with reference rows: found, missed, look-alikes, clutter, errors.
 
     Example: detect compare images/e --min-recall 0.9, or: detect compare images/e --lines
@@ -255,9 +246,6 @@ class Compare:
     json: MaybePath = None  #: Write the result as JSON; -: to standard output only.
     force: bool = False  #: Replace an existing JSON file.
     matching: OmitArgPrefixes[CompareOptions] = field(default_factory=CompareOptions)
-
-    def __post_init__(self) -> None:
-        demand_fields(self, CompareError)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from detect.errors import DetectError
 from redetect.bounds import (
     FINITE,
     PROBABILITY,
+    Bounded,
     Bounds,
     Limit,
     MaybeFloat,
@@ -38,7 +39,7 @@ _OUTSIDE = Bounds("more than 1, the disc's edge", lambda x: 1.0 < x < math.inf)
 
 
 @dataclass(frozen=True)
-class CircleSettings:
+class CircleSettings(Bounded, error=DetectError):
     """All settings of the disc detector."""
 
     radius_m: Positive = 0.10  #: Radius of the discs, metres.
@@ -86,9 +87,6 @@ class CircleSettings:
     #: positions if the frame's tilt is unknown. By default what some images of the run show, or 0.3
     #: where they show none.
     tilt_sigma_deg: Annotated[MaybeFloat, from_to(0.0, 90.0)] = None
-
-    def __post_init__(self) -> None:
-        demand_fields(self, DetectError)
 
     @property
     def tilt_sigma_rad(self) -> float:

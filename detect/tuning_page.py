@@ -102,9 +102,9 @@ class TuningSession:
             )
         ]
         rejected = [
-            {**one.record(), "outline": self._outline((one.x_m, one.y_m), settings.radius_m)}
-            for one in explained.candidates
-            if not one.is_disc
+            {**row, "outline": self._outline((row["x_m"], row["y_m"]), settings.radius_m)}
+            for row in explained.records()
+            if row["stage"] != "disc"
         ]
         return {"discs": discs, "rejected": rejected, "suggestions": list(explained.suggestions)}
 

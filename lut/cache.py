@@ -18,21 +18,21 @@ import logging
 import os
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import astuple, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from camera import Camera
-from lut.outlines import DiscShape, DiscTable, build_disc_table
+from lut.outlines import DiscShape, DiscTable, build_disc_table, fingerprint
 from lut.verticals import VerticalTable, build_vertical_table
 from lut.votes import VoteShape, VoteTable, build_vote_table
 from redetect.storage import write_whole
 from redetect.storage.bounded import read_bounded, writable_by_others
 
 #: Incremented with every change of the tables' content or computation.
-TABLE_VERSION = 16
+TABLE_VERSION = 17
 
 Table = TypeVar("Table", DiscTable, VerticalTable, VoteTable)
 
@@ -72,15 +72,11 @@ def cached_vertical_table(camera: Camera, folder: Path | None = None) -> Vertica
 
 
 def _cached(
-    kind: type[Table],
-    name: str,
-    of: tuple[Any, ...],
-    build: Callable[..., Table],
+    kind: type[Table], name: str, of: tuple[Any, ...], build: Callable[..., Table],
     folder: Path | None,
-) -> Table:
-    parts = [str(TABLE_VERSION), of[0].content_hash]
-    parts += [float(value).hex() for shape in of[1:] for value in astuple(shape)]
-    key = hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
+) -> Table:  # fmt: skip
+    content = f"{TABLE_VERSION} {fingerprint(*of).tobytes().hex()}"
+    key = hashlib.sha256(content.encode()).hexdigest()[:32]
     path = (folder or cache_folder()) / f"{name}-{key}.table"
     table = _read(path, kind)
     if table is None:

@@ -10,16 +10,17 @@ the border, and the floor there moves by no more than a given length per image r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import astuple, dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
-from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.messages import OneLineError
 
@@ -85,6 +86,7 @@ class DiscTable:
     pixels: NDArray[np.int32]  # (N, 2) pixel (u, v) of each centre, in scan order
     #: (H, W, 2) floor position (robot X, Y, m) of each pixel; NaN above the horizon
     floor_xy: Float32Array
+    made_for: ByteArray  # `fingerprint` of the camera and the shape
 
     @cached_property
     def groups(self) -> CentreGroups:
@@ -97,6 +99,14 @@ class DiscTable:
         usable = np.zeros(self.floor_xy.shape[:2], np.bool_)
         usable[self.pixels[:, 1], self.pixels[:, 0]] = True
         return usable
+
+
+@lru_cache(maxsize=64)
+def fingerprint(camera: Camera, *shapes: Any) -> ByteArray:
+    """(32,) digest of the numbers that determine a table: of a camera, and of its shape, if any."""
+    numbers = [float(value).hex() for shape in shapes for value in astuple(shape)]
+    digest = hashlib.sha256(" ".join([camera.content_hash, *numbers]).encode()).digest()
+    return np.array(bytearray(digest))
 
 
 def ring(radius_m: float, samples: int) -> FloatArray:
@@ -154,6 +164,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         samples=np.concatenate(samples),
         pixels=np.concatenate(pixels),
         floor_xy=floor_xy.astype(np.float32),
+        made_for=fingerprint(camera, shape),
     )
 
 

@@ -79,19 +79,14 @@ def build_vertical_table(camera: Camera) -> VerticalTable:
     trace_verticals(camera_numbers(camera), bearing, row, elevation_rad, column, elevation)
     first, last, seen = _unbroken(column, row)
     return VerticalTable(
-        anchor_elevation_rad=elevation_rad,
-        anchor_row=row,
-        bearing_rad=bearing,
-        first_row=first,
-        last_row=last,
-        column=np.asfortranarray(np.where(seen, column, np.nan), dtype=np.float32),
-        elevation_tan=np.asfortranarray(
-            np.where(seen, np.tan(elevation), np.nan), dtype=np.float32
-        ),
+        anchor_elevation_rad=elevation_rad, anchor_row=row, bearing_rad=bearing,
+        first_row=first, last_row=last,
+        column=np.asfortranarray(np.where(seen, column, np.nan), np.float32),
+        elevation_tan=np.asfortranarray(np.where(seen, np.tan(elevation), np.nan), np.float32),
         # Like arrays of a cached table, since kernels are compiled for one kind of array only.
         robot_from_camera=np.array(camera.rotation),
         row_aspect=camera.scale_x / camera.scale_y,
-    )
+    )  # fmt: skip
 
 
 def _anchor(camera: Camera, normalised: FloatArray) -> tuple[float, FloatArray]:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from lut.outlines import demand_above_floor, floor_positions, pixels_within, size_down
-from redetect.array_types import Float32Array, FloatArray, IntArray
+from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 #: Width of a cell, radii, and its least length ahead, pixels.
 _CELL_RADII, _CELL_PX = 0.25, 0.8
@@ -56,6 +56,7 @@ class VoteTable(NamedTuple):
     left: float  # left end of column 0
     foot: FloatArray  # (2,) floor position below the camera
     turn: FloatArray  # (2, 2) the directions across and ahead
+    made_for: ByteArray  # `fingerprint` of the camera and the shape
 
 
 def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
@@ -74,6 +75,7 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
         return VoteTable(
             floor_xy.astype(np.float32), False, nothing, np.zeros((0, 0, 6), np.float32), nothing,
             np.zeros(0), nothing, nothing, 0, 1.0, 1.0, 0.0, foot, np.eye(2),
+            fingerprint(camera, shape),
         )  # fmt: skip
     direction = offset[usable].mean(axis=0)
     direction /= max(float(np.hypot(*direction)), 1e-9)
@@ -117,21 +119,15 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     known = np.flatnonzero(last)
     at = np.arange(math.floor((edges[-1] - edges[0]) / step)) + 0.5
     return VoteTable(
-        floor_xy=floor_xy.astype(np.float32),
-        paired=paired,
-        image_row=np.array(image_row),
-        pixel=pixel[image_row],
+        floor_xy=floor_xy.astype(np.float32), paired=paired,
+        image_row=np.array(image_row), pixel=pixel[image_row],
         row_of_step=np.searchsorted(edges, edges[0] + step * at, side="right") - 1,
         ahead=0.5 * (edges[1:] + edges[:-1]),
         first=np.interp(np.arange(len(first)), known, first[known]).astype(np.int64),
         last=np.interp(np.arange(len(last)), known, last[known]).astype(np.int64),
-        columns=int(last.max()) + 3,
-        cell=cell,
-        step=step,
-        left=left,
-        foot=foot,
-        turn=turn,
-    )
+        columns=int(last.max()) + 3, cell=cell, step=step, left=left, foot=foot, turn=turn,
+        made_for=fingerprint(camera, shape),
+    )  # fmt: skip
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:

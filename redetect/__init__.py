@@ -2,7 +2,7 @@
 
 >>> import redetect as rd
 >>> camera = rd.Camera.read("images/e/e.cam")                                  # doctest: +SKIP
->>> found = rd.detect("images/e/images/e.0000.png", camera, radius_m=0.10)     # doctest: +SKIP
+>>> found = rd.detect("images/e/images/e.0000.jpg", camera, radius_m=0.10)     # doctest: +SKIP
 >>> found.discs.xy, found.discs.covariance                                     # doctest: +SKIP
 >>> found.to_dataframe()                                                       # doctest: +SKIP
 
@@ -19,10 +19,11 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from camera import Camera
+    from detect.discs.unfound import Explanation
     from detect.line_settings import LineSettings
     from detect.options import CompareOptions
     from detect.settings import CircleSettings
-    from redetect.interface.detection import Detection, Explanation, detect, explain
+    from redetect.interface.detection import Detection, detect, explain
     from redetect.interface.maps import Localization, RunMap, localize
     from redetect.interface.maps import map_landmarks as map
     from redetect.interface.recordings import Recording, compare
@@ -30,51 +31,30 @@ if TYPE_CHECKING:
     from redetect.messages import OneLineError as Error
 
 _PLACES = {
-    "Camera": ("camera", "Camera"),
-    "CircleSettings": ("detect.settings", "CircleSettings"),
-    "CompareOptions": ("detect.options", "CompareOptions"),
-    "Detection": ("redetect.interface.detection", "Detection"),
-    "Error": ("redetect.messages", "OneLineError"),
-    "Explanation": ("redetect.interface.detection", "Explanation"),
-    "LineSettings": ("detect.line_settings", "LineSettings"),
-    "Localization": ("redetect.interface.maps", "Localization"),
-    "Recording": ("redetect.interface.recordings", "Recording"),
-    "RunMap": ("redetect.interface.maps", "RunMap"),
-    "compare": ("redetect.interface.recordings", "compare"),
-    "detect": ("redetect.interface.detection", "detect"),
-    "explain": ("redetect.interface.detection", "explain"),
-    "localize": ("redetect.interface.maps", "localize"),
-    "map": ("redetect.interface.maps", "map_landmarks"),
-    "open": ("redetect.interface.recordings", "open_recording"),
+    "camera": ["Camera"],
+    "detect.discs.unfound": ["Explanation"],
+    "detect.line_settings": ["LineSettings"],
+    "detect.options": ["CompareOptions"],
+    "detect.settings": ["CircleSettings"],
+    "redetect.interface.detection": ["Detection", "detect", "explain"],
+    "redetect.interface.maps": ["Localization", "RunMap", "localize", "map"],
+    "redetect.interface.recordings": ["Recording", "compare", "open"],
+    "redetect.messages": ["Error"],
 }
+_OWN_NAMES = {"Error": "OneLineError", "map": "map_landmarks", "open": "open_recording"}
 __all__ = [
-    "Camera",
-    "CircleSettings",
-    "CompareOptions",
-    "Detection",
-    "Error",
-    "Explanation",
-    "LineSettings",
-    "Localization",
-    "Recording",
-    "RunMap",
-    "__version__",
-    "compare",
-    "detect",
-    "explain",
-    "localize",
-    "map",
-    "open",
-]
+    "Camera", "CircleSettings", "CompareOptions", "Detection", "Error", "Explanation",
+    "LineSettings", "Localization", "Recording", "RunMap", "__version__", "compare", "detect",
+    "explain", "localize", "map", "open",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, own_name = _PLACES[name]
-    value = getattr(import_module(module), own_name)
-    globals()[name] = value
-    return value
+    for module, names in _PLACES.items():
+        if name in names:
+            value = getattr(import_module(module), _OWN_NAMES.get(name, name))
+            return globals().setdefault(name, value)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -2,7 +2,7 @@
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
-A dataclass with many settings may annotate its fields instead, and call `demand_fields`.
+A dataclass with many settings annotates its fields instead: `Bounded`, or `demand_fields`.
 
 NaN is always rejected; infinity is rejected unless it means "no limit".
 """
@@ -15,7 +15,7 @@ from functools import cache
 from math import inf
 from numbers import Integral
 from pathlib import Path
-from typing import Annotated, Any, Literal, Optional, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Optional, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
@@ -100,9 +100,28 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
 def demand_fields(settings: object, error: type[Exception]) -> None:
     """Reject a dataclass of settings with a number out of the bounds that annotate its field, or
     a word that is none of a field's.
+
+    Numbers become Python's of the field's type, for which kernels are compiled.
     """
     kind: Any = type(settings)
     demand(settings, error, **_annotated(kind))
+    for name, bounds in _annotated(kind).items():
+        value = getattr(settings, name)
+        if value is not None and not isinstance(value, str | tuple):
+            number = round(value) if bounds.whole else float(value)
+            object.__setattr__(settings, name, number)
+
+
+class Bounded:
+    """Base class of settings that are checked by `demand_fields`; its subclasses name the error."""
+
+    _error: ClassVar[type[Exception]]
+
+    def __init_subclass__(cls, error: type[Exception] | None = None) -> None:
+        cls._error = error or cls._error
+
+    def __post_init__(self) -> None:
+        demand_fields(self, self._error)
 
 
 @cache

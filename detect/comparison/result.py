@@ -17,6 +17,7 @@ from detect.seen import Sight
 from redetect.array_types import FloatArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.messages import counted
+from redetect.tables import Table
 
 Kind = Literal["circles", "lines"]
 
@@ -118,8 +119,8 @@ class LinePairs:
     sigma_rad: FloatArray
 
 
-@dataclass(frozen=True)
-class Comparison(ABC):
+@dataclass(frozen=True, eq=False)
+class Comparison(Table, ABC):
     """How a run's detected rows compare with reference rows.
 
     Figures are None if there are no rows to compute them from. Rows are counted as in `FrameMatch`;
@@ -149,6 +150,18 @@ class Comparison(ABC):
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
+
+    def columns(self) -> dict[str, Any]:
+        """One row per frame that is in both files."""
+        rows = [self._row(match) for match in self.frames]
+        return {name: [row[name] for row in rows] for name in rows[0]}
+
+    def _row(self, match: FrameMatch) -> dict[str, Any]:
+        counts = {count: len(getattr(match, count)) for count in self.counts}
+        return {"name": match.name, **counts, f"largest_error_{self.unit}": match.largest_error}
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences())
 
     def sentences(self) -> tuple[str, ...]:
         """Sentences on found, missed and extra rows, rows set aside, errors and covariances."""
@@ -195,14 +208,7 @@ class Comparison(ABC):
         figures |= {
             "frames": len(self.frames),
             "pairs": self.matched,
-            "worst_frames": [
-                {
-                    "name": match.name,
-                    **{count: len(getattr(match, count)) for count in self.counts},
-                    f"largest_error_{self.unit}": match.largest_error,
-                }
-                for match in self.worst_frames(WORST_FRAMES)
-            ],
+            "worst_frames": [self._row(match) for match in self.worst_frames(WORST_FRAMES)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
         return plain
@@ -212,7 +218,8 @@ class Comparison(ABC):
         return f"{json.dumps(self.figures(), indent=2)}\n"
 
     def _repr_html_(self) -> str:
-        return "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
+        words = "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
+        return words + super()._repr_html_()
 
     def worst_frames(self, count: int) -> list[FrameMatch]:
         """The frames with most missed and extra rows; ties are broken by the largest error."""
@@ -224,7 +231,7 @@ class Comparison(ABC):
         return sorted(self.frames, key=order)[:count]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DiscComparison(Comparison):
     """How a run's detected discs compare with reference rows."""
 
@@ -259,7 +266,7 @@ class DiscComparison(Comparison):
         return errors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LineComparison(Comparison):
     """How a run's detected lines compare with reference rows: absolute differences."""
 

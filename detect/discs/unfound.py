@@ -12,7 +12,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from html import escape
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,13 +28,17 @@ from detect.circles import (
 )
 from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, Judgement
 from detect.discs.radius import FACTOR, find_radius
+from detect.drawing import frame as drawing
 from detect.grey_values import estimate_noise
+from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import ByteArray, FloatArray, GreyImage
 from redetect.messages import counted
+from redetect.tables import Table
 
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
+_COLOURS = drawing.colours_of(get_args(Stage))
 
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
@@ -76,41 +81,89 @@ class Candidate(NamedTuple):
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
         }[self.stage]
 
-    def record(self) -> dict[str, Any]:
-        """All fields and the reason, for JSON; non-finite values become null."""
-        known = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in self._asdict().items()
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(Table):
+    """Candidates of an image with the stage and the number that rejected them, and suggestions.
+
+    Attributes
+    ----------
+    image : (H, W) uint8
+    camera : Camera
+    settings : CircleSettings
+    at : (float, float) or None
+        The given pixel.
+    candidates : tuple of detect.discs.unfound.Candidate
+        Accepted ones first, then in order of decreasing votes.
+    place : str
+        Description of the given pixel; empty without one.
+    suggestions : tuple of str
+        Flags or settings to try, with their results.
+    """
+
+    image: GreyImage
+    camera: Camera
+    settings: CircleSettings
+    at: tuple[float, float] | None
+    candidates: tuple[Candidate, ...]
+    place: str
+    suggestions: tuple[str, ...]
+
+    def columns(self) -> dict[str, Any]:
+        """One row per candidate, numbered as in the picture."""
+        rows = self.candidates
+        return {
+            "number": list(range(1, len(rows) + 1)),
+            **{name: [getattr(row, name) for row in rows] for name in Candidate._fields},
+            "reason": [row.reason() for row in rows],
         }
-        return {**known, "reason": self.reason()}
-
-
-@dataclass(frozen=True)
-class DiscExplanation:
-    """The candidates of an image, and why they were accepted or rejected."""
-
-    candidates: tuple[Candidate, ...]  # found ones first, then by decreasing votes
-    place: str  # description of the given position; empty without one
-    suggestions: tuple[str, ...]  # what to try, and what that would find
 
     def to_json(self) -> str:
         """The explanation as JSON, with candidates numbered from 1."""
         content = {
             "place": self.place,
             "suggestions": list(self.suggestions),
-            "candidates": [
-                {"number": k, **row.record()} for k, row in enumerate(self.candidates, 1)
-            ],
+            "candidates": self.records(),
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
+    def picture(self) -> ByteArray:
+        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
+        canvas = drawing.canvas_of(self.image, self.camera)
+        for number, candidate in enumerate(self.candidates, start=1):
+            colour, place = _COLOURS[candidate.stage], (candidate.x_m, candidate.y_m)
+            rim = self.camera.project_floor(circle_on_floor(place, self.settings.radius_m))
+            drawing.draw_curve(canvas, rim, colour, closed=True)
+            beside = (float(rim[:, 0].max()), candidate.v)
+            drawing.draw_text(canvas, f"{number}", beside, colour, shift=(2, 4))
+        if self.at is not None:
+            for arm in ([6.0, 0.0], [0.0, 6.0]):
+                line = self.at + np.outer([-1.0, 1.0], arm)
+                drawing.draw_curve(canvas, line, drawing.LINE_COLOUR)
+        counts = Counter(candidate.stage for candidate in self.candidates)
+        words = [(f"{stage}: {count}", _COLOURS[stage]) for stage, count in counts.items()]
+        return drawing.with_legend(canvas, words, 190, 0.38)
+
+    def __str__(self) -> str:
+        lines = [self.place] if self.place else []
+        lines += [
+            f"{number:3d}  ({row.u:.0f}, {row.v:.0f})  {row.reason()}"
+            for number, row in enumerate(self.candidates, start=1)
+        ]
+        return "\n".join([*lines, *self.suggestions])
+
+    def _repr_png_(self) -> bytes:
+        return drawing.png_of(self.picture())
+
+    def _repr_html_(self) -> str:
+        words = "".join(f"<p>{escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
+        return words + super()._repr_html_()
+
 
 def explain_discs(
-    image: GreyImage,
-    camera: Camera,
-    settings: CircleSettings,
+    image: GreyImage, camera: Camera, settings: CircleSettings,
     at: tuple[float, float] | None = None,
-) -> DiscExplanation:
+) -> Explanation:  # fmt: skip
     """Explain what was found in an image and what was not.
 
     Parameters
@@ -131,7 +184,8 @@ def explain_discs(
         near = _NEAR * settings.radius_m
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
     candidates.sort(key=lambda c: (not c.is_disc, -c.votes))
-    return DiscExplanation(tuple(candidates), place, tuple(_suggestions(scene, at)))
+    suggestions = tuple(_suggestions(scene, at))
+    return Explanation(image, camera, settings, at, tuple(candidates), place, suggestions)
 
 
 def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:

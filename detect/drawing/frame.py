@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import get_args
 
 import cv2
 import numpy as np
@@ -20,7 +19,6 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
-from detect.discs.unfound import Candidate, Stage
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
@@ -272,13 +270,9 @@ def draw_curve(
 
 
 def draw_text(
-    canvas: ByteArray,
-    text: str,
-    at: ArrayLike,
-    colour: Colour,
-    size: float = 0.35,
+    canvas: ByteArray, text: str, at: ArrayLike, colour: Colour, size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
-) -> None:
+) -> None:  # fmt: skip
     """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
 
     `shift` moves the text, by more in wide pictures.
@@ -308,7 +302,7 @@ def with_legend(
     return np.concatenate([canvas, legend])
 
 
-def _colours(names: Sequence[str]) -> dict[str, Colour]:
+def colours_of(names: Sequence[str]) -> dict[str, Colour]:
     """Distinct colours, always the same; the first is for accepted ones."""
     hues = np.linspace(128, 298, len(names)) % 256  # from cyan to yellow: no green
     colours = cv2.applyColorMap(hues.astype(np.uint8)[:, None], cv2.COLORMAP_HSV)[:, 0]
@@ -316,8 +310,7 @@ def _colours(names: Sequence[str]) -> dict[str, Colour]:
     return dict(zip(names, [LINE_COLOUR, *map(tuple, pale)], strict=True))
 
 
-_FATE_COLOURS = _colours(FATES)
-_STAGE_COLOURS = _colours(get_args(Stage))
+_FATE_COLOURS = colours_of(FATES)
 
 
 def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -> ByteArray:
@@ -339,29 +332,6 @@ def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> 
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
     return with_legend(picture, words, 210, 0.36)
-
-
-def draw_disc_candidates(
-    image: GreyImage,
-    camera: Camera,
-    radius_m: float,
-    candidates: Sequence[Candidate],
-    at: tuple[float, float] | None = None,
-) -> ByteArray:
-    """Draw candidates for discs, coloured by their fates and numbered in order, with a legend."""
-    canvas = canvas_of(image, camera)
-    for number, candidate in enumerate(candidates, start=1):
-        colour = _STAGE_COLOURS[candidate.stage]
-        rim = camera.project_floor(circle_on_floor((candidate.x_m, candidate.y_m), radius_m))
-        draw_curve(canvas, rim, colour, closed=True)
-        beside = (float(rim[:, 0].max()), candidate.v)
-        draw_text(canvas, f"{number}", beside, colour, shift=(2, 4))
-    if at is not None:
-        for shift in ((6.0, 0.0), (0.0, 6.0)):
-            draw_curve(canvas, np.array([np.subtract(at, shift), np.add(at, shift)]), LINE_COLOUR)
-    counts = Counter(candidate.stage for candidate in candidates)
-    words = [(f"{stage}: {count}", _STAGE_COLOURS[stage]) for stage, count in counts.items()]
-    return with_legend(canvas, words, 190, 0.38)
 
 
 def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray:

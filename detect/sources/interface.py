@@ -126,10 +126,6 @@ class ImageRun:
         """The file for a kind of result."""
         return self.output_base.with_name(f"{self.output_base.name}.{kind}")
 
-    def calibrated(self, camera: Camera) -> Run:
-        """The run with a calibration."""
-        return Run(**vars(self), camera=camera)
-
 
 @dataclass(frozen=True)
 class Run(ImageRun):

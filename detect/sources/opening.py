@@ -6,7 +6,7 @@ import math
 import re
 from pathlib import Path
 
-from camera import read_camera
+from camera import Camera, read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
@@ -20,7 +20,7 @@ _LIVE = re.compile(r"camera:([0-9]{1,4})")
 
 
 def open_run(
-    name: Path, camera_path: Path | None = None, options: SourceOptions | None = None
+    name: Path, camera: Camera | Path | None = None, options: SourceOptions | None = None
 ) -> Run:
     """Open a run by the name of its image source, with a calibration.
 
@@ -28,7 +28,7 @@ def open_run(
     ----------
     name : path
         A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
-    camera_path : path, optional
+    camera : Camera, or path, optional
         The calibration; by default the one beside the images (``<run>.cam`` if a run folder has
         several).
     options : SourceOptions, optional
@@ -40,7 +40,7 @@ def open_run(
     camera.CameraError, redetect.landmarks.LandmarkFileError
         If the calibration or the odometry cannot be read, or there are several calibrations.
     """
-    run = open_source(name, camera_path, options, posed=True)
+    run = open_source(name, camera, options, posed=True)
     if isinstance(run, Run):
         return run
     raise DetectError(
@@ -51,7 +51,7 @@ def open_run(
 
 def open_source(
     name: Path,
-    camera_path: Path | None = None,
+    camera: Camera | Path | None = None,
     options: SourceOptions | None = None,
     *,
     posed: bool = False,
@@ -62,7 +62,10 @@ def open_source(
     """
     options = options or SourceOptions()
     source = _source(name, options)
-    camera = source.calibration(posed=posed) if camera_path is None else read_camera(camera_path)
+    if isinstance(camera, Path):
+        camera = read_camera(camera)
+    elif camera is None:
+        camera = source.calibration(posed=posed)
     frames: Frames
     odometry: Path | None
     # The odometry of a run folder in the data set's layout.
@@ -77,7 +80,7 @@ def open_source(
     frames = SomeFrames(frames, options.frames) if options.frames else frames
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
-    return run if camera is None else run.calibrated(camera)
+    return run if camera is None else Run(**vars(run), camera=camera)
 
 
 def demand_recording(name: Path) -> None:

@@ -12,11 +12,11 @@ from typing import Annotated, ClassVar, Literal
 
 from redetect.bounds import (
     PROBABILITY,
+    Bounded,
     Bounds,
     NotNegative,
     Positive,
     ShareAbove0,
-    demand_fields,
     inside,
     whole,
 )
@@ -27,18 +27,8 @@ Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
 _ODDS = Bounds("more than 1", lambda x: 1.0 < x < inf)
 
 
-class _Bounded:
-    """Settings whose numbers are within the bounds that annotate them.
-
-    Raises `GroundTruthError` if a number is not.
-    """
-
-    def __post_init__(self) -> None:
-        demand_fields(self, GroundTruthError)
-
-
 @dataclass(frozen=True)
-class PoseSettings(_Bounded):
+class PoseSettings(Bounded, error=GroundTruthError):
     """Settings of the poses."""
 
     solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
@@ -70,7 +60,7 @@ class PoseSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class RigSettings(_Bounded):
+class RigSettings(Bounded, error=GroundTruthError):
     """Settings of the rig's estimation."""
 
     # Least number of times, or images, that show a marker of the rig with another one and agree
@@ -86,7 +76,7 @@ class RigSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class NetworkSettings(_Bounded):
+class NetworkSettings(Bounded, error=GroundTruthError):
     """Settings of the network's estimation."""
 
     # Standard deviation of a checkerboard's corners (px). Only its ratio to the sigmas of the
@@ -99,7 +89,7 @@ class NetworkSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class AlignmentSettings(_Bounded):
+class AlignmentSettings(Bounded, error=GroundTruthError):
     """Settings of the scanners' alignment."""
 
     # Initial gate for matching readings (m).
@@ -108,7 +98,7 @@ class AlignmentSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class LaserSettings(_Bounded):
+class LaserSettings(Bounded, error=GroundTruthError):
     """Settings of laser tracking."""
 
     gate_m: Positive = 0.2  # Largest distance of a reading from the robot's outline (m).
@@ -149,7 +139,7 @@ class LaserSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class SyncSettings(_Bounded):
+class SyncSettings(Bounded, error=GroundTruthError):
     """Settings of the synchronisation of clocks."""
 
     largest_offset_s: Positive = 60.0  # Bound of the time offset, either way (s).
@@ -164,7 +154,7 @@ class SyncSettings(_Bounded):
 
 
 @dataclass(frozen=True)
-class FuseSettings(_Bounded):
+class FuseSettings(Bounded, error=GroundTruthError):
     """Errors of odometry, and the gate of measurements."""
 
     # Standard deviation of odometry's distance per square root of a metre driven (m).

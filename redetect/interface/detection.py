@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
+from numbers import Integral
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.unfound import Candidate, DiscExplanation, explain_discs
-from detect.drawing.frame import draw_disc_candidates, draw_rows, png_of
+from detect.discs.unfound import Explanation, explain_discs
+from detect.drawing.frame import draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
@@ -27,17 +27,30 @@ from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
-from redetect.interface.tables import Table, covariance_columns, html_table, plain
+from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.messages import counted, excerpt
+from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table, plain
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
 
 
+class Landmarks(Table):
+    """Landmarks of an image as arrays with one row each."""
+
+    def __len__(self) -> int:
+        return len(next(iter(vars(self).values())))
+
+    def __getitem__(self, chosen: Any) -> Any:
+        """One, by its number, with its values as attributes; some, by a slice, numbers or mask."""
+        kind = SimpleNamespace if isinstance(chosen, Integral) else type(self)
+        return kind(**{name: values[chosen] for name, values in vars(self).items()})
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Discs(Table):
+class Discs(Landmarks):
     """Discs on the floor, N of them, in scan order.
 
     Attributes
@@ -61,9 +74,6 @@ class Discs(Table):
     quality: FloatArray
     evidence: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.u)
-
     def columns(self) -> dict[str, Any]:
         """One row per disc."""
         return {
@@ -78,7 +88,7 @@ class Discs(Table):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Verticals(Table):
+class Verticals(Landmarks):
     """Vertical lines of the building, N of them, the leftmost first.
 
     Attributes
@@ -99,9 +109,6 @@ class Verticals(Table):
     top: FloatArray
     bottom: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.bearing_rad)
-
     def columns(self) -> dict[str, Any]:
         """One row per vertical."""
         return {
@@ -116,7 +123,7 @@ class Verticals(Table):
 
 
 @dataclass(frozen=True, eq=False)
-class Tilt:
+class Tilt(ByContent):
     """The robot's tilt, from the verticals.
 
     Attributes
@@ -186,8 +193,8 @@ class Detection(Table):
             "image": self.name,
             "axes": self.axes,
             "tilt": None if self.tilt is None else plain(vars(self.tilt)),
-            "discs": _records(self.discs),
-            "verticals": _records(self.verticals),
+            "discs": self.discs.records(),
+            "verticals": self.verticals.records(),
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
@@ -212,10 +219,11 @@ class Detection(Table):
         return png_of(self.picture())
 
     def _repr_html_(self) -> str:
-        words, picture = html.escape(str(self)), html_picture(self.picture(), self.name)
-        return f"<p>{words}</p>{picture}{html_table(self.discs.columns())}"
+        tables = html_table(self.discs.columns()) + html_table(self.verticals.columns())
+        return f"<p>{html.escape(str(self))}</p>{html_picture(self)}{tables}"
 
 
+@keywords_named()
 def detect(
     image: ImageLike,
     camera: CameraLike,
@@ -300,6 +308,7 @@ class RecordedFrame:
         """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
         return read_image(self.frame, self.camera)
 
+    @keywords_named()
     def detect(
         self,
         radius_m: float | None = None,
@@ -312,7 +321,8 @@ class RecordedFrame:
     ) -> Detection:
         """Detect discs, verticals and tilt: see `detect`."""
         if axes not in MEANING:
-            raise DetectError(f"axes is {excerpt(axes)}: expected one of {', '.join(MEANING)}")
+            meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())
+            raise DetectError(f"axes is {excerpt(axes)}: expected {meant}; robotics are REP 103's")
         chosen = settings_of(settings, radius_m, polarity)
         plan = FramePlan(
             self.camera,
@@ -330,32 +340,28 @@ def settings_of(
     settings: CircleSettings | None, radius_m: float | None, polarity: Polarity | None
 ) -> CircleSettings:
     """Settings with the radius and polarity that are given separately."""
-    settings = settings or CircleSettings()
-    # Kernels are compiled for Python's numbers, not for those of NumPy.
-    number = radius_m.item() if isinstance(radius_m, np.generic) else radius_m
-    return replace(
-        settings,
-        radius_m=settings.radius_m if number is None else number,
-        polarity=polarity or settings.polarity,
-    )
+    if isinstance(radius_m, str):
+        raise DetectError(
+            f"radius_m is {excerpt(radius_m)}: expected metres, which `detect all --radius-m auto` "
+            "and detect.discs.radius.find_radius estimate from images"
+        )
+    given: dict[str, Any] = {"radius_m": radius_m, "polarity": polarity}
+    given = {name: value for name, value in given.items() if value is not None}
+    return replace(settings or CircleSettings(), **given)
 
 
 def camera_of(camera: CameraLike) -> Camera:
     """The given camera, or the one in the given file."""
-    return camera if isinstance(camera, Camera) else read_camera(camera)
-
-
-def html_picture(picture: NDArray[np.uint8], name: str = "") -> str:
-    """A picture as HTML with embedded content."""
-    content = base64.b64encode(png_of(picture)).decode()
-    return f'<img alt="{html.escape(name)}" src="data:image/png;base64,{content}"/>'
+    if isinstance(camera, Camera):
+        return camera
+    return read_camera(path_of(camera, "a Camera, or the name of its .cam file", DetectError))
 
 
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     if isinstance(image, np.ndarray):
         return RunFrame(still("image"), None, content=plain_image(image))
-    path = Path(image)
+    path = path_of(image, "an array of grey values, or the name of an image file", FrameError)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
     return RunFrame(still("_".join(path.stem.split()) or "image"), path)  # a prefix is one word
@@ -367,35 +373,24 @@ def _detection(
     assert found.image is not None
     assert found.discs is not None
     assert found.lines is not None
-    verticals, discs = found.lines, found.discs
+    verticals, lines, discs = found.lines, found.lines.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
     unknown = np.full(len(discs), -1)
     rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     return Detection(
-        discs=Discs(
-            u=pixels[:, 0],
-            v=pixels[:, 1],
-            xy=from_dataset(discs.floor_xy, axes),
+        Discs(
+            u=pixels[:, 0], v=pixels[:, 1], xy=from_dataset(discs.floor_xy, axes),
             covariance=covariance_from_dataset(discs.covariance, axes),
-            quality=discs.quality,
-            evidence=discs.evidence,
+            quality=discs.quality, evidence=discs.evidence,
         ),
-        verticals=Verticals(
-            bearing_rad=verticals.lines.alpha_rad,
-            sigma_rad=verticals.lines.sigma_rad,
-            inclination_rad=verticals.lines.beta_rad,
-            top=camera.distort(verticals.lines.ends[:, :2]),
-            bottom=camera.distort(verticals.lines.ends[:, 2:]),
+        Verticals(
+            bearing_rad=lines.alpha_rad, sigma_rad=lines.sigma_rad, inclination_rad=lines.beta_rad,
+            top=camera.distort(lines.ends[:, :2]), bottom=camera.distort(lines.ends[:, 2:]),
         ),
-        tilt=_tilt_of(found.tilt, axes),
-        axes=axes,
-        name=step.prefix,
-        image=found.image,
-        camera=camera,
-        settings=settings,
+        _tilt_of(found.tilt, axes), axes, step.prefix, found.image, camera, settings,
         frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
         frame_tilt=found.tilt,
-    )
+    )  # fmt: skip
 
 
 def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
@@ -407,61 +402,7 @@ def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
 
 
-def _records(table: Table) -> list[dict[str, Any]]:
-    columns = plain(table.columns())
-    return [dict(zip(columns, values)) for values in zip(*columns.values())]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Explanation(DiscExplanation, Table):
-    """Candidates of an image with the stage and the number that rejected them, and suggestions.
-
-    Attributes
-    ----------
-    candidates : tuple of detect.discs.unfound.Candidate
-        Accepted ones first, then in order of decreasing votes.
-    place : str
-        Description of the given pixel; empty without one.
-    suggestions : tuple of str
-        Flags or settings to try, with their results.
-    """
-
-    image: NDArray[np.uint8]
-    camera: Camera
-    settings: CircleSettings
-    at: tuple[float, float] | None
-
-    def columns(self) -> dict[str, Any]:
-        """One row per candidate, numbered as in the picture."""
-        rows = self.candidates
-        return {
-            "number": list(range(1, len(rows) + 1)),
-            **{name: [getattr(row, name) for row in rows] for name in Candidate._fields},
-            "reason": [row.reason() for row in rows],
-        }
-
-    def picture(self) -> NDArray[np.uint8]:
-        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
-        return draw_disc_candidates(
-            self.image, self.camera, self.settings.radius_m, self.candidates, self.at
-        )
-
-    def __str__(self) -> str:
-        lines = [self.place] if self.place else []
-        lines += [
-            f"{number:3d}  ({row.u:.0f}, {row.v:.0f})  {row.reason()}"
-            for number, row in enumerate(self.candidates, start=1)
-        ]
-        return "\n".join([*lines, *self.suggestions])
-
-    def _repr_png_(self) -> bytes:
-        return png_of(self.picture())
-
-    def _repr_html_(self) -> str:
-        words = "".join(f"<p>{html.escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
-        return f"{words}{html_picture(self.picture())}{super()._repr_html_()}"
-
-
+@keywords_named()
 def explain(
     image: ImageLike,
     camera: CameraLike,
@@ -495,6 +436,4 @@ def explain(
     chosen = settings_of(settings, radius_m, polarity)
     if at is not None and (np.shape(at) != (2,) or not np.isreal(at).all()):
         raise DetectError(f"at is {excerpt(at)}: expected a pixel (u, v)")
-    pixels = read_image(frame, camera)
-    found = explain_discs(pixels, camera, chosen, at)
-    return Explanation(**vars(found), image=pixels, camera=camera, settings=chosen, at=at)
+    return explain_discs(read_image(frame, camera), camera, chosen, at)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from redetect.bounds import demand_fields
-from redetect.interface.tables import Table, covariance_columns
+from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks.map_file import (
     LandmarkMap,
     Landmarks,
@@ -31,11 +31,13 @@ from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined
+from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
 Command = TypeVar("Command", Map, Localize)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Poses(Table):
     """The poses of a path as a table.
 
@@ -44,8 +46,7 @@ class Poses(Table):
     path : Path2D
     """
 
-    def __init__(self, path: Path2D) -> None:
-        self.path = path
+    path: Path2D
 
     def columns(self) -> dict[str, Any]:
         """One row per pose, with covariances if the path has them."""
@@ -141,7 +142,6 @@ class Localization(Poses):
         The map.
     """
 
-    path: Path2D
     result: FilterRun
     landmarks: LandmarkMap
 
@@ -153,6 +153,7 @@ class Localization(Poses):
         return draw_map(self.landmarks, self.path)
 
 
+@keywords_named()
 def map_landmarks(
     run: PathLike, *, circles: bool = True, lines: bool = False, **options: Any
 ) -> RunMap:
@@ -179,11 +180,12 @@ def map_landmarks(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     """
-    command = _checked(Map(run=Path(run), circles=circles, lines=lines, **_as_paths(options)))
+    command = _checked(Map(run=_run(run), circles=circles, lines=lines, **_as_paths(options)))
     mapped = mapped_run_of(command, joined(read_runs(command)))
     return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
 
+@keywords_named()
 def localize(
     run: PathLike, landmarks: RunMap | PathLike, *, circles: bool = True, lines: bool = False,
     **options: Any,
@@ -213,9 +215,10 @@ def localize(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     """
-    in_file = Path("the map") if isinstance(landmarks, RunMap) else Path(landmarks)
+    in_memory = isinstance(landmarks, RunMap)
+    in_file = path_of("the map" if in_memory else landmarks, "a RunMap, or its map.csv", SlamError)
     command = _checked(
-        Localize(run=Path(run), map=in_file, circles=circles, lines=lines, **_as_paths(options))
+        Localize(run=_run(run), map=in_file, circles=circles, lines=lines, **_as_paths(options))
     )
     if isinstance(landmarks, RunMap):
         places = landmarks.result.landmarks_jointly()
@@ -237,8 +240,13 @@ def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
         paths["camera"] = Path(paths["camera"])
     if "more" in paths:
         more = paths["more"]
-        paths["more"] = tuple(map(Path, [more] if isinstance(more, str | os.PathLike) else more))
+        paths["more"] = tuple(map(_run, [more] if isinstance(more, str | os.PathLike) else more))
     return paths
+
+
+def _run(name: PathLike) -> Path:
+    expected = "a run folder or a file of rows; `redetect.landmarks.write_frames` writes detections"
+    return path_of(name, expected, SlamError)
 
 
 def _checked(command: Command) -> Command:

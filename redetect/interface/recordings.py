@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from camera import Camera
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
@@ -16,8 +16,10 @@ from detect.options import Compare, CompareOptions, SourceOptions
 from detect.row_files import read_head
 from detect.seen import Sight
 from detect.sources.interface import Run
-from detect.sources.opening import open_run, open_source
+from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
+from redetect.interface.inputs import keywords_named, path_of
+from redetect.messages import excerpt
 
 PathLike = str | os.PathLike[str]
 
@@ -37,8 +39,15 @@ class Recording:
         self.name, self.camera, self.folder = run.name, run.camera, run.folder
 
     def __iter__(self) -> Iterator[RecordedFrame]:
-        for frame in self._run.frames:
-            yield RecordedFrame(frame, self.camera)
+        with keywords_named():
+            for frame in self._run.frames:
+                yield RecordedFrame(frame, self.camera)
+
+    def __getitem__(self, number: int) -> RecordedFrame:
+        """A frame by its number, from 0; those before it are passed over."""
+        for frame in islice(self, number, None) if number >= 0 else ():
+            return frame
+        raise IndexError(f"{self.name} has no frame {number}")
 
     @property
     def expected(self) -> int | None:
@@ -49,6 +58,7 @@ class Recording:
         return f"<recording {self.name}: {self.expected or 'unknown number of'} frames>"
 
 
+@keywords_named()
 def open_recording(name: PathLike, camera: CameraLike | None = None, **source: Any) -> Recording:
     """Open a run folder, a folder or pattern of images, a video, a bag, or `camera:0`.
 
@@ -72,14 +82,14 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
         If the calibration or the odometry cannot be read.
     """
     options = SourceOptions(**source)
-    if isinstance(camera, Camera):
-        return Recording(open_source(Path(name), None, options).calibrated(camera))
-    return Recording(open_run(Path(name), None if camera is None else Path(camera), options))
+    place = path_of(name, "the name of a run, a folder, a video or a bag", DetectError)
+    return Recording(open_run(place, None if camera is None else camera_of(camera), options))
 
 
+@keywords_named()
 def compare(
     run: PathLike,
-    detected: PathLike | Iterable[Detection] | None = None,
+    detected: PathLike | Detection | Iterable[Detection] | None = None,
     reference: PathLike | None = None,
     *,
     lines: bool = False,
@@ -92,7 +102,7 @@ def compare(
     ----------
     run : path
         Run folder.
-    detected : path, or iterable of Detection, optional
+    detected : path, Detection, or iterable of Detection, optional
         Detected rows; by default `detected.circles` (`detected.lines`) in the run folder.
     reference : path, optional
         Reference rows; by default `map.circles` (`map.lines`) in the run folder.
@@ -117,28 +127,23 @@ def compare(
     detect.errors.CompareError
         If an image has two frames, or no image is in both.
     """
-    options = options or CompareOptions()
+    options, run = options or CompareOptions(), path_of(run, "a run folder", DetectError)
     in_file = None if reference is None else Path(reference)
     if detected is None or isinstance(detected, str | os.PathLike):
         path = None if detected is None else Path(detected)
-        command = Compare(
-            Path(run), lines=lines, reference=in_file, detected=path, matching=options,
-            camera=None if camera is None or isinstance(camera, Camera) else Path(camera),
-        )  # fmt: skip
-        return comparison_of(command, camera if isinstance(camera, Camera) else None)
-    found = list(detected)
+        command = Compare(run, lines=lines, reference=in_file, detected=path, matching=options)
+        return comparison_of(command, None if camera is None else camera_of(camera))
+    found = list(detected) if isinstance(detected, Iterable) else [detected]
+    for one in found:
+        if not isinstance(one, Detection):
+            raise DetectError(f"{excerpt(one)}: expected a Detection, or the name of a file")
     kind: Kind = "lines" if lines else "circles"
-    in_file = in_file or Path(run) / f"map.{kind}"
+    in_file = in_file or run / f"map.{kind}"
     if not found or not in_file.is_file():
         raise DetectError(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
     seen_by = found[0].camera if camera is None else camera_of(camera)
-    return compare_with_file(
-        kind,
-        in_file,
-        [one.frame for one in found],
-        options,
-        sight=Sight.by(seen_by, found[0].settings, read_head(in_file).level),
-        names=(str(in_file), "detections"),
-    )
+    sight = Sight.by(seen_by, found[0].settings, read_head(in_file).level)
+    frames, names = [one.frame for one in found], (str(in_file), "detections")
+    return compare_with_file(kind, in_file, frames, options, sight=sight, names=names)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
-from redetect.bounds import NotNegative, Positive, demand_fields
+from redetect.bounds import Bounded, NotNegative, Positive
 from redetect.plane import apply, between, rotation
 from redetect.slam.errors import SlamError
 
@@ -23,7 +23,7 @@ CAMERA_HEIGHT_M = 1.5
 
 
 @dataclass(frozen=True)
-class OdometryNoise:
+class OdometryNoise(Bounded, error=SlamError):
     """Standard deviations of odometry steps without a covariance."""
 
     per_metre: NotNegative = 0.05  # of the distance, relative to it
@@ -31,9 +31,6 @@ class OdometryNoise:
     turn_per_metre: NotNegative = 0.03  # of the turn due to the distance, radians per metre
     least_m: Positive = 0.005  # lower bound for the distance, metres
     least_rad: Positive = 0.002  # lower bound for the turn, radians
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
 
     def covariance(self, steps: FloatArray) -> FloatArray:
         """(N, 3, 3) covariances of (N, 3) steps dx, dy (m), dphi (rad)."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from redetect.bounds import PROBABILITY, NotNegative, Positive, demand_fields, from_to, whole
+from redetect.bounds import PROBABILITY, Bounded, NotNegative, Positive, from_to, whole
 from redetect.slam.errors import SlamError
 
 #: Bounds of positions given by flags (m, rad) and of their standard deviations.
@@ -15,7 +15,7 @@ Method = Literal["nearest", "joint"]
 
 
 @dataclass(frozen=True)
-class AssociateSettings:
+class AssociateSettings(Bounded, error=SlamError):
     """How a run is associated."""
 
     # `nearest`: Mahalanobis distance of one row at a time; `joint`: joint compatibility of a
@@ -36,9 +36,6 @@ class AssociateSettings:
     # Discs with fewer such rows count as clutter: their rows get -1.
     fewest_rows: Annotated[int, whole(1)] = 3
 
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
-
     @property
     def tilt_sigma_rad(self) -> float:
         """`tilt_sigma_deg` in radians."""
@@ -46,7 +43,7 @@ class AssociateSettings:
 
 
 @dataclass(frozen=True)
-class AddedNoise:
+class AddedNoise(Bounded, error=SlamError):
     """Standard deviations of the added noise, independent for each number."""
 
     sigma: NotNegative = 0.0  # Added to disc positions along x and y (m).
@@ -56,9 +53,6 @@ class AddedNoise:
     turn_sigma: NotNegative = 0.0  # Added to dphi of each step (rad).
     # Seed of all random numbers. The files of discs and of lines of a run get the same odometry.
     seed: Annotated[int, whole(0)] = 1
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
 
     @property
     def nothing(self) -> bool:

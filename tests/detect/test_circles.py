@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from detect.circles import (
     published_positions,
 )
 from detect.errors import DetectError, FrameError
+from detect.lines import detect_lines
 from detect.settings import REPORT, CircleSettings, Polarity
-from lut import DiscTable, VoteTable, cached_disc_table, ring
+from lut import DiscTable, VoteTable, build_vertical_table, cached_disc_table, ring
 from tests.detect.line_scene import mirrored
 from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
 from tools.detector_maps import quality_of_centres
@@ -348,11 +350,35 @@ def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera
     assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5
 
 
-def test_a_table_of_the_other_detector_is_refused(published_camera: Camera) -> None:
+def test_a_table_that_is_not_that_of_camera_and_settings_is_refused(
+    published_camera: Camera,
+) -> None:
     image = np.zeros((published_camera.height, published_camera.width), np.uint8)
-    for asked, other, whose in (
-        (DEFAULT, REPORT, "the published detector"),
-        (REPORT, DEFAULT, "the default detector"),
+    lower = replace(published_camera, scale_x=published_camera.scale_x + 1.0)
+    tables: dict[str, Any] = {
+        "VoteTable": table_of(published_camera, DEFAULT),
+        "DiscTable": table_of(published_camera, REPORT),
+        "VerticalTable": build_vertical_table(published_camera),
+    }
+    for camera, asked, names in (
+        (published_camera, DEFAULT, ("DiscTable", "VerticalTable")),
+        (published_camera, REPORT, ("VoteTable", "VerticalTable")),
+        (published_camera, replace(DEFAULT, radius_m=0.06), tables),
+        (published_camera, replace(REPORT, radius_m=0.06), tables),
+        (lower, DEFAULT, tables),
     ):
-        with pytest.raises(DetectError, match=whose):
-            detect_circles(image, published_camera, table_of(published_camera, other), asked)
+        for name in names:
+            with pytest.raises(DetectError, match=f"the {name} is for another"):
+                detect_circles(image, camera, tables[name], asked)
+    with pytest.raises(DetectError, match="a VoteTable: expected a VerticalTable"):
+        detect_lines(image, tables["VoteTable"])
+
+
+@pytest.mark.parametrize("radius_m", [1, np.float32(1.0), np.int64(1), np.array(1.0)])
+def test_numbers_of_other_types_are_the_same_settings(
+    published_camera: Camera, radius_m: Any
+) -> None:
+    image = np.zeros((published_camera.height, published_camera.width), np.uint8)
+    settings = CircleSettings(radius_m=radius_m)
+    assert type(settings.radius_m) is float
+    assert len(detect(image, published_camera, settings)) == 0

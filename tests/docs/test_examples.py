@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
+from contextlib import redirect_stdout
 from importlib import import_module
 from pathlib import Path
 
@@ -36,9 +39,16 @@ def test_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def run(block: Block) -> None:
-    """Do what a block says; the project's own programs in this process, which saves their start."""
+    """Do what a block says; the project's own programs in this process, which saves their start.
+
+    A comment of Python that begins with an arrow, `# -> 5 discs`, is what is printed there.
+    """
     if block.language == "python":
-        exec(compile("\n".join(block.lines), block.name, "exec"), {"__name__": "__main__"})
+        text = "\n".join(block.lines)
+        with redirect_stdout(io.StringIO()) as printed:
+            exec(compile(text, block.name, "exec"), {"__name__": "__main__"})
+        for words in re.findall(r"# -> (.*)", text):
+            assert words in printed.getvalue().splitlines(), block.name
         return
     assert block.language in ("console", "bash"), f"{block.name}: {block.language} does not run"
     for line, text in shell_lines(block):

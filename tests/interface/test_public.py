@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import types
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ import pytest
 
 import redetect as rd
 from detect.errors import DetectError, FrameError
-from redetect.interface.tables import FrameLibrary, ResultError
 from redetect.landmarks import read_frames, write_frames
 from redetect.storage import OutputExistsError
+from redetect.tables import FrameLibrary, ResultError
 
 
 def test_importing_costs_nothing(project_root: Path) -> None:
@@ -110,7 +111,7 @@ def test_radius_and_settings(demo_image: Path, demo_camera: rd.Camera) -> None:
     wrong: Any = "grey"
     with pytest.raises(rd.Error, match="polarity is 'grey': expected one of any, light, dark"):
         rd.detect(demo_image, demo_camera, polarity=wrong)
-    with pytest.raises(rd.Error, match="axes is 'grey': expected one of robotics, dataset"):
+    with pytest.raises(rd.Error, match="axes is 'grey': expected robotics"):
         rd.detect(demo_image, demo_camera, axes=wrong)
 
 
@@ -156,7 +157,8 @@ def test_notebooks_show_pictures_and_tables(found: rd.Detection) -> None:
     assert picture is not None
     assert picture.shape[0] > found.image.shape[0]
     page = found._repr_html_()
-    assert page.count("<tr>") == 1 + len(found.discs)
+    assert page.count("<tr>") == 2 + len(found.discs) + 20  # of the verticals
+    assert "and 1 more rows" in page
     assert "data:image/png;base64," in page
     assert len(repr(found)) < 200
     assert len(repr(found.discs)) < 200
@@ -187,6 +189,54 @@ def test_without_a_library_of_data_frames(
         found.to_dataframe()
 
 
+def test_parts_and_equality(found: rd.Detection, demo_image: Path, demo_camera: rd.Camera) -> None:
+    again = rd.detect(demo_image, demo_camera, polarity="light")
+    assert found == again
+    assert found.tilt == again.tilt
+    assert found != rd.detect(demo_image, demo_camera, polarity="light", level=False)
+    assert found != found.name
+    assert found.discs == found.discs[:] != found.discs[1:]
+    clear = found.discs[found.discs.evidence > 3.0]
+    assert 0 < len(clear) < len(found.discs)
+    assert found.verticals[-1].bearing_rad == found.verticals.bearing_rad[-1]
+    assert [disc.u for disc in clear] == clear.u.tolist()
+    undone = replace(found.discs, evidence=np.full(len(found.discs), np.nan))
+    assert undone == replace(undone)
+
+
+#: The API for arguments that type checkers refuse.
+ANY: Any = rd
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda one: ANY.detect(None, one.camera), "None: expected an array of grey values, or"),
+        (lambda one: ANY.detect([one.image], one.camera), "expected an array of grey values, or"),
+        (lambda one: ANY.detect(one.image / 255.0, one.camera), r"\(255 \* image\)\.astype"),
+        (lambda one: ANY.detect(one.image[:9], one.camera), "of these images by `camera`$"),
+        (lambda one: ANY.detect(one.image, {}), "expected a Camera, or the name of its .cam file"),
+        (lambda one: ANY.detect(one.image, one.camera, "auto"), "expected metres, which"),
+        (lambda one: ANY.detect(one.image, one.camera, axes="rep103"), "robotics are REP 103's"),
+        (lambda _: ANY.open(["e"]), "expected the name of a run"),
+        (lambda _: ANY.open("images/e/images"), "named by `camera`; `camera calibrate`"),
+        (lambda _: ANY.open("images/e", wheel_base_m=-1), "wheel_base_m is -1: expected 0 or more"),
+        (lambda one: ANY.compare("images/e", [one.frame]), "expected a Detection, or the name"),
+        (lambda one: ANY.compare(one, [one]), "expected a run folder"),
+        (lambda one: ANY.map([one]), "expected a run folder or a file of rows"),
+        (lambda one: ANY.map("images/e", more=[one]), "expected a run folder or a file of rows"),
+        (lambda one: ANY.localize("images/e", one), "expected a RunMap, or its map.csv"),
+    ],
+)  # fmt: skip
+def test_arguments_of_another_kind(
+    call: Callable[[Any], Any], words: str, found: rd.Detection, project_root: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(project_root)
+    with pytest.raises(rd.Error, match=words):
+        call(found)
+
+
 # -- runs -----------------------------------------------------------------------------------
 
 
@@ -207,6 +257,13 @@ def test_frames_of_a_run_and_their_comparison(demo: Path, tmp_path: Path) -> Non
     verticals = rd.compare(demo, found, lines=True)
     alone = shutil.copy(demo / "map.lines", tmp_path)  # with nothing beside it
     assert "verticals of the reference are found" in verticals._repr_html_()
+    assert verticals.columns()["name"] == ["e.0000", "e.0001", "e.0002"]
+    assert sum(discs.columns()["matched"]) == discs.matched
+    assert str(discs).splitlines() == list(discs.sentences())
+    assert rd.compare(demo, found[1]) == rd.compare(demo, iter(found[1:2]))
+    assert run[2].detect(polarity="light") == found[2]
+    with pytest.raises(IndexError, match="e has no frame -1"):
+        _ = run[-1]
     without_unlisted = rd.compare(demo, found, alone, lines=True)
     assert verticals.extra < without_unlisted.extra
     with pytest.raises(DetectError, match="nothing to compare"):
@@ -217,6 +274,8 @@ def test_a_run_with_another_camera(demo: Path, demo_camera: rd.Camera) -> None:
     for camera in (demo_camera, demo / "e.cam"):
         (frame,) = rd.open(demo / "images", camera, frames=1)
         assert frame.camera == demo_camera
+    other = replace(demo_camera, scale_x=500.0)
+    assert rd.open(demo, other).camera == other  # than that of the run folder
     with pytest.raises(rd.Error, match="no such folder"):
         rd.open("no-such-run.mcap")
 
@@ -234,6 +293,8 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     assert set(landmarks.columns()["kind"]) == {"disc", "vertical"}
     assert len(landmarks.poses().columns()["prefix"]) == len(landmarks.path.poses)
     assert landmarks._repr_png_().startswith(b"\x89PNG")
+    assert "data:image/png" in landmarks._repr_html_()
+    assert "<table>" in landmarks._repr_html_()
     landmarks.write(tmp_path)
     with pytest.raises(OutputExistsError):
         landmarks.write(tmp_path)

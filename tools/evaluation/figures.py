@@ -23,8 +23,8 @@ from redetect import __version__
 from redetect.cli import PROGRAMS
 from redetect.command_line import exit_code_of
 from redetect.groundtruth.files import write_json
-from redetect.interface.tables import plain
 from redetect.storage import write_bytes
+from redetect.tables import plain
 from tools.benchmark.timing import number
 
 #: Figures by name, or further figures by theirs.

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.bounds import Positive, demand_fields
+from redetect.bounds import Bounded, Positive
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.plane import between
@@ -38,7 +38,7 @@ LINE_PRIOR_M = 3.0
 
 
 @dataclass(frozen=True)
-class Weighting:
+class Weighting(Bounded, error=SlamError):
     """The cost function and the unknowns."""
 
     loss: LossKind = "none"  # robust loss of landmark rows; odometry always has full weight
@@ -52,9 +52,6 @@ class Weighting:
     # the row that the calibrated camera would have written is compared with the actual one, to
     # which that covariance belongs.
     row_errors: RowErrors = "recorded"
-
-    def __post_init__(self) -> None:
-        demand_fields(self, SlamError)
 
     @property
     def unknown_mounting(self) -> list[int]:

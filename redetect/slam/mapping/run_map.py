@@ -29,6 +29,7 @@ from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, 
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
+from redetect.tables import plain
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
@@ -113,10 +114,8 @@ def table_lines(table: ChiSquared) -> list[str]:
 
 def as_json(table: ChiSquared | OdometryCheck) -> dict[str, float | int | None]:
     """A table for a JSON file; NaN becomes null."""
-    return {
-        name: None if isinstance(value, float) and math.isnan(value) else value
-        for name, value in asdict(table).items()
-    }
+    figures: dict[str, float | int | None] = plain(asdict(table))
+    return figures
 
 
 @dataclass(frozen=True)

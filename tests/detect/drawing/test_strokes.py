@@ -22,7 +22,9 @@ def marked(canvas: NDArray[np.uint8], above: int = 0) -> tuple[int, int]:
     return int(np.sum(rows > above)), int(np.sum(columns > above))
 
 
-@pytest.mark.parametrize(("columns", "times"), [(320, 1), (768, 1), (1536, 2), (2250, 3), (4000, 5)])
+@pytest.mark.parametrize(
+    ("columns", "times"), [(320, 1), (768, 1), (1536, 2), (2250, 3), (4000, 5)]
+)
 def test_strokes_and_words_grow_with_the_picture(columns: int, times: int) -> None:
     canvas = np.zeros((200, columns, 3), np.uint8)
     assert enlargement(canvas) == times

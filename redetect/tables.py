@@ -1,12 +1,14 @@
-"""Results as tables: data frames, JSON, HTML."""
+"""Results as tables: data frames, JSON, HTML; results with arrays are equal if all values are."""
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from typing import Any, Literal, get_args
 
@@ -24,12 +26,24 @@ class ResultError(OneLineError, ValueError):
     """A result that cannot be converted to the requested form."""
 
 
-class Table:
+class ByContent:
+    """Base class of dataclasses with arrays: equal if all values are."""
+
+    def __eq__(self, other: object) -> bool:
+        return alike(self, other)
+
+
+class Table(ByContent):
     """A result with columns; base class of all results."""
 
     def columns(self) -> dict[str, Sequence[Any]]:
         """Columns of equal length by name; names end with the unit."""
         raise NotImplementedError
+
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as dicts with JSON's types."""
+        columns = plain(self.columns())
+        return [dict(zip(columns, values)) for values in zip(*columns.values())]
 
     def to_dataframe(self, library: FrameLibrary | None = None) -> Any:
         """The columns as a data frame.
@@ -41,7 +55,7 @@ class Table:
 
         Raises
         ------
-        redetect.interface.tables.ResultError
+        redetect.tables.ResultError
             If it is not installed.
         """
         wanted = get_args(FrameLibrary) if library is None else (library,)
@@ -65,7 +79,21 @@ class Table:
         return f"<{type(self).__name__}: {rows} rows of {', '.join(columns)}>"
 
     def _repr_html_(self) -> str:
-        return html_table(self.columns())
+        return html_picture(self) + html_table(self.columns())
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two values, arrays or records of such are equal; NaN equals NaN."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+    if is_dataclass(one):
+        compared = [field.name for field in fields(one) if field.compare]
+        return all(alike(getattr(one, name), getattr(other, name)) for name in compared)
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return bool(one == other or (one != one and other != other))
 
 
 def plain(value: Any) -> Any:
@@ -81,11 +109,15 @@ def plain(value: Any) -> Any:
 
 def covariance_columns(covariance: Any) -> dict[str, Sequence[Any]]:
     """Columns of (N, 2, 2) covariances of positions, square metres."""
-    return {
-        "cxx_m2": covariance[:, 0, 0],
-        "cxy_m2": covariance[:, 0, 1],
-        "cyy_m2": covariance[:, 1, 1],
-    }
+    return dict(zip(("cxx_m2", "cxy_m2", "cyy_m2"), covariance[:, (0, 0, 1), (0, 1, 1)].T))
+
+
+def html_picture(shown: Any) -> str:
+    """What a notebook shows as a picture, if anything, as HTML with embedded content."""
+    if not hasattr(shown, "_repr_png_"):
+        return ""
+    content = base64.b64encode(shown._repr_png_()).decode()
+    return f'<img alt="{html.escape(repr(shown))}" src="data:image/png;base64,{content}"/>'
 
 
 def html_table(columns: Mapping[str, Sequence[Any]]) -> str:
