@@ -252,8 +252,10 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
     """The settings on which the table of outlines depends."""
     inner, outer = settings.inner_radius_m, settings.outer_radius_m
     return DiscShape(
-        inner, outer, settings.samples, settings.border_px, settings.far_limit_m_per_px,
-        settings.least_pairs, settings.apart_px, stride_m=settings.stride * (outer - inner),
+        inner_radius_m=inner, outer_radius_m=outer, samples=settings.samples,
+        border_px=settings.border_px, far_limit_m_per_px=settings.far_limit_m_per_px,
+        least_pairs=settings.least_pairs, apart_px=settings.apart_px,
+        stride_m=settings.stride * (outer - inner),
     )  # fmt: skip
 
 

@@ -7,7 +7,8 @@ from rich.console import Console
 from rich.table import Table
 
 from camera import Camera, camera_in, read_camera
-from detect.discs.unfound import Explanation, explain_discs
+from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.drawing.frame import draw_explanation, png_of
 from detect.errors import DetectError
 from detect.options import Explain
 from detect.sources.interface import RunFrame, read_image, still
@@ -30,7 +31,7 @@ def perform(command: Explain) -> int:
     found = explain_discs(image, camera, command.detector, command.at)
     _print(found)
     if command.output is not None:
-        write_bytes(command.output, found._repr_png_(), overwrite=command.force)
+        write_bytes(command.output, png_of(draw_explanation(found)), overwrite=command.force)
         print(f"{command.output}: {counted(len(found.candidates), 'candidate')}")
     if command.json is not None:
         write_bytes(command.json, f"{found.to_json()}\n".encode(), overwrite=command.force)
@@ -50,7 +51,7 @@ def _camera(command: Explain) -> Camera:
     )
 
 
-def _print(found: Explanation) -> None:
+def _print(found: DiscExplanation) -> None:
     console = Console()
     if found.place:
         console.print(found.place, highlight=False, markup=False)

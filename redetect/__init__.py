@@ -19,11 +19,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from camera import Camera
-    from detect.discs.unfound import Explanation
     from detect.line_settings import LineSettings
     from detect.options import CompareOptions
     from detect.settings import CircleSettings
-    from redetect.interface.detection import Detection, detect, explain
+    from redetect.interface.detection import Detection, Explanation, detect, explain
     from redetect.interface.maps import Localization, RunMap, localize
     from redetect.interface.maps import map_landmarks as map
     from redetect.interface.recordings import Recording, compare
@@ -32,11 +31,10 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "camera": ["Camera"],
-    "detect.discs.unfound": ["Explanation"],
     "detect.line_settings": ["LineSettings"],
     "detect.options": ["CompareOptions"],
     "detect.settings": ["CircleSettings"],
-    "redetect.interface.detection": ["Detection", "detect", "explain"],
+    "redetect.interface.detection": ["Detection", "Explanation", "detect", "explain"],
     "redetect.interface.maps": ["Localization", "RunMap", "localize", "map"],
     "redetect.interface.recordings": ["Recording", "compare", "open"],
     "redetect.messages": ["Error"],

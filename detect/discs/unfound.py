@@ -12,8 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from html import escape
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -28,17 +27,14 @@ from detect.circles import (
 )
 from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, Judgement
 from detect.discs.radius import FACTOR, find_radius
-from detect.drawing import frame as drawing
 from detect.grey_values import estimate_noise
-from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
-from redetect.array_types import ByteArray, FloatArray, GreyImage
+from redetect.array_types import FloatArray, GreyImage
 from redetect.messages import counted
 from redetect.tables import Table
 
 Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
-_COLOURS = drawing.colours_of(get_args(Stage))
 
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
@@ -83,7 +79,7 @@ class Candidate(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Explanation(Table):
+class DiscExplanation(Table):
     """Candidates of an image with the stage and the number that rejected them, and suggestions.
 
     Attributes
@@ -127,23 +123,6 @@ class Explanation(Table):
         }
         return json.dumps(content, indent=1, allow_nan=False)
 
-    def picture(self) -> ByteArray:
-        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
-        canvas = drawing.canvas_of(self.image, self.camera)
-        for number, candidate in enumerate(self.candidates, start=1):
-            colour, place = _COLOURS[candidate.stage], (candidate.x_m, candidate.y_m)
-            rim = self.camera.project_floor(circle_on_floor(place, self.settings.radius_m))
-            drawing.draw_curve(canvas, rim, colour, closed=True)
-            beside = (float(rim[:, 0].max()), candidate.v)
-            drawing.draw_text(canvas, f"{number}", beside, colour, shift=(2, 4))
-        if self.at is not None:
-            for arm in ([6.0, 0.0], [0.0, 6.0]):
-                line = self.at + np.outer([-1.0, 1.0], arm)
-                drawing.draw_curve(canvas, line, drawing.LINE_COLOUR)
-        counts = Counter(candidate.stage for candidate in self.candidates)
-        words = [(f"{stage}: {count}", _COLOURS[stage]) for stage, count in counts.items()]
-        return drawing.with_legend(canvas, words, 190, 0.38)
-
     def __str__(self) -> str:
         lines = [self.place] if self.place else []
         lines += [
@@ -152,18 +131,11 @@ class Explanation(Table):
         ]
         return "\n".join([*lines, *self.suggestions])
 
-    def _repr_png_(self) -> bytes:
-        return drawing.png_of(self.picture())
-
-    def _repr_html_(self) -> str:
-        words = "".join(f"<p>{escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
-        return words + super()._repr_html_()
-
 
 def explain_discs(
     image: GreyImage, camera: Camera, settings: CircleSettings,
     at: tuple[float, float] | None = None,
-) -> Explanation:  # fmt: skip
+) -> DiscExplanation:  # fmt: skip
     """Explain what was found in an image and what was not.
 
     Parameters
@@ -185,7 +157,7 @@ def explain_discs(
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
     candidates.sort(key=lambda c: (not c.is_disc, -c.votes))
     suggestions = tuple(_suggestions(scene, at))
-    return Explanation(image, camera, settings, at, tuple(candidates), place, suggestions)
+    return DiscExplanation(image, camera, settings, at, tuple(candidates), place, suggestions)
 
 
 def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:
@@ -317,15 +289,15 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
     by_polarity = gained(replace(settings, polarity="any")) if settings.polarity != "any" else 0
     if by_polarity > 0:
         yield f"--polarity any finds {by_polarity} {where}."
-    radius_m, discs = None, "a disc there"
+    radius_m, gain = None, "a disc there"
     if at is not None and by_polarity <= 0:
         radius_m = _radius_at(scene, at)
     elif at is None and not here:
         estimate = find_radius([scene.image], scene.camera, replace(settings, polarity="any"))
         if estimate is not None:
-            radius_m, discs = estimate.radius_m, counted(estimate.discs, "disc")
+            radius_m, gain = estimate.radius_m, counted(estimate.discs, "disc")
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
-        yield f"--radius-m {radius_m:.3f} finds {discs}."
+        yield f"--radius-m {radius_m:.3f} finds {gain}."
     rims = scene.judgement[1]
     discs = (rims.fate == JUDGED) & (rims.log_odds > settings.evidence)
     sizes = rims.radius[discs] / (RIM_RADIUS * settings.radius_m)

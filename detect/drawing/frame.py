@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
+from detect.discs.unfound import DiscExplanation, Stage
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
@@ -302,7 +304,7 @@ def with_legend(
     return np.concatenate([canvas, legend])
 
 
-def colours_of(names: Sequence[str]) -> dict[str, Colour]:
+def _colours(names: Sequence[str]) -> dict[str, Colour]:
     """Distinct colours, always the same; the first is for accepted ones."""
     hues = np.linspace(128, 298, len(names)) % 256  # from cyan to yellow: no green
     colours = cv2.applyColorMap(hues.astype(np.uint8)[:, None], cv2.COLORMAP_HSV)[:, 0]
@@ -310,7 +312,8 @@ def colours_of(names: Sequence[str]) -> dict[str, Colour]:
     return dict(zip(names, [LINE_COLOUR, *map(tuple, pale)], strict=True))
 
 
-_FATE_COLOURS = colours_of(FATES)
+_FATE_COLOURS = _colours(FATES)
+_STAGE_COLOURS = _colours(get_args(Stage))
 
 
 def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -> ByteArray:
@@ -332,6 +335,23 @@ def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> 
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
     return with_legend(picture, words, 210, 0.36)
+
+
+def draw_explanation(found: DiscExplanation) -> ByteArray:
+    """Draw candidates for discs, coloured by their fates and numbered in order, with a legend."""
+    canvas = canvas_of(found.image, found.camera)
+    for number, candidate in enumerate(found.candidates, start=1):
+        colour, place = _STAGE_COLOURS[candidate.stage], (candidate.x_m, candidate.y_m)
+        rim = found.camera.project_floor(circle_on_floor(place, found.settings.radius_m))
+        draw_curve(canvas, rim, colour, closed=True)
+        beside = (float(rim[:, 0].max()), candidate.v)
+        draw_text(canvas, f"{number}", beside, colour, shift=(2, 4))
+    if found.at is not None:
+        for arm in ([6.0, 0.0], [0.0, 6.0]):
+            draw_curve(canvas, found.at + np.outer([-1.0, 1.0], arm), LINE_COLOUR)
+    counts = Counter(candidate.stage for candidate in found.candidates)
+    words = [(f"{stage}: {count}", _STAGE_COLOURS[stage]) for stage, count in counts.items()]
+    return with_legend(canvas, words, 190, 0.38)
 
 
 def track_pixels(tracks: LineTracks, table: VerticalTable, t: int) -> FloatArray:

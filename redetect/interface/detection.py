@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.unfound import Explanation, explain_discs
-from detect.drawing.frame import draw_rows, png_of
+from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.drawing.frame import draw_explanation, draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
@@ -199,7 +199,7 @@ class Detection(Table):
         return json.dumps(content, indent=1, allow_nan=False)
 
     def picture(self) -> NDArray[np.uint8]:
-        """(H + h, W, 3) the image with the detections, in OpenCV's order blue, green, red."""
+        """(S H + h, S W, 3) the image with the detections: blue, green, red; see `draw_rows`."""
         rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
         sight = Sight.by(self.camera, self.settings)
         return draw_rows(self.image, sight, rows, self.settings, self.name)
@@ -402,6 +402,28 @@ def _tilt_of(tilt: FrameTilt | None, axes: Axes) -> Tilt | None:
     return Tilt(tilt.pitch, sign * tilt.roll, covariance, tilt.lines)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(DiscExplanation):
+    """Why discs of an image were found or not: candidates, suggestions, and their picture.
+
+    Attributes
+    ----------
+    image, camera, settings, at, candidates, place, suggestions
+        Those of `detect.discs.unfound.DiscExplanation`.
+    """
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(H + h, W, 3) the image with its candidates, in OpenCV's order blue, green, red."""
+        return draw_explanation(self)
+
+    def _repr_png_(self) -> bytes:
+        return png_of(self.picture())
+
+    def _repr_html_(self) -> str:
+        words = "".join(f"<p>{html.escape(w)}</p>" for w in (self.place, *self.suggestions) if w)
+        return words + super()._repr_html_()
+
+
 @keywords_named()
 def explain(
     image: ImageLike,
@@ -436,4 +458,4 @@ def explain(
     chosen = settings_of(settings, radius_m, polarity)
     if at is not None and (np.shape(at) != (2,) or not np.isreal(at).all()):
         raise DetectError(f"at is {excerpt(at)}: expected a pixel (u, v)")
-    return explain_discs(read_image(frame, camera), camera, chosen, at)
+    return Explanation(**vars(explain_discs(read_image(frame, camera), camera, chosen, at)))

@@ -101,8 +101,13 @@ def as_localisation(
     spread = np.zeros((len(aligned), POSE, POSE))
     spread[:, :2, :2] = by_motion @ position.mean_covariance @ np.swapaxes(by_motion, 1, 2)
     spread[:, 2, 2] = heading.mean_covariance[0, 0]
-    times = (position.correlation_s, heading.correlation_s)
-    found = LocalisationErrors(position.sigma, heading.sigma, *times, float(heading.mean[0]))
+    found = LocalisationErrors(
+        position_sigma=position.sigma,
+        heading_sigma=heading.sigma,
+        position_correlation_s=position.correlation_s,
+        heading_correlation_s=heading.correlation_s,
+        heading_offset=float(heading.mean[0]),
+    )
     aligned = PlanarPoses(aligned.times_s, aligned.poses, spread)
     return _bridged(path, aligned, problem.measured_s, found), found
 

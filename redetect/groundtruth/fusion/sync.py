@@ -208,11 +208,18 @@ def _segment(
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
     return [
         ClockSegment(
-            float(segment.times_s[0]), float(segment.times_s[-1]), reference_s, offset_s,
-            1.0 + drift, float(np.angle(np.mean(np.exp(1j * angles)))), float(best.sigmas[0]),
-            float(best.sigmas[1]), turned, "at a bound" if at_bound else "ok",
+            from_s=float(segment.times_s[0]),
+            to_s=float(segment.times_s[-1]),
+            reference_s=reference_s,
+            offset_s=offset_s,
+            rate=1.0 + drift,
+            angle_rad=float(np.angle(np.mean(np.exp(1j * angles)))),
+            sigma_offset_s=float(best.sigmas[0]),
+            sigma_rate=float(best.sigmas[1]),
+            turned_rad=turned,
+            status="at a bound" if at_bound else "ok",
         )
-    ]  # fmt: skip
+    ]
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
@@ -273,22 +280,16 @@ def _most_likely_clock(
         noise *= math.sqrt(variance_inflation(problem, noise))
         if found is None:
             inward = np.where(clock > 0.0, -unit, unit)
-            clock = (
-                unit
-                * minimize(
-                    lambda x, unit: deviance(x * unit),
-                    clock / unit,
-                    (unit,),
-                    method="Nelder-Mead",
-                    bounds=Bounds(-largest / unit, largest / unit),
-                    options={
-                        "xatol": 0.05,
-                        "fatol": 0.1,
-                        "initial_simplex": (clock + np.vstack([np.zeros(2), np.diag(inward)]))
-                        / unit,
-                    },
-                ).x
+            corners = (clock + np.vstack([np.zeros(2), np.diag(inward)])) / unit
+            descended = minimize(
+                lambda x, unit: deviance(x * unit),
+                clock / unit,
+                (unit,),
+                method="Nelder-Mead",
+                bounds=Bounds(-largest / unit, largest / unit),
+                options={"xatol": 0.05, "fatol": 0.1, "initial_simplex": corners},
             )
+            clock = unit * descended.x
         found = _parabola(deviance, clock, unit, largest)
         if found is None:
             return None

@@ -149,8 +149,9 @@ def align_scanners(
         for scanner, pose, block in zip(scanners, fit.poses, blocks)
     )
     return Alignment(
-        placed, steps, shares, fit.used, fit.rms_m, covariance, fit.map_sigma_m, undetermined,
-        inconsistent,
+        scanners=placed, steps=steps, pairs=shares, matched=fit.used, rms_m=fit.rms_m,
+        covariance=covariance, map_sigma_m=fit.map_sigma_m, undetermined=undetermined,
+        inconsistent=inconsistent,
     )  # fmt: skip
 
 

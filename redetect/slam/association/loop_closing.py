@@ -243,7 +243,8 @@ def closed_path(path: FloatArray, matches: Sequence[Match], lost: IntArray) -> F
     Takes `path` (N + 1, 3), and the lost steps; returns (N + 1, 3).
     """
     count = len(path) - 1
-    first, second = 1 + np.array([(m.earlier_frame, m.later_frame) for m in matches]).T
+    first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)
+    second = np.array([m.later_frame + 1 for m in matches], dtype=np.int64)
     motion = np.array([m.motion for m in matches])
     moved = np.column_stack([apply(motion, path[second, :2]), path[second, 2] + motion[:, 2]])
     before = np.concatenate([np.arange(count), first])
