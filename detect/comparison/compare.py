@@ -57,6 +57,8 @@ _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files have six digits: a smaller sigma is meaningless.
 LEAST_SIGMA_RAD = 1e-12
 
+#: Deviation from whole pixels that rounding positions to six digits causes.
+_WHOLE_PX = 0.01
 #: Of discs that are compared on the floor, where nothing else is said (m).
 FLOOR_GATE_M = 0.10
 # Breaks ties between pairs of lines, so that the result does not depend on the file's order.
@@ -179,8 +181,16 @@ def compare_frames(
         reference_levelled=sum(wanted[m.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.name].levelled_by is not None for m in matches),
         reference_level=sight is not None and sight.reference_level,
+        reference_whole_pixels=_at_whole_pixels(matches),
         pairs=pairs,
     )
+
+
+def _at_whole_pixels(matches: Iterable[FrameMatch]) -> bool:
+    """Whether all matched reference rows are at whole pixels, like those of the data set."""
+    seen = [m.view.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.view]
+    px = np.concatenate([np.zeros((0, 2)), *seen])
+    return len(px) > 0 and bool(np.abs(px - np.rint(px)).max() < _WHOLE_PX)
 
 
 def _image_cost(matches: Iterable[FrameMatch]) -> float:

@@ -188,7 +188,7 @@ class Comparison(Table, ABC):
             extra += f" {aside} on {self.what} that the reference does not list{with_ids}."
         if not self.matched:
             return found, extra, "There are no errors: no rows match."
-        return found, extra, self._errors(), _agreement(self.normalised_error)
+        return found, extra, self._errors(), self._agreement()
 
     def _beyond(self) -> str:
         """More on extra rows if look-alikes are not known."""
@@ -197,6 +197,18 @@ class Comparison(Table, ABC):
     @abstractmethod
     def _errors(self) -> str:
         """A sentence on the errors."""
+
+    def _agreement(self) -> str:
+        """A sentence on whether errors agree with the covariances."""
+        error = self.normalised_error.per_dof
+        if error is None:
+            return "There are no errors to compare with the stated covariances."
+        figure = f"the mean squared normalised error is {error:.2f}"
+        if 0.67 <= error <= 1.5:
+            return f"The errors agree with the stated covariances: {figure}."
+        size = "small" if error > 1.5 else "large"
+        exact = " if the reference has no errors of its own" if error > 1.5 else ""
+        return f"The stated covariances are too {size}{exact}: {figure}."
 
     def figures(self) -> dict[str, Any]:
         """All figures by name, for JSON: always the same names in the same order.
@@ -247,6 +259,7 @@ class DiscComparison(Comparison):
     reference_levelled: int  # number of reference frames with rows levelled by a tilt
     detected_levelled: int
     reference_level: bool  # whether its other rows are level, too, as stated or by the images
+    reference_whole_pixels: bool  # whether its rows are at whole pixels, as published ones are
     pairs: DiscPairs = field(repr=False)
 
     def _beyond(self) -> str:
@@ -264,6 +277,16 @@ class DiscComparison(Comparison):
         if self.reference_level and not self.detected_levelled:
             errors += " They are not corrected for the robot's tilt, which `detect all` does."
         return errors
+
+    def _agreement(self) -> str:
+        error = self.normalised_error.per_dof
+        if not self.reference_whole_pixels or error is None or error <= 1.5:
+            return super()._agreement()
+        return (
+            "The reference's rows are at whole pixels: errors of about a pixel are its own, and do "
+            f"not tell whether the stated covariances are right (the mean squared normalised error "
+            f"is {error:.2f})."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,18 +314,6 @@ def number(value: float | None, decimals: int) -> str:
     if value is None:
         return "-"
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
-
-
-def _agreement(error: NormalisedError) -> str:
-    """A sentence on whether errors agree with the covariances."""
-    if error.per_dof is None:
-        return "There are no errors to compare with the stated covariances."
-    figure = f"the mean squared normalised error is {error.per_dof:.2f}"
-    if 0.67 <= error.per_dof <= 1.5:
-        return f"The errors agree with the stated covariances: {figure}."
-    size = "small" if error.per_dof > 1.5 else "large"
-    exact = " if the reference has no errors of its own" if error.per_dof > 1.5 else ""
-    return f"The stated covariances are too {size}{exact}: {figure}."
 
 
 def quantile(values: FloatArray, q: float = 0.5) -> float | None:
