@@ -11,13 +11,17 @@ from types import MappingProxyType
 from camera import Camera
 from detect.errors import DetectError
 from detect.options import RowFiles
-from detect.runs.outputs import LEVEL, LEVELLED
-from detect.runs.plan import FramesByImage
+from detect.runs.plan import FramesByImage, tilts_by_image
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import word_value
+from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun
-from redetect.landmarks import Frame, FrameTilt, read_tilts
+from redetect.landmarks import Frame, FrameTilt
+
+#: Phrases in the head of files whose positions are levelled, or corrected for the tilt.
+LEVEL = "level robot frame"
+LEVELLED = "corrected for the tilt of the frames that have one"
 
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is the part before the first row; real ones are much shorter.
@@ -101,7 +105,7 @@ class RunRows:
             unlisted = reference["circles"].parent / "unlisted.circles"
             files |= {"unlisted": unlisted} if unlisted.is_file() else {}
         self._frames = {kind: FramesByImage(path) for kind, path in files.items()}
-        self._tilts = read_tilts(detected["tilt"]) if "tilt" in detected else {}
+        self._tilts = tilts_by_image(detected["tilt"]) if "tilt" in detected else {}
 
     @cached_property
     def circle_settings(self) -> CircleSettings:
@@ -111,7 +115,7 @@ class RunRows:
     def of(self, prefix: str) -> SeenRows:
         """The rows of an image, by the prefix of its STEP."""
         frames = {kind: source.get(prefix) for kind, source in self._frames.items()}
-        return SeenRows(**frames, tilt=self._tilts.get(prefix))
+        return SeenRows(**frames, tilt=self._tilts.get(image_name(prefix)))
 
     def sight(self, camera: Camera) -> Sight:
         """The projection of discs into the images of a camera."""

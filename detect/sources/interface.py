@@ -34,8 +34,9 @@ from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
 
-#: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
-_BIT_DEPTHS = (8, 10, 12, 14, 16)
+#: Bit depths of cameras; a 16-bit image has the lowest that holds all but this share of its values
+#: (hot pixels).
+_BIT_DEPTHS, _BRIGHTEST = (8, 10, 12, 14, 16), 1e-4
 # Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
 # expand, plus thumbnails and other metadata of cameras.
 _BYTES_PER_PIXEL = 16
@@ -212,9 +213,9 @@ def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
         gray = gray[:, :, 0]
     if dtype == np.uint8:
         return gray
-    largest = int(gray.max())
-    bits = next(depth for depth in _BIT_DEPTHS if not largest >> depth)
-    return (gray >> (bits - 8)).astype(np.uint8)
+    few = _BRIGHTEST * gray.size
+    bits = next(bits for bits in _BIT_DEPTHS if np.count_nonzero(gray >> bits) <= few)
+    return np.asarray(np.minimum(gray >> (bits - 8), 255), np.uint8)
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:

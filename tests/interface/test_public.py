@@ -344,6 +344,22 @@ def test_every_disc_that_is_found_is_explained(
     assert "data:image/png" in why._repr_html_()
 
 
+def test_a_disc_whose_centre_is_cut_off(
+    found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
+) -> None:
+    """The image ends two columns before the centre of its clearest disc."""
+    image = np.asarray(cv2.imread(str(demo_image), cv2.IMREAD_GRAYSCALE), np.uint8)
+    clearest = int(np.argmax(found.discs.evidence))
+    width = int(found.discs.u[clearest]) - 2
+    why = rd.explain(image[:, :width].copy(), replace(demo_camera, width=width))
+    (cut,) = [row for row in why.candidates if row.stage == "outside"]
+    assert (cut.u, cut.v) == pytest.approx(
+        (found.discs.u[clearest], found.discs.v[clearest]), abs=1.5
+    )
+    assert "centre is outside the image" in cut.reason()
+    assert json.loads(why.to_json())
+
+
 def test_the_wrong_polarity_is_named(
     found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
 ) -> None:
