@@ -95,7 +95,7 @@ def detect_lines(
     table : VerticalTable
         The table of the image's camera.
     settings : LineSettings
-        `detect.line_settings.PUBLISHED` are those of the report.
+        `detect.line_settings.REPORT` are those of the report.
 
     Returns
     -------

@@ -1,7 +1,6 @@
 """Processes one frame: image in; verticals, tilts, discs and markers out, and their rows.
 
-Workers import this module; a process that delegates the work needs neither the detectors nor the
-compiler, and does not load them.
+Workers import this module; a process that delegates the work does not need the detectors.
 """
 
 from __future__ import annotations
