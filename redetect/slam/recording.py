@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +38,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 # In the head of files by `detect`: the covariances of their discs include that of a tilt.
-_TILTED, _HEAD_BYTES = b" tilt_sigma_deg=", 1 << 16
+_TILTED = re.compile(rb" refine=True .*tilt_sigma_deg=(?!0(\.0*)?\s)")
+_HEAD_BYTES = 1 << 16
 # Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
@@ -263,7 +265,7 @@ def read_recording(
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
     with files[0].open("rb") as stream:
-        return replace(found, tilted=_TILTED in stream.read(_HEAD_BYTES))
+        return replace(found, tilted=bool(_TILTED.search(stream.read(_HEAD_BYTES))))
 
 
 def recording_of_frames(
