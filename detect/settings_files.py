@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
+from redetect.bounds import expectation
 from redetect.messages import excerpt
 
 _LONGEST_BYTES = 1 << 24
@@ -80,14 +81,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     try:
         return _of_type(hints[name], value)
     except (TypeError, OverflowError):
-        kinds: dict[Any, str] = {
-            bool: "True or False", int: "a whole number", float: "a number",
-            float | None: "a number or none",
-        }  # fmt: skip
-        words = ", ".join(map(str, get_args(hints[name])))
-        expected = kinds.get(hints[name], f"one of {words}")
-        if get_origin(hints[name]) is tuple:
-            expected = "a list of numbers, or of pairs of them"
+        expected = expectation(hints[name])
         raise DetectError(f"{name} is {excerpt(value)}: expected {expected}") from None
 
 
