@@ -25,11 +25,11 @@ from camera import Camera
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
-from detect.errors import DetectError, FrameError, imported_for
+from detect.errors import DetectError, FrameError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
-from redetect.messages import OneLineError, excerpt, one_line
+from redetect.messages import OneLineError, excerpt, imported_for, one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -61,7 +61,7 @@ _INDEFINITE = 1e-9
 @contextmanager
 def opened_bag(path: Path) -> Iterator[AnyReader]:
     """Open a bag."""
-    with imported_for(f"{path}: bags are read by the package rosbags", "bags"):
+    with imported_for(f"{path}: bags are read by the package rosbags", "bags", DetectError):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     # Bags of older ROS 2 do not contain the definitions of their messages.
