@@ -32,6 +32,8 @@ _LINE_END = re.compile(r"\r\n|\r|\n")
 # Python's float also reads "1_000", "infinity" and digits of other scripts.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
+_LENS = {"scale_x": "scaleX", "scale_y": "scaleY", "offset_x": "offsetX", "offset_y": "offsetY"}
+
 # A key's value: its tokens, each with its line.
 _Entries = dict[str, list[tuple[str, int]]]
 
@@ -94,17 +96,10 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             raise CameraError(f"{name}:{line}: {key} is {value}: expected a whole number")
         return int(value)
 
-    def number(key: str) -> float:
-        return numbers(key, 1)[0]
-
     fields: dict[str, Any] = {
         "robot_from_camera": np.reshape(numbers("sensor2World", 12), (3, 4)),
-        "width": whole("width"),
-        "height": whole("height"),
-        "scale_x": number("scaleX"),
-        "scale_y": number("scaleY"),
-        "offset_x": number("offsetX"),
-        "offset_y": number("offsetY"),
+        **{key: whole(key) for key in ("width", "height")},
+        **{name: numbers(key, 1)[0] for name, key in _LENS.items()},
         "coef": numbers("coef", 5),
     }
     if "sensor2Tcp" in entries:
@@ -129,11 +124,8 @@ def format_camera(camera: Camera) -> str:
         lines += _pose_lines("sensor2Tcp", camera.sensor_to_tcp)
     lines += _pose_lines("sensor2World", camera.robot_from_camera)
     lines.append(f"mountIndex: {camera.mount_index}")
-    lines.append(
-        f"width: {camera.width} height: {camera.height} "
-        f"scaleX: {_shortest(camera.scale_x)} scaleY: {_shortest(camera.scale_y)} "
-        f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
-    )
+    pinhole = " ".join(f"{key}: {_shortest(x)}" for key, x in zip(_LENS.values(), camera.pinhole))
+    lines.append(f"width: {camera.width} height: {camera.height} {pinhole}")
     for key in ("coef", "tangential", "polynomial"):
         terms = getattr(camera, key)
         if key == "coef" or any(terms):

@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from camera import model_checks as checks
 from camera.distortion import (
     NO_POLYNOMIAL,
     NOT_TANGENTIAL,
@@ -29,20 +30,12 @@ from camera.distortion import (
     Coef,
     Polynomial,
     Tangential,
-    brown_shift,
     distorted_jacobian,
     one_to_one_radius,
     radial_factor,
     straightened,
+    tangential_shift,
     undistorted_radius,
-)
-from camera.model_checks import (
-    check_numbers,
-    check_one_to_one,
-    checked_covariance,
-    checked_pose,
-    checked_whole,
-    seen_share,
 )
 from redetect.array_types import FloatArray
 
@@ -112,20 +105,20 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
-            object.__setattr__(self, name, checked_whole(name, getattr(self, name)))
+            object.__setattr__(self, name, checks.checked_whole(name, getattr(self, name)))
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         for name in ("coef", "tangential", "polynomial"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
-        pose = checked_pose("sensor2World", self.robot_from_camera)
+        pose = checks.checked_pose("sensor2World", self.robot_from_camera)
         object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:
-            pose = checked_pose("sensor2Tcp", self.sensor_to_tcp)
+            pose = checks.checked_pose("sensor2Tcp", self.sensor_to_tcp)
             object.__setattr__(self, "sensor_to_tcp", pose)
         if self.covariance is not None:
-            covariance = checked_covariance(self.covariance, PARAMETERS)
+            covariance = checks.checked_covariance(self.covariance, PARAMETERS)
             object.__setattr__(self, "covariance", covariance)
-        check_numbers(self)
-        check_one_to_one(self)
+        checks.check_numbers(self)
+        checks.check_one_to_one(self)
 
     def __hash__(self) -> int:
         # By a digest that is kept: tables are looked up by the camera, image by image.
@@ -169,7 +162,7 @@ class Camera:
     @cached_property
     def seen_share(self) -> float:
         """Share of the image that sees anything: less than 1 where the distortion folds in it."""
-        return seen_share(self)
+        return checks.seen_share(self)
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
@@ -218,14 +211,11 @@ class Camera:
 
         Both NaN past the distortion's fold.
         """
-        xy, radius = self._before_fold(normalised)
-        factor = radial_factor(radius, self.coef)
-        u = self.scale_x * xy[..., 0] * factor
-        v = self.scale_y * xy[..., 1] * factor
-        if any(self.brown):
-            shift = brown_shift(xy, self.brown)
-            u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
-        return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
+        (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
+        pixels = scale * xy * radial_factor(radius, self.coef, self.polynomial)[..., None]
+        if self.decentred:
+            pixels = pixels + scale * tangential_shift(xy, self.tangential)
+        return np.asarray(pixels + self.pinhole[2:])
 
     def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(..., 2) coordinates and their (...) radii, NaN past the fold."""

@@ -50,7 +50,14 @@ def find_board(
         If the board is not there, or too little of a ChArUco board is.
     """
     if board.kind == "charuco":
-        return _charuco(image, board)
+        indices, pixels = find_charuco(image, board)
+        if len(indices) < _FEWEST_POINTS:
+            raise CalibrationError(
+                f"{len(indices)} corners of a {board} in the image: expected at least "
+                f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
+                "sharp and large enough to be read?"
+            )
+        return indices, pixels
     if board.kind == "checkerboard":
         grid = _checkerboard(image, board, window)
     else:
@@ -162,17 +169,6 @@ def _from_the_front(grid: FloatArray) -> FloatArray:
     if np.sum(right[:, 0]) * np.sum(down[:, 1]) < np.sum(right[:, 1]) * np.sum(down[:, 0]):
         return grid[:, ::-1]
     return grid
-
-
-def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    indices, pixels = find_charuco(image, board)
-    if len(indices) < _FEWEST_POINTS:
-        raise CalibrationError(
-            f"{len(indices)} corners of a {board} in the image: expected at least "
-            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
-            "sharp and large enough to be read?"
-        )
-    return indices, pixels
 
 
 def _least_spacing(grid: NDArray[np.float32]) -> float:

@@ -113,7 +113,7 @@ class Adjusted:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance (u and v together) between seen and projected."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+        return rms(self.residuals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +125,11 @@ class _Problem:
     sigma: float
     loss: Loss
 
-    def residuals(self, at: Estimate) -> FloatArray:
-        """(N, 2) seen less projected (px)."""
-        return self.points.pixels - project_estimate(at, self.points)[0]
-
     def cost(self, at: Estimate) -> float:
         if not is_possible(at.intrinsics, self.points.width, self.points.height):
             return float("inf")
         with np.errstate(invalid="ignore"):
-            seen = self.residuals(at).reshape(-1, 1) / self.sigma
+            seen = residuals_of(at, self.points).reshape(-1, 1) / self.sigma
             return robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
 
     def linear(self, at: Estimate) -> Linear:
@@ -182,6 +178,20 @@ def project_estimate(
     return pixels, by_intrinsics, by_pose
 
 
+def residuals_of(estimate: Estimate, points: Points, radius_m: float = 0.0) -> FloatArray:
+    """(N, 2) seen less projected (px); of circles with a radius, their centroids."""
+    residuals = points.pixels - project_estimate(estimate, points)[0]
+    if radius_m > 0.0:
+        shifts = circle_shifts(estimate, points, radius_m)
+        residuals = residuals - np.where(np.isfinite(shifts), shifts, 0.0)
+    return residuals
+
+
+def rms(residuals: FloatArray) -> float:
+    """Root of the mean squared length of residuals (N, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
 def adjust(
     start: Estimate,
     points: Points,
@@ -211,7 +221,7 @@ def adjust(
 
 def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
     """Standard deviation of a coordinate from the median residual, robust against outliers."""
-    residuals = points.pixels - project_estimate(estimate, points)[0]
+    residuals = residuals_of(estimate, points)
     unknown = free + 6 * len(points.counts)
     share = max(1.0 - unknown / residuals.size, 0.1)
     return max(float(1.4826 * np.median(np.abs(residuals)) / np.sqrt(share)), 1e-9)
@@ -219,7 +229,7 @@ def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
 
 def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adjusted:
     points, span, sigma = problem.points, problem.span, problem.sigma
-    residuals = problem.residuals(estimate)
+    residuals = residuals_of(estimate, points)
     _, weights = robustified((residuals / sigma) ** 2, problem.loss)
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.

@@ -10,13 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.boards.board import Board
-from camera.calibration.adjustment import (
-    Adjusted,
-    Estimate,
-    Points,
-    circle_shifts,
-    project_estimate,
-)
+from camera.calibration.adjustment import Adjusted, Estimate, Points, residuals_of
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
     ALL_THE_SAME,
@@ -264,11 +258,7 @@ def _without_wrong_points(
     """Exclude points that were found wrongly; the second result is their number."""
     if not settings.robust:
         return points, 0
-    seen = points.pixels
-    if radius_m > 0.0:
-        shifts = circle_shifts(estimate, points, radius_m)
-        seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
-    residuals = seen - project_estimate(estimate, points)[0]
+    residuals = residuals_of(estimate, points, radius_m)
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
     # A picture with too few remaining points is unchanged: the robust loss handles it.
     right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]

@@ -13,9 +13,9 @@ from camera.calibration.adjustment import (
     Estimate,
     Points,
     adjust,
-    circle_shifts,
     fit_points,
-    project_estimate,
+    residuals_of,
+    rms,
 )
 from camera.calibration.model import (
     COUNT,
@@ -131,7 +131,7 @@ def _fitted(
 ) -> Candidates:
     """Each lens fitted from where the last ended, or from the fullest fit if that got stuck."""
     tried: Candidates = {}
-    much = _STUCK * _rms_px(full, points, radius_m)
+    much = _STUCK * rms(residuals_of(full, points, radius_m))
     for lens in lenses:
         adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
         if lens.coefficients >= _CAN_BE_STUCK and adjusted.rms_px > much:
@@ -148,13 +148,6 @@ def _fitted(
         )
         tried[lens] = Candidate(adjusted, seen, error)
     return tried
-
-
-def _rms_px(estimate: Estimate, points: Points, radius_m: float) -> float:
-    residuals = points.pixels - project_estimate(estimate, points)[0]
-    if radius_m > 0.0:
-        residuals = residuals - circle_shifts(estimate, points, radius_m)
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _fewest_needed(tried: Candidates) -> FreeLens:

@@ -33,7 +33,9 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
     videos: list[Path] = []
     for path in inputs:
         if path.is_dir():
-            images += sorted(p for p in path.iterdir() if _is_image(p))
+            # Hidden files are skipped: some systems keep metadata in ones named ._ and the image.
+            visible = [each for each in path.iterdir() if not each.name.startswith(".")]
+            images += sorted(p for p in visible if p.suffix.lower() in IMAGE_SUFFIXES)
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -45,7 +47,10 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
             f"no pictures in {', '.join(str(path) for path in inputs)}: expected files ending in "
             f"{' '.join(IMAGE_SUFFIXES)}, or a video"
         )
-    for path in _evenly(_each_once(images), most):
+    images = _each_once(images)
+    if len(images) > most:
+        images = [images[i] for i in np.linspace(0, len(images) - 1, most).round().astype(int)]
+    for path in images:
         yield path.name, read_grey(path)
     for path in _each_once(videos):
         yield from _frames(path, most)
@@ -90,19 +95,8 @@ def decoded_image(content: bytes) -> NDArray[Any] | None:
         return None
 
 
-def _is_image(path: Path) -> bool:
-    # Hidden files are skipped: some systems keep metadata in files named ._ and the image's name.
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-
-
 def _each_once(paths: list[Path]) -> list[Path]:
     return list({path.resolve(): path for path in reversed(paths)}.values())[::-1]
-
-
-def _evenly(paths: list[Path], most: int) -> list[Path]:
-    if len(paths) <= most:
-        return paths
-    return [paths[i] for i in np.linspace(0, len(paths) - 1, most).round().astype(int)]
 
 
 def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from redetect.messages import one_line
+from redetect.messages import excerpt, one_line
 
 _LARGEST_TEXT_BYTES = 1 << 28
 
@@ -107,17 +107,29 @@ def read_text(
 
 
 def rows_of_numbers(
-    path: str | os.PathLike[str], kind: str, columns: str, error: type[Exception]
+    path: str | os.PathLike[str],
+    kind: str,
+    columns: str,
+    error: type[Exception],
+    *,
+    head: bool = False,
 ) -> Iterator[tuple[str, list[float]]]:
     """The place and the finite numbers of each row of a text file with the given columns.
 
-    They are separated by blanks or commas; ``#`` begins a comment. Other files raise an `error`.
+    They are separated by blanks or commas; ``#`` begins a comment. With a `head`, the names of the
+    columns come first. Other files raise an `error`.
     """
     count = len(columns.split())
     lines = read_text(path, _LARGEST_TEXT_BYTES, kind, error).split("\n")
     for number, line in enumerate(lines, start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
+            continue
+        if head:
+            if " ".join(words).lower() != columns:
+                found, expected = excerpt(line.strip()), columns.replace(" ", ",")
+                raise error(f"{path}:{number}: the header is {found}: expected {expected}")
+            head = False
             continue
         try:
             values = [float(word) for word in words]
