@@ -19,6 +19,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
 from redetect.bounds import expectation
 from redetect.messages import excerpt
+from redetect.storage.bounded import read_text
 
 _LONGEST_BYTES = 1 << 24
 Settings = TypeVar("Settings", CircleSettings, LineSettings, MarkerSettings)
@@ -41,11 +42,9 @@ def read_settings(path: Path) -> SettingsFile:
     DetectError
         If it cannot be read, has no settings, or an unknown or invalid one.
     """
+    text = read_text(path, _LONGEST_BYTES, "settings file", DetectError)
     try:
-        with path.open("rb") as stream:
-            document = json.loads(stream.read(_LONGEST_BYTES))
-    except OSError as error:
-        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
+        document = json.loads(text)
     except (ValueError, RecursionError):  # the latter if it is nested very deeply
         raise DetectError(f"{path}: not JSON: expected settings, as in a .log.json") from None
     given = document.get("settings") if isinstance(document, dict) else None

@@ -97,30 +97,27 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     cv2.Scharr(grey, cv2.CV_64F, 1, 0, dst=gradient[0])
     cv2.Scharr(grey, cv2.CV_64F, 0, 1, dst=gradient[1])
     white = 0.5 * (1.0 - marker_share)
-    rough, result = grid, np.full(grid.shape, np.nan)
-    tried = np.zeros(grid.shape[:2], dtype=bool)
-    while True:
-        # First the given corners, then, ring by ring, the neighbours of those found.
-        known = rough if not tried.any() else result
+    known, result = grid, np.full(grid.shape, np.nan)
+    wanted, tried = np.isfinite(grid[..., 0]), np.zeros(grid.shape[:2], dtype=bool)
+    # First the given corners, then, ring by ring, the neighbours of those found.
+    while wanted.any():
         present = np.isfinite(known[..., 0])
-        wanted = present if not tried.any() else binary_dilation(present, np.ones((3, 3)))
-        wanted = wanted & ~tried
-        if not wanted.any() or present.sum() < _FEWEST_FOUND:
-            return result
         # (3, 3) from (column, row) to pixels, by all corners; None if they are on a line.
-        places = np.argwhere(present)[:, ::-1].astype(np.float64)
-        homography: FloatArray | None = cv2.findHomography(places, known[present])[0]  # type: ignore[assignment]
+        places, pixels = np.argwhere(present)[:, ::-1].astype(np.float64), known[present]
+        if len(places) < _FEWEST_FOUND:
+            break
+        homography: FloatArray | None = cv2.findHomography(places, pixels)[0]  # type: ignore[assignment]
         if homography is None:
-            return result
-        found = result.copy()
+            break
         for row, column in np.argwhere(wanted):
-            tried[row, column] = True
-            at, axes = _expected(homography, places, known[present], np.array([column, row], float))
-            if np.isfinite(known[row, column, 0]):
+            at, axes = _expected(homography, places, pixels, np.array([column, row], float))
+            if present[row, column]:
                 at = known[row, column]
             parity = int(row + column) % 2
-            found[row, column] = _measured(grey, gradient, at, axes, white, parity)
-        result = found
+            result[row, column] = _measured(grey, gradient, at, axes, white, parity)
+        known, tried = result, tried | wanted
+        wanted = binary_dilation(np.isfinite(result[..., 0]), np.ones((3, 3))) & ~tried
+    return result
 
 
 def _expected(

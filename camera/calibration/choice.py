@@ -93,11 +93,10 @@ def _chosen_of_a_kind(
 ) -> tuple[FreeLens, Candidates]:
     """`choose_lens` among rational functions, or polynomials."""
     counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
-    if settings.tangential is True:
-        decentred = [settings.lens(count, tangential=True) for count in counts]
-        tried = fitted(start, decentred)
+    fixed = settings.tangential is True
+    tried = fitted(start, [settings.lens(count, tangential=fixed) for count in counts])
+    if fixed:
         return _fewest_needed(tried), tried
-    tried = fitted(start, [settings.lens(count) for count in counts])
     return _with_tangential(fitted, start, settings, tried)
 
 

@@ -13,6 +13,7 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
@@ -20,9 +21,7 @@ from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
 from redetect.storage.bounded import leads_out, link_out
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
-
 WILDCARDS = frozenset("*?[")
 
 

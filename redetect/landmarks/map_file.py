@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,9 +18,8 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import FINITE, LARGEST_NUMBER
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_bytes
-from redetect.storage.bounded import read_bounded, read_plain_array
+from redetect.storage.bounded import FilePath, read_bounded, read_plain_array
 
-FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
 
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
@@ -170,13 +168,9 @@ def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> Landmark
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise LandmarkFileError(path, None, f"cannot be read: {reason}") from None
-    if found.shape != shape or found.dtype != np.float64:
-        raise LandmarkFileError(
-            path,
-            None,
-            f"{found.dtype} of shape {found.shape}: expected float64 of {shape}, x and y of each "
-            f"landmark of {map_file}",
-        )
+    if found.shape != shape:
+        words = f"is of shape {found.shape}: expected {shape}, x and y of each one of {map_file}"
+        raise LandmarkFileError(path, None, words)
     k = np.arange(len(own))
     blocks = found.reshape(len(own), 2, len(own), 2)[k, :, k, :]
     nearly = _SAME * float(np.max(np.abs(own), initial=0.0))
