@@ -38,10 +38,7 @@ def camera_numbers(camera: Camera) -> FloatArray:
 
 
 def published_camera_numbers(camera: Camera) -> FloatArray:
-    """`camera_numbers` of the data set's own detector.
-
-    It uses the transpose of the rotation, which the file gives in few digits, not the inverse.
-    """
+    """`camera_numbers` of the data set's detector: the rotation's transpose for its inverse."""
     numbers = camera_numbers(camera)
     numbers[10:19] = camera.rotation.T.ravel()
     return numbers

@@ -40,10 +40,7 @@ _tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
-    """The same discs, their positions and covariances corrected for the tilt of their frame.
-
-    Discs above the horizon of the levelled camera are dropped.
-    """
+    """The discs corrected for the tilt of their frame, without those above the level horizon."""
     floor_xy, covariance, down = level_discs(
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
     )
@@ -52,10 +49,7 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
-    """Convert discs of a leaning camera to the floor positions of the camera as calibrated.
-
-    Discs above the horizon of the latter are dropped.
-    """
+    """Discs of a leaning camera at the floor positions of the camera as calibrated, if any."""
     pixels = leaning.project_floor(found.floor_xy)
     floor_xy = camera.floor_from_pixel(pixels)
     jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
@@ -121,10 +115,7 @@ def common_covariance(
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:
-    """(2,) variances of pitch and roll from verticals that are common to all frames, rad^2.
-
-    None if the camera has no covariance.
-    """
+    """(2,) variances of a pitch and roll common to all frames, rad^2; None if they are unknown."""
     covariance = covariance_of(camera)
     if covariance is None:
         return None

@@ -69,10 +69,7 @@ def level_matrix(levelled_by: ArrayLike) -> FloatArray:
 
 
 def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
-    """The camera mounted higher, then leaning by pitch and roll (rad).
-
-    These level directions, about the robot's origin on the floor. The covariance is dropped.
-    """
+    """The camera raised, then leaning by pitch and roll (rad); without its covariance."""
     turn = level_matrix(lean)
     centre = camera.centre + np.array([0.0, 0.0, raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ centre])

@@ -68,10 +68,7 @@ def checked_settings(name: str, values: Any, kind: type[Settings]) -> Settings:
 
 
 def setting_value(kind: type, name: str, value: Any) -> Any:
-    """Convert a JSON value to that of a setting, a field of a dataclass.
-
-    Raises DetectError if there is no such field, or the value has another type.
-    """
+    """A setting's value from JSON; DetectError if it is unknown or has another type."""
     hints = get_type_hints(kind)
     if name not in hints:
         raise DetectError(
@@ -103,10 +100,7 @@ def _of_type(hint: Any, value: Any) -> Any:
 
 
 def word_value(kind: type, name: str, word: str) -> Any:
-    """Convert a word of a command line or of a file's head to the value of a setting.
-
-    Raises DetectError if that fails, or there is no such setting.
-    """
+    """A setting's value from a word; DetectError if it is unknown or that fails."""
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
     for number in (float, int):  # a float setting accepts whole numbers
         with suppress(ValueError):

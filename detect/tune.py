@@ -221,10 +221,7 @@ def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) indices of the settings on the Pareto front of recall and precision.
-
-    By increasing recall; of equals the first. Recalls and precisions (N,) are NaN if undefined.
-    """
+    """(M,) settings on the Pareto front, by increasing recall; NaN rates are undefined."""
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
     # By decreasing recall, then precision: points no better than those before are dominated.

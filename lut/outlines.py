@@ -36,10 +36,7 @@ class TableError(OneLineError, ValueError):
 
 @dataclass(frozen=True)
 class DiscShape:
-    """Samples around a centre, and the nearest and farthest centres.
-
-    The bounds are those of the detector's settings (`detect.settings.CircleSettings`).
-    """
+    """Samples around a centre, nearest and farthest centres; bounds: `CircleSettings`."""
 
     inner_radius_m: float = 0.06  #: Radius of the inner outline on the floor, metres.
     outer_radius_m: float = 0.14  #: Radius of the outer one.
@@ -60,10 +57,7 @@ class DiscShape:
 
 
 class CentreGroups(NamedTuple):
-    """Neighbouring centres with some samples at the same offset from each centre.
-
-    A group's centres are in one row, within `GROUP_COLUMNS` of each other.
-    """
+    """Neighbouring centres in a row, within `GROUP_COLUMNS`, with samples at equal offsets."""
 
     first: NDArray[np.int32]  # (G,) the first centre of each group
     #: (G,) bit mask of the columns of its centres, counted from the first

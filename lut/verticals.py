@@ -193,10 +193,7 @@ def trace_verticals(
 def _crossing(
     numbers: FloatArray, bearing: float, row: float, angle: float
 ) -> tuple[float, float, float]:
-    """Column and elevation at which a vertical crosses a row, and its rows per radian there.
-
-    By Newton's method from an elevation nearby; NaN if there is no crossing.
-    """
+    """Column and elevation where a vertical crosses a row, its rows per radian; NaN if nowhere."""
     for _ in range(_NEWTON_STEPS):
         u, v = _seen(numbers, bearing, angle)
         slope = (_seen(numbers, bearing, angle + _STEP_RAD)[1] - v) / _STEP_RAD

@@ -75,8 +75,7 @@ def both_heights(
 ) -> Iterator[tuple[GreyImage, Callable[[FloatArray], FloatArray]]]:
     """The image, and the image stretched to twice its height, each with its map of pixels back.
 
-    Half-height images flatten squares and circles. Their row v is at 2 v + 0.5 in the stretched
-    image.
+    Half-height images flatten squares and circles; their row v is at 2 v + 0.5 when stretched.
     """
     yield image, lambda pixels: pixels
     height, width = image.shape

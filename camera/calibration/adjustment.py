@@ -165,10 +165,7 @@ class _Problem:
 def project_estimate(
     estimate: Estimate, points: Points
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels of all points, and their derivatives.
-
-    Returns `pixels` (N, 2), `by_intrinsics` (N, 2, 14), `by_pose` (N, 2, 6).
-    """
+    """Pixels (N, 2) of all points, derivatives by intrinsics (N, 2, 14) and poses (N, 2, 6)."""
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
     pixels, by_intrinsics, by_point = project_points(
@@ -201,10 +198,7 @@ def adjust(
     sigma_px: float | None = None,
     tolerance: float = _SMALLEST_DECREASE,
 ) -> Adjusted:
-    """Fit intrinsics and poses by the reprojection error.
-
-    Takes `span` (14, K).
-    """
+    """Fit poses, and intrinsics along a (14, K) `span`, by the reprojection error."""
     estimate = start
     loss = Loss("huber", HUBER) if robust else Loss()
     problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
@@ -255,11 +249,9 @@ def with_terms(
 ) -> FloatArray:
     """(14, 14) expected squared error of a fit's intrinsics if further terms are not exactly 0.
 
-    The terms have a normal prior about 0. One step of Gauss and Newton from the fit, of `span` and
-    terms together, gives their posterior; it is C + d d^T about the fit, where C is its covariance
-    and d its step.
-
-    Takes `span` (14, K), `terms` (14, m), and their priors' standard deviations (m,).
+    The (14, m) terms have a normal prior about 0, of (m,) `sigmas`. One step of Gauss and Newton
+    from the fit, of the (14, K) `span` and terms together, gives their posterior; it is C + d d^T
+    about the fit, where C is its covariance and d its step.
     """
     both = np.hstack([span, terms])
     linear = _Problem(points, both, fit.sigma_px, Loss()).linear(fit.estimate)
@@ -293,8 +285,7 @@ def fit_to_centres(
 ) -> tuple[Adjusted, Points]:
     """Fit to points; with circles, repeatedly, corrected for the shifts by the previous fit.
 
-    `adjusted` fits points, starting from an estimate. Also returns the corrected points
-    (`circle_shifts`).
+    `adjusted` fits points, starting from an estimate; corrected points are returned, too.
     """
     fit = adjusted(start, points)
     corrected = points

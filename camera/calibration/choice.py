@@ -177,8 +177,7 @@ def holdout_error(
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    For held-out points only the poses are fitted. Each view is in one of the `folds`, by default
-    every `_FOLDS`-th.
+    Only poses are fitted to held-out views: each of the `folds`, by default every `_FOLDS`-th.
     """
     every = np.arange(len(points.counts))
     if folds is None:

@@ -87,10 +87,7 @@ def place_on_floor(
     intrinsics_covariance: FloatArray | None = None,
     radius_m: float = 0.0,
 ) -> FloorPose:
-    """The camera's pose from points on the floor.
-
-    Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
-    """
+    """The pose from pixels (N, 2) of floor points (N, 2), with the lens's (14, 14) covariance."""
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor, (camera.width, camera.height))
     points = Points(floor, pixels, np.zeros(len(floor), np.int64), camera.width, camera.height)

@@ -141,10 +141,7 @@ def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Gre
 
 
 def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: float) -> GreyImage:
-    """1 where an image is darker than its closing by the threshold and by `gate` grey levels.
-
-    The darkness of I1 under its closing I2 is 1 - I1/I2.
-    """
+    """1 where I1 is darker than its closing I2: 1 - I1/I2 > threshold, I2 - I1 > `gate`."""
     levels = np.arange(256.0)
     # I1 < limit(I2), for integer grey levels; the limit itself is not dark.
     limit = np.minimum(levels * (1.0 - threshold), levels - gate)
@@ -210,9 +207,6 @@ def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:
 
 
 def pixel_area(polygon: NDArray[np.int32]) -> float:
-    """Number of pixels inside and on a polygon (N, 2) through pixel centres, by Pick's theorem.
-
-    Oblique sides are counted as the digital lines that they represent.
-    """
+    """Number of pixels inside and on a polygon (N, 2) of digital lines, by Pick's theorem."""
     steps = np.abs(polygon - polygon[np.arange(len(polygon)) - 1]).max(axis=1)
     return float(cv2.contourArea(polygon) + 0.5 * steps.sum() + 1.0)

@@ -147,10 +147,7 @@ class Templates:
 
 @functools.lru_cache(maxsize=16)
 def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
-    """Templates of a dictionary's markers: of the given IDs, or of all if there are none.
-
-    Raises DetectError if there is no such dictionary or marker.
-    """
+    """Templates of a dictionary's markers, of some IDs or all; DetectError if one is unknown."""
     dictionary = marker_dictionary(name)
     if ids:
         dictionary = dictionary.only(ids)

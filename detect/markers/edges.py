@@ -146,10 +146,7 @@ def _edges_near(
 
 
 def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray | None:
-    """(R, S, 4) grey values between straight positions (R, 4, 2); None if outside the image.
-
-    They are so close to each other that distortion between them is negligible.
-    """
+    """(R, S, 4) grey values between near straight positions (R, 4, 2); None if outside."""
     ends = picture.bend(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
     height, width = picture.grey.shape
     inside = (ends >= -0.5) & (ends <= np.array([width, height])[:, None, None, None, None] - 0.5)

@@ -87,10 +87,7 @@ def fit_marker(
     *,
     first_look: bool = False,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern by the Gauss-Newton method, starting from its edges.
-
-    None if there is no such marker nearby.
-    """
+    """Fit a marker of a known pattern by Gauss-Newton from its edges; None if there is none."""
     most_pixels, steps = _FIRST_LOOK if first_look else _WHOLE_FIT
     corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))

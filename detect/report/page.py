@@ -276,10 +276,7 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
 
 
 def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:
-    """Tables of the worst frames, and the frames to be shown with the reasons.
-
-    The first one has most discs. Without a reference to rank them, the others are some frames.
-    """
+    """Tables of the worst frames; frames to show with the reasons, first that with most discs."""
     done = {name: seen for name, seen in zip(inputs.names, inputs.rows) if processed(seen)}
     named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []

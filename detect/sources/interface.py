@@ -55,10 +55,7 @@ class RunFrame:
 
 
 class Frames(ABC):
-    """The frames of a run, made on demand.
-
-    Iterating again starts over (with a live camera: from then on).
-    """
+    """The frames of a run, made on demand; iterating again starts over (live: from then on)."""
 
     ships_images = True  # yields contents of images, not files
     expected: int | None = None  # approximate number of frames, if known

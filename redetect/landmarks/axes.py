@@ -32,10 +32,7 @@ _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
 def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = False) -> FloatArray:
-    """Convert vectors, poses or steps from the data set's axes to others, or `back`.
-
-    Takes (..., 2) or (..., 3): x, y and, for poses and steps, the angle; returns the same shape.
-    """
+    """Convert (..., 2 or 3) x, y, angle from the data set's axes to others, or `back`."""
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
         return old

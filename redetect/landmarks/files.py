@@ -78,18 +78,12 @@ def read_rows(path: FilePath) -> Iterator[Row]:
 
 
 def read_frames(path: FilePath) -> Iterator[Frame]:
-    """Read a landmark file frame by frame: each STEP with the landmarks after it.
-
-    Parameters, errors and laziness are those of `read_rows`.
-    """
+    """Read a landmark file frame by frame: each STEP with the landmarks after it (`read_rows`)."""
     return frames_of_rows(read_rows(path))
 
 
 def read_steps(path: FilePath) -> Iterator[Step]:
-    """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
-
-    Parameters, errors and laziness are those of `read_rows`; landmarks are checked and skipped.
-    """
+    """Read the STEP rows of a file of landmarks or odometry; errors as of `read_rows`."""
     return (row.record for row in read_rows(path) if isinstance(row.record, Step))
 
 

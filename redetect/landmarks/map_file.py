@@ -152,10 +152,7 @@ def covariance_file(map_file: Path) -> Path:
 
 
 def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> LandmarkMap:
-    """A map with the joint covariance beside its file; unchanged if there is none.
-
-    Raises LandmarkFileError if that is malformed, or of another map.
-    """
+    """A map with the joint covariance beside its file, if any; malformed: LandmarkFileError."""
     path = covariance_file(map_file)
     if not path.is_file():
         return landmark_map
