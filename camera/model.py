@@ -22,21 +22,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from camera import distortion
 from camera import model_checks as checks
-from camera.distortion import (
-    NO_POLYNOMIAL,
-    NOT_TANGENTIAL,
-    Brown,
-    Coef,
-    Polynomial,
-    Tangential,
-    distorted_jacobian,
-    one_to_one_radius,
-    radial_factor,
-    straightened,
-    tangential_shift,
-    undistorted_radius,
-)
+from camera.distortion import Brown, Coef, Polynomial, Tangential
 from redetect.array_types import FloatArray
 
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -99,8 +87,8 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    tangential: Tangential = NOT_TANGENTIAL
-    polynomial: Polynomial = NO_POLYNOMIAL
+    tangential: Tangential = distortion.NOT_TANGENTIAL
+    polynomial: Polynomial = distortion.NO_POLYNOMIAL
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -157,7 +145,7 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return one_to_one_radius(self.coef, self.brown)
+        return distortion.one_to_one_radius(self.coef, self.brown)
 
     @cached_property
     def seen_share(self) -> float:
@@ -209,9 +197,10 @@ class Camera:
     def distort(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted normalised coordinates; NaN past the fold."""
         (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
-        pixels = scale * xy * radial_factor(radius, self.coef, self.polynomial)[..., None]
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        pixels = scale * xy * factor[..., None]
         if self.decentred:
-            pixels = pixels + scale * tangential_shift(xy, self.tangential)
+            pixels = pixels + scale * distortion.tangential_shift(xy, self.tangential)
         return np.asarray(pixels + self.pinhole[2:])
 
     def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -225,10 +214,11 @@ class Camera:
         """(..., 2) undistorted normalised coordinates of (..., 2) pixels; NaN past the fold."""
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            return straightened(seen, self.coef, self.brown, self.r_max)
+            return distortion.straightened(seen, self.coef, self.brown, self.r_max)
         distorted = np.hypot(seen[..., 0], seen[..., 1])
-        radius = undistorted_radius(distorted, self.coef, self.polynomial)
-        return np.asarray(seen / radial_factor(radius, self.coef, self.polynomial)[..., None])
+        radius = distortion.undistorted_radius(distorted, self.coef, self.polynomial)
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        return np.asarray(seen / factor[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 3) points in the camera frame (m); NaN behind, past the fold."""
@@ -277,7 +267,7 @@ class Camera:
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
         xy, _ = self._before_fold(normalised)
-        jacobian = distorted_jacobian(xy, self.coef, self.brown)
+        jacobian = distortion.distorted_jacobian(xy, self.coef, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:

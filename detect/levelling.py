@@ -74,9 +74,8 @@ def level_discs(
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
     Positions are those of the calibrated camera on a level robot. Pitch and roll (rad) and their
-    covariances are given for each position, (N, 2) and (N, 2, 2), or once for all. The returned
-    covariances are the propagated ones of the positions plus those due to the tilt. If the levelled
-    ray does not meet the floor, numbers are NaN and the mask is false.
+    covariances are given for each, (N, 2) and (N, 2, 2), or once for all; they add to the
+    propagated covariances. NaN, and false in the mask, if the levelled ray misses the floor.
     """
     steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])[:, None]
     level_xy, *ends = level_seen(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
@@ -94,9 +93,8 @@ def common_covariance(
 ) -> FloatArray:
     """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) due to the calibration's errors.
 
-    `unstated_px` is the standard deviation of pixels of a camera without a covariance;
-    `by_verticals`, for each position (N,) or all of them, whether it is levelled by verticals of
-    the same camera.
+    `unstated_px` is the error of a camera without a covariance; `by_verticals`, for each (N,) or
+    all, whether positions are levelled by verticals of the same camera.
     """
     nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)

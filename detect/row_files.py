@@ -28,8 +28,7 @@ _LONGEST_BYTES = 1 << 16
 class FileHead:
     """The known parts of the head of a file of rows.
 
-    Settings that it does not contain have their defaults; a DetectError is raised if one has an
-    impossible value.
+    Missing settings have their defaults; DetectError if one has an impossible value.
     """
 
     comments: tuple[str, ...] = ()  # its lines without comment signs
@@ -122,8 +121,7 @@ class RunRows:
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
     """Find the files of a run's rows, and index them.
 
-    Raises DetectError if there are none, or given reference rows do not exist, and
-    redetect.landmarks.LandmarkFileError if one is malformed.
+    DetectError without any, or given reference rows; LandmarkFileError if one is malformed.
     """
     usual = {
         kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"

@@ -1,8 +1,7 @@
 """Reads and writes settings of detectors, to repeat a run or to change it.
 
-The JSON file beside every result (`detected.log.json`) contains its settings under ``settings``,
-one object for each kind: ``circles``, ``lines``, ``markers``. Settings files have the same form
-without other content; missing kinds and settings have their defaults.
+Like the JSON file beside every result (`detected.log.json`), a file has an object for each kind,
+``circles``, ``lines``, ``markers``, under ``settings``; missing ones have their defaults.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
-A dataclass with many settings annotates its fields instead: `Bounded`, or `demand_fields`.
-
-NaN is always rejected; infinity is rejected unless it means "no limit".
+A dataclass with many settings annotates its fields instead: `Bounded`, or `demand_fields`. NaN is
+always rejected; infinity is rejected unless it means "no limit".
 """
 
 from __future__ import annotations

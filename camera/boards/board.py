@@ -1,13 +1,9 @@
 """``camera board``: calibration boards, their dimensions in metres, and PDF pages at true scale.
 
 A board's frame: origin in the middle of its points, x right, y up, z out of the print, held so that
-
-- the square in a checkerboard's top left corner is black;
-- a ChArUco board's first marker is at the top left, as OpenCV prints it;
-- the first of a circle grid's points is at the top left.
-
-A board's points are in rows from the top left. The print is a list of black shapes in metres, in
-the same frame.
+a checkerboard's top left square is black, or a ChArUco board's first marker (as OpenCV prints it)
+or a circle grid's first point is at the top left. Points are in rows from there; the print is a
+list of black shapes in metres, in the same frame.
 """
 
 from __future__ import annotations

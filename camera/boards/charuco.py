@@ -1,9 +1,8 @@
 """Corners of a ChArUco board: OpenCV reads the markers, and each corner is measured on its edges.
 
-The markers fill most of the white squares. A window around a corner thus contains marker edges,
-which bias the corner. Instead, two strips along the corner's own edges are measured, as wide as the
-white margin between edge and marker. Corners whose markers were not read (small, oblique or cut off
-by the image's border) are searched at positions predicted from their neighbours.
+Markers fill most of the white squares, so that a window around a corner has their edges, too, which
+bias it. Instead, two strips along its own edges are measured, as wide as the white margin. Corners
+whose markers were not read (small, oblique or cut off) are searched where neighbours predict them.
 """
 
 from __future__ import annotations
@@ -153,8 +152,7 @@ def _measured(
     """A corner as the point that its edges' gradients are at right angles to (Foerstner 1987).
 
     The columns of `axes` are the pixels of one square to the right and one down; `white` is the
-    width between edge and marker in squares; `parity` is 0 where the square right below the corner
-    is black. NaN if there is no such corner.
+    margin's width in squares; `parity` is 0 where the square right below is black. NaN if none.
     """
     nothing = np.full(2, np.nan)
     area = abs(float(np.linalg.det(axes)))

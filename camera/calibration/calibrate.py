@@ -10,7 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.boards.board import Board
-from camera.calibration.adjustment import Adjusted, Estimate, Points, residuals_of
+from camera.calibration.adjustment import (
+    Adjusted,
+    Estimate,
+    Points,
+    residuals_of,
+    with_unfitted_terms,
+)
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
     ALL_THE_SAME,
@@ -20,7 +26,6 @@ from camera.calibration.consensus import (
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
-from camera.calibration.unfitted import with_unfitted_terms
 from camera.errors import CalibrationError, CameraError
 from camera.uncertainty import UNPOSED, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray

@@ -70,10 +70,9 @@ class FloorPose:
 
 
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
-    """(N, 3) positions in the robot frame of a board's (N, 3) points.
+    """(N, 3) positions in the robot frame of a board's (N, 3) points, its middle at `origin_xy`.
 
-    The board's middle lies at `origin_xy`; `yaw` is the angle from the robot's X axis to the
-    board's x axis, counterclockwise seen from above (rad).
+    `yaw` (rad) is from the robot's X axis to the board's, counterclockwise seen from above.
     """
     c, s = np.cos(yaw), np.sin(yaw)
     turned = board_points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
@@ -148,8 +147,7 @@ def placed_camera(
 def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, FloatArray, float]:
     """Points on the floor of a .csv file, or of a picture of the board.
 
-    Returns `pixels` (N, 2), places `floor_xy` (N, 2) (robot X, Y in m), and the radius of the
-    circles seen there (m), 0 for points.
+    Their pixels (N, 2), places (N, 2) (robot X, Y, m), and the radius of circles (m), else 0.
     """
     path = options.floor
     if path.suffix.lower() == ".csv":

@@ -24,8 +24,7 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
     """Names and grey images of photographs, folders of them, and videos, one after the other.
 
-    At most `most` images are used, and at most `most` frames of each video, evenly spaced. A file
-    that is named twice is used once.
+    At most `most` images, and frames of each video, evenly spaced; a file named twice counts once.
     """
     if most < 1:
         raise CalibrationError(f"--max-images {most}: expected 1 or more")
@@ -84,9 +83,8 @@ def read_grey(path: Path) -> GreyImage:
 def decoded_image(content: bytes) -> NDArray[Any] | None:
     """(H, W) grey values of an image file's content, of any depth; None if they cannot be decoded.
 
-    How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
-    calibration is of the sensor's pixels, whichever way up they are shown. The memory that the
-    image takes is not checked here: see `redetect.storage.bounded`.
+    Orientation in metadata (Exif) turns nothing: a calibration is of the sensor's pixels. The
+    memory that the image takes is not checked here: see `redetect.storage.bounded`.
     """
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     try:

@@ -186,18 +186,14 @@ def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:
 class FreeLens(NamedTuple):
     """Which of the distortion's coefficients are free."""
 
-    coefficients: int
-    """Number of the rational ones, 0 to 5 (`FREE_COEFFICIENTS`)."""
-    tangential: bool = False
-    """Whether p1 and p2 are."""
-    polynomial: int = 0
-    """Number of k1, k2, k3 that are."""
+    coefficients: int  #: Number of the rational ones, 0 to 5 (`FREE_COEFFICIENTS`)
+    tangential: bool = False  #: Whether p1 and p2 are
+    polynomial: int = 0  #: Number of k1, k2, k3 that are
 
     def span(self, aspect: float | None) -> FloatArray:
-        """(14, K) directions in which intrinsics may change.
+        """(14, K) directions in which intrinsics may change: scales, principal point, coefficients.
 
-        Free are the scales (`aspect` is scaleY / scaleX; None: each by itself), the principal
-        point, and these coefficients.
+        `aspect` is scaleY / scaleX; None: the scales are independent.
         """
         names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[self.coefficients]]
         names += [*(TANGENTIAL if self.tangential else ()), *POLYNOMIAL[: self.polynomial]]

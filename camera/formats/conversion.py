@@ -213,11 +213,8 @@ def convert_to_camera(
 
     A polynomial and tangential terms without a denominator are copied. Otherwise the rational part
     is fitted with the source's tangential terms and, if that is not close enough, all terms and a
-    polynomial together.
-
-    Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
-    ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of `pose`; by default those of the source if
-    it has them, else the identity.
+    polynomial. Source, rows, result and errors are those of `convert_to_foreign`. The pose,
+    ``sensor2Tcp`` and ``mountIndex`` are those of `pose`, else of the source, else the identity.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)

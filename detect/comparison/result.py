@@ -72,8 +72,7 @@ class FloorDifference:
 class DistanceBin:
     """Discs at a range of forward distances (m), open at an end that is None.
 
-    Differences are those of matched discs on the floor, as the rows are and levelled alike; the
-    latter are None if all rows are levelled alike already.
+    Differences are as written, and levelled alike; the latter are None if all rows are.
     """
 
     from_m: float | None

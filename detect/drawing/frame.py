@@ -1,9 +1,8 @@
 """Drawing of a frame's rows into its image: discs, verticals, markers, tilt, and their residuals.
 
-Outlines of discs are projected through the lens, and through the frame's tilt if rows are corrected
-for it; verticals through the lens, with error bars of one standard deviation at the horizon (the
-report's figures 5, 6 and 8). With reference rows, the missed ones are drawn as well, and unmatched
-rows have a different colour.
+Outlines of discs are projected through the lens, and through the tilt by which rows are levelled;
+verticals have error bars of one standard deviation at the horizon (the report's figures 5, 6, 8).
+With reference rows, missed ones are drawn as well, and unmatched rows in another colour.
 """
 
 from __future__ import annotations
@@ -111,11 +110,10 @@ def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
 
 
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Error bars of one standard deviation of the bearing, at the lines' crossings of the horizon.
+    """Error bars of one standard deviation of bearings, where lines cross the level horizon.
 
-    The horizon is that of the level robot; lines that end before it are extended. `ends`: (N, 4),
-    as for `line_curves`; `sigma_rad`: (N,). Returns (N, 2, 2) pixels; NaN for lines that do not
-    cross the horizon in front of the camera.
+    Lines that end before it are extended. `ends`: (N, 4), as for `line_curves`; `sigma_rad`: (N,).
+    Returns (N, 2, 2) pixels; NaN for lines that do not cross it in front of the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))

@@ -1,11 +1,9 @@
 """Phases 1 and 2: dark regions in brighter surroundings, and those that may be markers.
 
 The grayscale closing I2 of the image I1 with a disc fills all dark regions that the disc does not
-fit into; pixels where I1 is much darker than I2 are candidates for (a part of) a marker. These
-regions are filtered by inexpensive measures, the cheapest first: area, number of holes, solidity,
-area ratio of the holes. RAWSEEDS deliverable D2.1 part 2. The disc is replaced by an octagon,
-composed of squares and crosses at a cost that grows slowly with its size, and large markers are
-searched in reduced images.
+fit into; pixels where I1 is much darker than I2 are candidates. Their regions are filtered by area,
+number of holes, solidity and area ratio of the holes (RAWSEEDS deliverable D2.1 part 2). The disc
+is an octagon, composed of squares and crosses; large markers are searched in reduced images.
 """
 
 from __future__ import annotations

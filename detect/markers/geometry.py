@@ -2,12 +2,9 @@
 
 Edges of markers are straight only in a pinhole image. All fits to edges therefore use *straight*
 positions, ``(scale x + offset)`` of the undistorted normalised coordinates, and their results are
-distorted again. Without a camera both are the same.
-
-The rough corners of a region are those of the quadrangle of largest area in its hull (algorithm B
-of RAWSEEDS deliverable D2.1 part 2); the report searches it by coordinate ascent, this module
-exhaustively over all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
-(0, 1).
+distorted again. The rough corners of a region are those of the quadrangle of largest area in its
+hull (algorithm B of RAWSEEDS deliverable D2.1 part 2, which searches by coordinate ascent, this
+module over all diagonals). A square is (0, 0) top left, (1, 0), (1, 1) bottom right, (0, 1).
 """
 
 from __future__ import annotations

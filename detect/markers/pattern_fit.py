@@ -233,9 +233,8 @@ def _homography_of(p: FloatArray) -> FloatArray:
 def _inflation(pixel: IntArray, left: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
-    A residual with correlation rho to its neighbours in a row (decaying geometrically) counts as
-    (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only significant
-    correlation is considered.
+    With a significant correlation rho to its neighbours in a row (decaying geometrically), each
+    counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike.
     """
     weighted = left.residual * np.sqrt(left.weight)
     energy = max(float(np.mean(weighted**2)), 1e-12)

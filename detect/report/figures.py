@@ -198,10 +198,9 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
 
 
 def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
-    """Map of the discs found and of the reference, along the path summed from the steps.
+    """Map of the discs found and of the reference along the steps; forward is up, left is left.
 
-    Forward at the start is up, left is left. The caption ends with `unmatched`, on discs without a
-    reference row. None if there are no discs; a note if some are too far away for a figure.
+    The caption ends with `unmatched`. None without discs; a note if some are too far away.
     """
     seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
     if not any(found.circles for found, _ in seen):
@@ -240,8 +239,7 @@ def repeated(rows: Sequence[SeenRows]) -> Repeatability | None:
     """How well discs in successive frames agree, the latter moved by the odometry's step.
 
     Discs are paired within five standard deviations, unless these are too large to identify them.
-    The step's error is common to all pairs of two frames, and estimated from them. None without
-    pairs, or if all steps are zeros.
+    The step's error, common to the pairs of two frames, is estimated. None without pairs or steps.
     """
     left, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
     frames = [each.circles for each in rows]
@@ -291,8 +289,7 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatA
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
     """(M,) errors in units of their covariances: standard normal if these are right.
 
-    Two independent components for each disc with a positive definite covariance; one for each line
-    with a positive sigma.
+    Two independent components for each disc, one for each line, with a usable covariance.
     """
     if isinstance(comparison, LineComparison):
         usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD

@@ -225,9 +225,6 @@ def _uncertainty(inputs: ReportInputs) -> list[Part]:
     return parts
 
 
-# -- against the reference --------------------------------------------------------------------
-
-
 def _discs(result: DiscComparison | None) -> list[Part]:
     """Rates and errors of discs, and consistency of the covariances."""
     if result is None:
@@ -270,9 +267,6 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
         share = np.mean(np.abs(residuals) <= k)
         rows.append((f"within {k} {figures.SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
     return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
-
-
-# -- frames, tilt, settings -------------------------------------------------------------
 
 
 def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:

@@ -115,11 +115,9 @@ def write_map(
 def read_map(path: FilePath) -> LandmarkMap:
     """Read a map written by `write_map`, or one made by hand with the same columns.
 
-    The columns may also be `SHORT_MAP_COLUMNS`: discs with covariances of 0. The joint
-    covariance is not read (see `with_joint_covariance`).
-
-    Raises LandmarkFileError if the file cannot be read, a row is malformed, a landmark is listed
-    twice or a covariance is negative; names file and line.
+    The columns may also be `SHORT_MAP_COLUMNS`: discs with covariances of 0. The joint covariance
+    is read by `with_joint_covariance`. Raises LandmarkFileError, with file and line, if the file
+    cannot be read, a row is malformed, a landmark is listed twice or a covariance is negative.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     what = "a map: map.csv of `slam map`"
@@ -144,9 +142,8 @@ def read_map(path: FilePath) -> LandmarkMap:
 def covariance_file(map_file: Path) -> Path:
     """Path of the joint covariance of a map: ``map_covariance.npy`` beside ``map.csv``.
 
-    A map's own file contains only the covariance of each landmark. In a map made by driving,
-    landmarks share most of their error with their neighbours (the drift from the start), which only
-    the joint covariance describes.
+    In a map made by driving, landmarks share most of their error with their neighbours (the drift
+    from the start), which only the joint covariance describes.
     """
     return map_file.with_name(f"{map_file.stem}_covariance.npy")
 
