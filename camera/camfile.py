@@ -9,6 +9,7 @@ such terms, and ``covariance: { ... }``, the lower triangle of the parameters' c
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from itertools import pairwise
@@ -189,13 +190,10 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
     for token, line in value:
         if token in "{}[]":
             continue
-        if not _NUMBER.fullmatch(token):
-            raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: expected a number")
+        if not _NUMBER.fullmatch(token) or math.isinf(float(token)):
+            expected = "expected a number that fits a double"
+            raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: {expected}")
         numbers.append(float(token))
-        if not abs(numbers[-1]) < float("inf"):
-            raise CameraError(
-                f"{name}:{line}: {key} has {excerpt(token)}: expected a number that fits a double"
-            )
     if len(numbers) != count:
         where = f":{value[0][1]}" if value else ""
         raise CameraError(f"{name}{where}: {key} has {len(numbers)} numbers: expected {count}")

@@ -69,11 +69,9 @@ class DetectProgram(Program):
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help` and on errors."""
         arguments = [*_in_present_spelling(arguments)]
-        radius = ArgumentParser(add_help=False, allow_abbrev=False)
-        radius.add_argument("--radius-m", dest="given", nargs="?", action="append", default=[])
-        found, rest = radius.parse_known_args(arguments)
-        if "auto" in found.given:
-            arguments = [*rest, "--find-radius"]
+        if arguments:
+            joined = re.sub("--radius-m[=\0]auto", "--find-radius", "\0".join(arguments))
+            arguments = joined.split("\0")
         deciding = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--preset", "--settings"):
             deciding.add_argument(flag, nargs="?", default="", const="")

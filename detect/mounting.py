@@ -157,10 +157,7 @@ def mounting_of_run(
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
-    """The camera as it is mounted, turned about the robot's origin on the floor.
-
-    In a stated covariance, those of pitch, roll and (if estimated) height become the mounting's.
-    """
+    """The camera as it is mounted; in a stated covariance, pitch, roll and height are new."""
     turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
     pitch, roll = mounting.tilt_rad

@@ -125,11 +125,7 @@ def demand_above_floor(camera: Camera) -> None:
 
 
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
-    """Compute the outlines' pixels around the tested centres.
-
-    A camera that sees no usable floor (looking up, say) gets a table without centres; a camera that
-    is not above the floor raises a TableError.
-    """
+    """Compute the outlines' pixels around tested centres; TableError if not above the floor."""
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
     down, paired = size_down(floor_xy), shape.least_pairs > 0
@@ -256,10 +252,7 @@ def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> B
 
 
 def _strided(columns: IntArray, step: FloatArray) -> list[int]:
-    """Indices of columns that are at least the previous one's step apart.
-
-    If steps grow fast along a row, with a very wide lens, twice a column's own step is sufficient.
-    """
+    """Indices of columns at least the step of the one before, or twice their own, apart."""
     kept: list[int] = []
     last, following = 0, 0
     for k, (column, apart) in enumerate(zip(columns.tolist(), step.tolist())):

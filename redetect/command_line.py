@@ -12,7 +12,7 @@ import select
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import reduce
@@ -157,9 +157,7 @@ class Program:
                 if path.exists():
                     sys.stdout.write(path.read_text("utf-8"))
             return code
-        if len(words) == len(arguments):
-            return self.carry_out(command)
-        with _quietly():
+        with nullcontext() if len(words) == len(arguments) else _quietly():
             return self.carry_out(command)
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
@@ -173,17 +171,18 @@ class Program:
             raise SystemExit(0)
         asked = {_HELP_ALL, "-h", "--help"} & {*words}
         words = ["--help" if word == _HELP_ALL else word for word in words]
-        if not words or words[0].startswith("-"):
+        first = words[0] if words else ""
+        if first in ("-h", "--help") or first.startswith("--tyro-"):
             kinds: Any = (Annotated[k, subcommand(name)] for name, k in self.commands.items())
             choice: Any = Annotated[reduce(or_, kinds), arg(name="")]
             text = f"{self.description}\n\n{FOR_ALL}"
             return tyro.cli(choice, prog=self.name, description=text, args=words)
-        if words[0] not in self.commands:
-            end_with(no_such(f"{self.name}: no command", words[0], self.commands))
-        kind = self.commands[words[0]]
+        if first not in self.commands:
+            end_with(no_such(f"{self.name}: no command", first, self.commands))
+        kind = self.commands[first]
         shown = self._brief(kind) if asked and _HELP_ALL not in asked else kind
         known = {type(each): {"default": each} for each in defaults}
-        return _parsed_as(shown, known.get(shown, {}), f"{self.name} {words[0]}", words[1:])
+        return _parsed_as(shown, known.get(shown, {}), f"{self.name} {first}", words[1:])
 
     def carry_out(self, command: Any) -> int:
         """Execute a command; returns the exit code."""
@@ -226,9 +225,9 @@ def _parsed_as(kind: type, default: Any, name: str, words: list[str]) -> Any:
             cause = cause.__context__
         if cause is None:
             end_with(f"{name}: {_misunderstood(kind, words, boxes.getvalue())}")
-        setting, _, found = str(cause).partition(" is ")
-        flag = next((flag for flag, (own, _) in flags.items() if own == setting), setting)
-        end_with(f"{flag} is {found}" if found else str(cause))
+        setting = str(cause).partition(" is ")[0]
+        named = {name: flag for flag, (name, _) in flags.items()}.get(setting, setting)
+        end_with(str(cause).replace(setting, named, 1))
     for word in unknown:
         if word.startswith("-"):
             end_with(no_such(f"{name}: no flag", word.partition("=")[0], flags))

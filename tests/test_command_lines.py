@@ -123,6 +123,8 @@ def test_json_alone_on_standard_output(
         ("camera calibrate a --rows 6", "camera calibrate: expected --output --columns --square-m"),
         ("groundtruth laser --robot x", "groundtruth laser: expected SESSION"),
         ("detect draw", "detect draw: expected RUN"),
+        ("slam", "slam: no command '': one of associate, audit"),
+        ("slam --loss huber", "slam: no command '--loss': one of"),
     ],
 )
 def test_a_wrong_word_is_named_on_one_line(

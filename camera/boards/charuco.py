@@ -36,10 +36,7 @@ _FEWEST_FOUND = 4
 
 
 def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    """Which of a ChArUco board's points are in an image, ascending, and their (K, 2) pixels.
-
-    K may be 0. A dictionary that is unknown, or too small for the board, is refused.
-    """
+    """Indices, ascending, of a ChArUco board's points in an image, and their (K, 2) pixels."""
     rows, columns = board.rows - 1, board.columns - 1
     grid = np.full((rows, columns, 2), np.nan)
     indices, pixels = _interpolated(image, board)

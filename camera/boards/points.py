@@ -194,7 +194,8 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 
     Places without a measurable circle are unchanged.
     """
-    reach = 0.5 * min(np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1))
+    steps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1) for k in (0, 1)]
+    reach = 0.5 * min(each.min(initial=np.inf) for each in steps)
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):
         # Twice, because the first window is around the finder's centre.

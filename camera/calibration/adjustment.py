@@ -17,17 +17,9 @@ from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.distortion import polynomial_of, undistorted_radius
 from camera.rotations import cross_matrices, rotation_of
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.least_squares import solver
 from redetect.least_squares.covariance import diagonal_blocks
-from redetect.least_squares.solver import (
-    Block,
-    Linear,
-    Loss,
-    minimise,
-    normal_equations,
-    robust_cost,
-    stack,
-)
-from redetect.least_squares.solver import robust as robustified
+from redetect.least_squares.solver import Block, Linear, Loss
 
 #: Huber's constant, in standard deviations: the influence of larger residuals is constant.
 HUBER = 2.0
@@ -129,7 +121,7 @@ class _Problem:
             return float("inf")
         with np.errstate(invalid="ignore"):
             seen = residuals_of(at, self.points).reshape(-1, 1) / self.sigma
-            return robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
+            return solver.robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
 
     def linear(self, at: Estimate) -> Linear:
         pixels, by_intrinsics, by_pose = project_estimate(at, self.points)
@@ -142,7 +134,7 @@ class _Problem:
             Block(error, [(of_pose, by_pose)], shared, self.loss),
             Block(prior, [], (weight[:, None] * self.span)[:, None, :]),
         ]
-        return stack(blocks, 6 * len(self.points.counts), self.span.shape[1])
+        return solver.stack(blocks, 6 * len(self.points.counts), self.span.shape[1])
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         poses = step.reshape(-1, 6)
@@ -202,7 +194,7 @@ def adjust(
     loss = Loss("huber", HUBER) if robust else Loss()
     problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
     for _ in range(_SCALE_ROUNDS):
-        estimate = minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
+        estimate = solver.minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
         if sigma_px is not None:
             break
         found, before = _noise(estimate, points, span.shape[1]), problem.sigma
@@ -223,7 +215,7 @@ def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
 def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adjusted:
     points, span, sigma = problem.points, problem.span, problem.sigma
     residuals = residuals_of(estimate, points)
-    _, weights = robustified((residuals / sigma) ** 2, problem.loss)
+    _, weights = solver.robust((residuals / sigma) ** 2, problem.loss)
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.
     psi = weights * residuals / sigma
@@ -231,7 +223,7 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     freedom = max(residuals.size - unknown, 1) / residuals.size
     counted = max(float(np.mean(weights == 1.0)), 0.05)
     spread = 1.0 if sigma_known else float(np.mean(psi**2)) / freedom / counted**2
-    plain = normal_equations(replace(problem, loss=Loss()).linear(estimate))
+    plain = solver.normal_equations(replace(problem, loss=Loss()).linear(estimate))
     (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.counts)))])
     return Adjusted(
         estimate=estimate,
@@ -276,7 +268,7 @@ def with_unfitted_terms(
     influence = linear.residual.copy()
     counted = max(float(np.mean(fit.weights == 1.0)), 0.05)
     influence[: fit.weights.size] *= fit.weights.ravel() / counted
-    equations = normal_equations(linear._replace(residual=influence))
+    equations = solver.normal_equations(linear._replace(residual=influence))
     of_terms = np.array([*sigmas.values()]) ** -2.0
     prior = np.diag(np.concatenate([np.zeros(span.shape[1]), of_terms]))
     equations = replace(equations, corner=equations.corner + prior)

@@ -6,16 +6,9 @@ from pathlib import Path
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
-from camera.formats import yaml_files
+from camera.formats import conversion, yaml_files
 from camera.formats.colmap import format_colmap, parse_colmap
-from camera.formats.conversion import (
-    AnyCamera,
-    Converted,
-    contained,
-    convert_to_camera,
-    convert_to_foreign,
-    nearer,
-)
+from camera.formats.conversion import AnyCamera, Converted
 from camera.formats.models import ForeignCamera, Model
 from camera.model import Camera
 from camera.options import Convert, Format
@@ -163,7 +156,7 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
     """Convert to the first model that contains the camera or is within the limit, or nearest."""
     if to_format == "cam":
         pose = read_camera(options.pose_from) if options.pose_from is not None else None
-        return convert_to_camera(source, options.rows, pose)
+        return conversion.convert_to_camera(source, options.rows, pose)
     models = MODELS[to_format]
     if options.model != "auto":
         if options.model not in models:
@@ -173,10 +166,9 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
         models = {options.model: models[options.model]}
     own = source.model if isinstance(source, ForeignCamera) else None
     found: list[Converted] = []
-    for model, free in sorted(
-        models.items(), key=lambda item: (contained(source, *item) is None, item[0] != own)
-    ):
-        found.append(convert_to_foreign(source, model, options.rows, free=free))
+    exact = [model for model in models if conversion.contained(source, model, models[model])]
+    for model in sorted(models, key=lambda each: (each not in exact, each != own)):
+        found.append(conversion.convert_to_foreign(source, model, options.rows, free=models[model]))
         if found[-1].deviation_px <= options.limit_px:
             break
-    return nearer(*found)
+    return conversion.nearer(*found)

@@ -151,10 +151,7 @@ def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: floa
 def _marker_regions(
     dark: GreyImage, scale: int, widest: float, white: float, settings: MarkerSettings
 ) -> Iterator[Region | str]:
-    """Dark regions of a layer that may be markers, and the reasons for rejecting the others.
-
-    `white` is the expected share of white area, `widest` the largest side of a region.
-    """
+    """Dark regions that may be markers (share `white`, sides up to `widest`), or why not."""
     least_px, most_px = _area_limits(settings, scale)
     most_white = min(settings.most_white * white, 0.9)
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)

@@ -193,10 +193,7 @@ def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float3
 
 
 def _decoys(varied: BoolArray, patterns: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Patterns of frames, bars and panes, and a mask of the markers less than two cells from one.
-
-    Decoys that near a marker's pattern are omitted, since it could never be found.
-    """
+    """Patterns of frames, bars and panes, and which markers are within two cells of one."""
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     j, i = np.indices((len(rows), len(columns)))
     inner = [np.zeros(i.shape, bool)]

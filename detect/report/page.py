@@ -63,10 +63,7 @@ class ReportInputs:
 
 
 def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
-    """Read and compare all rows of a run.
-
-    Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
-    """
+    """Read and compare all rows of a run; DetectError or LandmarkFileError if one is bad."""
     files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)
     if not names:

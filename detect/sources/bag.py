@@ -231,10 +231,9 @@ class Bag(Source):
             found = next(messages(reader, self.path, topic), None)
         name = f"{self.path}: {one_line(topic, LONGEST_NAME)}"
         with understood(name):
-            # Drivers that are not calibrated publish a matrix of zeros.
-            if found is None or not np.any(_field(found[1], "k")):
-                return None
-            return _camera_of_info(found[1], name)
+            # ROS 1 has capital letters. Drivers that are not calibrated publish a matrix of zeros.
+            info = {} if found is None else {k.lower(): v for k, v in vars(found[1]).items()}
+            return _camera_of_info(info, name) if info and np.any(info["k"]) else None
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
@@ -292,14 +291,10 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
         before = pose
 
 
-def _camera_of_info(message: Any, name: str) -> Camera:
+def _camera_of_info(info: dict[str, Any], name: str) -> Camera:
     """The camera of a whole image's camera_info, without its pose, in the project's model."""
-    fields = {letter: _field(message, letter).tolist() for letter in "dk"} | {
-        key: getattr(message, key)
-        for key in ("width", "height", "distortion_model", "binning_x", "binning_y")
-    }
     try:
-        foreign = camera_of_info({**fields, "roi": vars(message.roi)}, name)
+        foreign = camera_of_info({**info, "roi": vars(info["roi"])}, name)
     except ConversionError as error:
         raise DetectError(f"{error}: name a calibration by --camera") from None
     converted = convert_to_camera(foreign)
@@ -311,9 +306,3 @@ def _camera_of_info(message: Any, name: str) -> Camera:
         )
     assert isinstance(converted.camera, Camera)
     return converted.camera
-
-
-def _field(message: Any, letter: str) -> FloatArray:
-    """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
-    name = letter.upper() if hasattr(message, letter.upper()) else letter
-    return np.array(getattr(message, name), dtype=np.float64)

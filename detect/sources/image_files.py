@@ -1,7 +1,4 @@
-"""Image files as a source, and the image of each step, which is never outside the run.
-
-Only the names of the images are kept in memory.
-"""
+"""Image files as a source, and the image of each step, which is never outside the run."""
 
 from __future__ import annotations
 
@@ -184,12 +181,10 @@ class ImageFiles(Source):
 
 def _matching_images(pattern: Path) -> ImageNames:
     """The images that a pattern matches, or one image, whose name may look like a pattern."""
-    if WILDCARDS & set(str(pattern.parent)) and not pattern.parent.is_dir():
-        raise DetectError(
-            f"{pattern}: wildcards in a folder's name: expected them in the last part only"
-        )
     if not pattern.parent.is_dir():
-        raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
+        wild = "wildcards in a folder's name: expected them in the last part only"
+        missing = f"no such folder: {pattern.parent}"
+        raise DetectError(f"{pattern}: {wild if WILDCARDS & {*str(pattern.parent)} else missing}")
     name = glob.escape(pattern.name) if pattern.is_file() else pattern.name
     found = ImageNames(pattern.parent, name)
     if not found.names:

@@ -72,10 +72,7 @@ class Source(Frames):
     has_times = True  # whether the times of the images are known
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The calibration beside the source, or contained in it; None if there is none.
-
-        Several are an error; if `posed`, a calibration without a pose above the floor is ignored.
-        """
+        """The calibration beside or in the source, if any; if `posed`, one above the floor."""
         return None if self.beside is None else camera_in(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
@@ -165,17 +162,9 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is truncated: its end is missing")
     claimed = claimed_size(content)
-    if claimed is not None and claimed[0] * claimed[1] > MOST_PIXELS:
-        raise FrameError(
-            f"{name}: cannot be decoded: claims {claimed[0]}x{claimed[1]} px: "
-            f"expected at most {MOST_PIXELS} pixels"
-        )
     if claimed is not None and size is not None and size != claimed:
         raise wrong_size(name, claimed, size)
-    image = None if claimed is None else decoded_image(content)
-    if image is None:
-        raise FrameError(f"{name}: cannot be decoded: expected an image")
-    return gray_of_pixels(image, name)
+    return gray_of_pixels(decoded_image(content, name, FrameError), name)
 
 
 def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:

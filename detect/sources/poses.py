@@ -47,10 +47,7 @@ _END_SLACK_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
-
-    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
-    """
+    """A pose, X forward, Y left (m, rad), and its covariance since the start; 0 if unknown."""
 
     time_s: float
     x: float

@@ -320,10 +320,7 @@ def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
 
 
 def without_orientation(content: bytes) -> bytes:
-    """The content of an image file, with a TIFF's orientation tag set to "not rotated".
-
-    On request, OpenCV ignores the orientation of JPEG and PNG, but not that of TIFF.
-    """
+    """An image file's content, a TIFF's orientation, which OpenCV obeys, set to not rotated."""
     if not content.startswith(_TIFF):
         return content
     changed = bytearray(content)
