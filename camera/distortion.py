@@ -98,10 +98,7 @@ def radial_factor_derivative(
 
 @lru_cache(maxsize=256)
 def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
-    """r_max, up to which g(r) grows: the first pole of f or zero of g'.
-
-    Past it the image folds back on itself and the projection is undefined.
-    """
+    """r_max, up to which g(r) grows (first pole of f or zero of g'); past it the image folds."""
     a2, a3, b1, b2, b3 = coef
     k1, k2, k3 = polynomial
     # Coefficients of powers of r, the lowest first; NumPy's classes for them take much longer.
@@ -137,10 +134,7 @@ def _first_positive_root(polynomial: ArrayLike) -> float:
 def inverse_table(
     coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> tuple[FloatArray, FloatArray]:
-    """Distorted radii, growing, and the undistorted radii that are seen there.
-
-    16384 of each, from 0 to the fold or `RADIUS_LIMIT`; read only.
-    """
+    """Distorted radii, growing up to the fold or `RADIUS_LIMIT`, and the undistorted ones there."""
     limit = min(fold_radius(coef, polynomial), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, np.arctan(limit), _TABLE_NODES))
     radius[-1] = limit
@@ -188,43 +182,27 @@ def polynomial_of(brown: Brown) -> Polynomial:
     return brown[0], brown[1], brown[4]
 
 
-def brown_shift(xy: FloatArray, brown: Brown) -> FloatArray:
-    """Displacement of (..., 2) points by Brown's terms, in addition to the rational distortion."""
-    k1, k2, p1, p2, k3 = brown
-    q = np.array([p2, p1])
-    squared = np.sum(xy * xy, axis=-1)
-    shift = 2.0 * (xy @ q)[..., None] * xy + squared[..., None] * q
-    if any(polynomial_of(brown)):
-        shift = shift + (squared * (k1 + squared * (k2 + squared * k3)))[..., None] * xy
-    return np.asarray(shift)
-
-
-def brown_jacobian(xy: FloatArray, brown: Brown) -> FloatArray:
-    """(..., 2, 2) derivative of `brown_shift` by x, y."""
-    k1, k2, p1, p2, k3 = brown
-    q = np.array([p2, p1])
-    outer = xy[..., :, None] * q
-    along = (xy @ q)[..., None, None] * np.eye(2)
-    jacobian = 2.0 * (along + outer + outer.swapaxes(-1, -2))
-    if any(polynomial_of(brown)):
-        squared = np.sum(xy * xy, axis=-1)[..., None, None]
-        # d(x p)/dx = p + x dp/dx, and dp/dr is r times the slope below.
-        jacobian = jacobian + squared * (k1 + squared * (k2 + squared * k3)) * np.eye(2)
-        slope = 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
-        jacobian = jacobian + slope * (xy[..., :, None] * xy[..., None, :])
-    return np.asarray(jacobian)
+def tangential_shift(xy: FloatArray, tangential: Tangential) -> FloatArray:
+    """Displacement of (..., 2) points by the tangential terms, in addition to the radial ones."""
+    q = np.array(tangential[::-1])
+    return np.asarray(2.0 * (xy @ q)[..., None] * xy + np.sum(xy * xy, axis=-1)[..., None] * q)
 
 
 def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
     """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
+    polynomial, q = polynomial_of(brown), np.array([brown[3], brown[2]])
     radius = np.hypot(xy[..., 0], xy[..., 1])
-    factor = radial_factor(radius, coef)
-    slope = radial_factor_derivative(radius, coef)
+    factor = radial_factor(radius, coef, polynomial)
+    slope = radial_factor_derivative(radius, coef, polynomial)
     # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
     unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
     outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
     jacobian = factor[..., None, None] * np.eye(2) + outer
-    return jacobian + brown_jacobian(xy, brown) if any(brown) else jacobian
+    if q.any():
+        outer = xy[..., :, None] * q
+        along = (xy @ q)[..., None, None] * np.eye(2)
+        jacobian += 2.0 * (along + outer + outer.swapaxes(-1, -2))
+    return np.asarray(jacobian)
 
 
 @lru_cache(maxsize=256)
@@ -272,10 +250,7 @@ def _least_determinant(
 
 
 def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) -> FloatArray:
-    """Undistorted normalised coordinates of distorted ones, all terms undone.
-
-    Newton's method from the radial inverse (`camera.kernels.straightened_point`).
-    """
+    """Undistorted normalised coordinates of distorted ones, by `kernels.straightened_point`."""
     from camera.kernels import straighten_points
 
     seen = np.ascontiguousarray(distorted, dtype=np.float64).reshape(-1, 2)

@@ -22,28 +22,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera.distortion import (
-    NO_POLYNOMIAL,
-    NOT_TANGENTIAL,
-    Brown,
-    Coef,
-    Polynomial,
-    Tangential,
-    brown_shift,
-    distorted_jacobian,
-    one_to_one_radius,
-    radial_factor,
-    straightened,
-    undistorted_radius,
-)
-from camera.model_checks import (
-    check_numbers,
-    check_one_to_one,
-    checked_covariance,
-    checked_pose,
-    checked_whole,
-    seen_share,
-)
+from camera import distortion
+from camera import model_checks as checks
+from camera.distortion import Brown, Coef, Polynomial, Tangential
 from redetect.array_types import FloatArray
 
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -106,26 +87,26 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    tangential: Tangential = NOT_TANGENTIAL
-    polynomial: Polynomial = NO_POLYNOMIAL
+    tangential: Tangential = distortion.NOT_TANGENTIAL
+    polynomial: Polynomial = distortion.NO_POLYNOMIAL
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
-            object.__setattr__(self, name, checked_whole(name, getattr(self, name)))
+            object.__setattr__(self, name, checks.checked_whole(name, getattr(self, name)))
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         for name in ("coef", "tangential", "polynomial"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
-        pose = checked_pose("sensor2World", self.robot_from_camera)
+        pose = checks.checked_pose("sensor2World", self.robot_from_camera)
         object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:
-            pose = checked_pose("sensor2Tcp", self.sensor_to_tcp)
+            pose = checks.checked_pose("sensor2Tcp", self.sensor_to_tcp)
             object.__setattr__(self, "sensor_to_tcp", pose)
         if self.covariance is not None:
-            covariance = checked_covariance(self.covariance, PARAMETERS)
+            covariance = checks.checked_covariance(self.covariance, PARAMETERS)
             object.__setattr__(self, "covariance", covariance)
-        check_numbers(self)
-        check_one_to_one(self)
+        checks.check_numbers(self)
+        checks.check_one_to_one(self)
 
     def __hash__(self) -> int:
         # By a digest that is kept: tables are looked up by the camera, image by image.
@@ -164,12 +145,12 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return one_to_one_radius(self.coef, self.brown)
+        return distortion.one_to_one_radius(self.coef, self.brown)
 
     @cached_property
     def seen_share(self) -> float:
         """Share of the image that sees anything: less than 1 where the distortion folds in it."""
-        return seen_share(self)
+        return checks.seen_share(self)
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
@@ -214,18 +195,13 @@ class Camera:
     # -- camera frame <-> pixels ------------------------------------------------------------
 
     def distort(self, normalised: ArrayLike) -> FloatArray:
-        """(..., 2) pixels of (..., 2) undistorted normalised coordinates px/pz, py/pz.
-
-        Both NaN past the distortion's fold.
-        """
-        xy, radius = self._before_fold(normalised)
-        factor = radial_factor(radius, self.coef)
-        u = self.scale_x * xy[..., 0] * factor
-        v = self.scale_y * xy[..., 1] * factor
-        if any(self.brown):
-            shift = brown_shift(xy, self.brown)
-            u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
-        return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
+        """(..., 2) pixels of (..., 2) undistorted normalised coordinates; NaN past the fold."""
+        (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        pixels = scale * xy * factor[..., None]
+        if self.decentred:
+            pixels = pixels + scale * distortion.tangential_shift(xy, self.tangential)
+        return np.asarray(pixels + self.pinhole[2:])
 
     def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(..., 2) coordinates and their (...) radii, NaN past the fold."""
@@ -235,22 +211,17 @@ class Camera:
         return np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
-
-        Pixels need not be inside the image; both are NaN where nothing is seen (past the fold).
-        """
+        """(..., 2) undistorted normalised coordinates of (..., 2) pixels; NaN past the fold."""
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            return straightened(seen, self.coef, self.brown, self.r_max)
+            return distortion.straightened(seen, self.coef, self.brown, self.r_max)
         distorted = np.hypot(seen[..., 0], seen[..., 1])
-        radius = undistorted_radius(distorted, self.coef, self.polynomial)
-        return np.asarray(seen / radial_factor(radius, self.coef, self.polynomial)[..., None])
+        radius = distortion.undistorted_radius(distorted, self.coef, self.polynomial)
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        return np.asarray(seen / factor[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
-        """(..., 2) pixels of (..., 3) points in the camera frame (m).
-
-        Both NaN for points not in front of the camera or past the distortion's fold.
-        """
+        """(..., 2) pixels of (..., 3) points in the camera frame (m); NaN behind, past the fold."""
         return self.distort(_normalised(points_camera)[0])
 
     def pixel_grid(self) -> FloatArray:
@@ -259,10 +230,7 @@ class Camera:
         return np.stack([u, v], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
-
-        All NaN past the fold.
-        """
+        """(..., 3) directions (x, y, 1), camera frame, of (..., 2) pixels; NaN past the fold."""
         xy = self.undistort(pixels)
         ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
         return np.concatenate([xy, ones], axis=-1)
@@ -288,10 +256,7 @@ class Camera:
         return self.unproject(pixels) @ self.rotation.T
 
     def floor_from_pixel(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2) places X, Y in the robot frame (m) where rays of (..., 2) pixels meet the floor.
-
-        NaN where the ray does not come down to the floor.
-        """
+        """(..., 2) floor positions X, Y (m) that (..., 2) pixels see; NaN if they see none."""
         direction = self.directions_robot(pixels)
         down = np.where(direction[..., 2] * self.centre[2] < 0.0, direction[..., 2], np.nan)
         along = -self.centre[2] / down
@@ -302,14 +267,11 @@ class Camera:
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
         xy, _ = self._before_fold(normalised)
-        jacobian = distorted_jacobian(xy, self.coef, self.brown)
+        jacobian = distortion.distorted_jacobian(xy, self.coef, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
-        """(..., 2, 3) derivatives of (u, v) of `project` by the (..., 3) points, analytic.
-
-        Pixels per metre; NaN where the projection is undefined.
-        """
+        """(..., 2, 3) d(u, v) / d(point) of `project`, pixels per metre; NaN where undefined."""
         xy, depth = _normalised(points_camera)
         perspective = np.zeros((*depth.shape, 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
@@ -318,18 +280,11 @@ class Camera:
         return np.asarray(self.distort_jacobian(xy) @ perspective)
 
     def floor_jacobian(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2, 2) derivatives of the floor's (X, Y) by (u, v) at (..., 2) pixels, analytic.
-
-        Metres per pixel; NaN where the pixel does not see the floor.
-        """
+        """(..., 2, 2) d(X, Y) / d(u, v) at (..., 2) pixels, m per px; NaN if they see no floor."""
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.camera_from_robot)
 
     def floor_jacobian_published(self, pixels: ArrayLike) -> FloatArray:
-        """d(floor X, Y) / d(u, v) as the data set's own detector has it.
-
-        Its projection turns by the transpose of `rotation`, which differs from the inverse in the
-        last digits that the file has. Shapes as in `floor_jacobian`.
-        """
+        """`floor_jacobian` of the data set's detector: the transpose for the inverse rotation."""
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.rotation.T)
 
     def _floor_jacobian(self, floor_xy: FloatArray, camera_from_robot: FloatArray) -> FloatArray:
@@ -340,10 +295,7 @@ class Camera:
 
 
 def _normalised(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """(..., 2) normalised coordinates of points in the camera frame, and (...) depths (m).
-
-    NaN for points not in front of the camera.
-    """
+    """(..., 2) normalised coordinates of points in the camera frame, (...) depths; NaN behind."""
     p = np.asarray(points_camera, dtype=np.float64)
     depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
     with np.errstate(over="ignore"):  # a point all but beside the camera

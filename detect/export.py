@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from detect.errors import DetectError, imported_for
+from detect.errors import DetectError
 from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
 from redetect.landmarks.times import read_times
+from redetect.messages import imported_for
 from redetect.storage import demand_place, write_whole
 
 if TYPE_CHECKING:
@@ -105,10 +106,7 @@ def _times(command: Export) -> dict[str, float] | None:
 def read_tables(
     path: Path, times: Mapping[str, float] | None, rate_hz: float | None
 ) -> dict[TableName, list[Row]]:
-    """The tables of a landmark or tilt file; the first is implied by its name, and may be empty.
-
-    The times of frames are from `times`, by prefix, or from the frame rate, if known.
-    """
+    """The tables of a file, that of its name first, perhaps empty, with the times of frames."""
     named = _TABLES.get(path.suffix)
     tables: dict[TableName, list[Row]] = {} if named is None else {named: []}
     image, time_s = "", None
@@ -149,7 +147,7 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Sequence[Row]) -> None:
 
 def required_pyarrow() -> Any:
     """The package; a DetectError if it is not installed."""
-    with imported_for("Parquet is written by the package pyarrow", "parquet", _OR_CSV):
+    with imported_for("Parquet is written by the package pyarrow", "parquet", DetectError, _OR_CSV):
         import pyarrow.parquet  # type: ignore[import-untyped]
     return pyarrow
 
@@ -181,7 +179,7 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
 
 def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
     """Write the messages of each frame, at its time; returns their number."""
-    with imported_for("MCAP is written by the package rosbags", "bags", _OR_CSV):
+    with imported_for("MCAP is written by the package rosbags", "bags", DetectError, _OR_CSV):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     store = get_typestore(Stores.ROS2_HUMBLE)

@@ -1,7 +1,5 @@
 """``camera level``: a camera's mounting from a run: its constant lean, and its height.
 
-The command is one of the program `camera`; it is implemented here because it needs detection.
-
 The lean is estimated from the verticals of all frames (`detect.run_tilt`), the height from the
 outlines of discs of known size: with a wrong height, their pitch differs from that of the verticals
 (`detect.discs.outline_tilt`). Both assume that the lens is calibrated correctly.
@@ -132,9 +130,8 @@ def mounting_of_run(
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    `height_m` is the calibrated height of the camera, `verticals` are the tilts of N frames, and
-    `outline_pitch_rad` (N, 3) the pitch from the outlines of discs, with the height changed by each
-    of `HEIGHT_STEPS`; NaN without outlines.
+    From the calibrated height of the camera, the tilts of N frames, and the pitch (N, 3) from the
+    outlines of discs with the height changed by each of `HEIGHT_STEPS`; NaN without outlines.
     """
     run = tilt_of_run(verticals)
     if run is None:
@@ -160,11 +157,7 @@ def mounting_of_run(
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
-    """The camera as it is mounted, turned about the robot's origin on the floor.
-
-    If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
-    mounting's; the rest stays.
-    """
+    """The camera as it is mounted; in a stated covariance, pitch, roll and height are new."""
     turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
     pitch, roll = mounting.tilt_rad

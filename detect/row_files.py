@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 
@@ -30,11 +31,7 @@ _LONGEST_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class FileHead:
-    """The known parts of the head of a file of rows.
-
-    Settings that it does not contain have their defaults; a DetectError is raised if one has an
-    impossible value.
-    """
+    """The known parts of the head of a file of rows; missing settings have their defaults."""
 
     comments: tuple[str, ...] = ()  # its lines without comment signs
     settings: tuple[tuple[str, str], ...] = ()  # names and values, as written
@@ -60,12 +57,9 @@ def read_head(path: Path) -> FileHead:
             start = stream.read(_LONGEST_BYTES)
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
-    comments: list[str] = []
-    for line in start.decode("utf-8", "replace").splitlines():
-        text = line.strip()
-        if text and not text.startswith("#"):
-            break
-        comments.append(text.removeprefix("#").strip())
+    lines = map(str.strip, start.decode("utf-8", "replace").splitlines())
+    head = takewhile(lambda line: not line or line.startswith("#"), lines)
+    comments = [line.removeprefix("#").strip() for line in head]
     settings = tuple(
         (name, value)
         for text in comments
@@ -124,11 +118,7 @@ class RunRows:
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
-    """Find the files of a run's rows, and index them.
-
-    Raises DetectError if there are none, or given reference rows do not exist, and
-    redetect.landmarks.LandmarkFileError if one is malformed.
-    """
+    """Index the files of a run's rows; DetectError without any, LandmarkFileError if bad."""
     usual = {
         kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
         for kind in KINDS

@@ -1,7 +1,4 @@
-"""Maps rows of discs back into the image: undoes the levelling, then projects through the lens.
-
-Plain NumPy, so that comparing files does not load the compiler.
-"""
+"""Maps rows of discs back into the image: undoes the levelling, then projects; plain NumPy."""
 
 from __future__ import annotations
 
@@ -69,10 +66,7 @@ def level_matrix(levelled_by: ArrayLike) -> FloatArray:
 
 
 def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
-    """The camera mounted higher, then leaning by pitch and roll (rad).
-
-    These level directions, about the robot's origin on the floor. The covariance is dropped.
-    """
+    """The camera raised, then leaning by pitch and roll (rad); without its covariance."""
     turn = level_matrix(lean)
     centre = camera.centre + np.array([0.0, 0.0, raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ centre])
@@ -137,10 +131,7 @@ class Sight:
         return np.where(np.isfinite(xy), xy, reference_xy)
 
     def gates(self, reference_xy: FloatArray) -> FloatArray:
-        """(N, 2) half widths and heights of imaged discs, at least `LEAST_GATE_PX`, pixels.
-
-        Wider where the tilt between the reference and the detected rows is unknown.
-        """
+        """(N, 2) half sizes of imaged discs, px, at least `LEAST_GATE_PX`; more without a tilt."""
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)

@@ -1,8 +1,7 @@
 """Reads and writes settings of detectors, to repeat a run or to change it.
 
-The JSON file beside every result (`detected.log.json`) contains its settings under ``settings``,
-one object for each kind: ``circles``, ``lines``, ``markers``. Settings files have the same form
-without other content; missing kinds and settings have their defaults.
+Like the JSON file beside every result (`detected.log.json`), a file has an object for each kind,
+``circles``, ``lines``, ``markers``, under ``settings``; missing ones have their defaults.
 """
 
 from __future__ import annotations
@@ -17,7 +16,9 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
+from redetect.bounds import expectation
 from redetect.messages import excerpt
+from redetect.storage.bounded import read_text
 
 _LONGEST_BYTES = 1 << 24
 Settings = TypeVar("Settings", CircleSettings, LineSettings, MarkerSettings)
@@ -40,11 +41,9 @@ def read_settings(path: Path) -> SettingsFile:
     DetectError
         If it cannot be read, has no settings, or an unknown or invalid one.
     """
+    text = read_text(path, _LONGEST_BYTES, "settings file", DetectError)
     try:
-        with path.open("rb") as stream:
-            document = json.loads(stream.read(_LONGEST_BYTES))
-    except OSError as error:
-        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
+        document = json.loads(text)
     except (ValueError, RecursionError):  # the latter if it is nested very deeply
         raise DetectError(f"{path}: not JSON: expected settings, as in a .log.json") from None
     given = document.get("settings") if isinstance(document, dict) else None
@@ -68,10 +67,7 @@ def checked_settings(name: str, values: Any, kind: type[Settings]) -> Settings:
 
 
 def setting_value(kind: type, name: str, value: Any) -> Any:
-    """Convert a JSON value to that of a setting, a field of a dataclass.
-
-    Raises DetectError if there is no such field, or the value has another type.
-    """
+    """A setting's value from JSON; DetectError if it is unknown or has another type."""
     hints = get_type_hints(kind)
     if name not in hints:
         raise DetectError(
@@ -80,14 +76,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     try:
         return _of_type(hints[name], value)
     except (TypeError, OverflowError):
-        kinds: dict[Any, str] = {
-            bool: "True or False", int: "a whole number", float: "a number",
-            float | None: "a number or none",
-        }  # fmt: skip
-        words = ", ".join(map(str, get_args(hints[name])))
-        expected = kinds.get(hints[name], f"one of {words}")
-        if get_origin(hints[name]) is tuple:
-            expected = "a list of numbers, or of pairs of them"
+        expected = expectation(hints[name])
         raise DetectError(f"{name} is {excerpt(value)}: expected {expected}") from None
 
 
@@ -110,10 +99,7 @@ def _of_type(hint: Any, value: Any) -> Any:
 
 
 def word_value(kind: type, name: str, word: str) -> Any:
-    """Convert a word of a command line or of a file's head to the value of a setting.
-
-    Raises DetectError if that fails, or there is no such setting.
-    """
+    """A setting's value from a word; DetectError if it is unknown or that fails."""
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
     for number in (float, int):  # a float setting accepts whole numbers
         with suppress(ValueError):

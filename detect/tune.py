@@ -128,10 +128,9 @@ def _with_reference(frames: Iterable[RunFrame], path: Path) -> list[tuple[RunFra
 
 
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:
-    """The values of a parameter to try, each once.
+    """The values of a parameter to try, each once; errors as those of `word_value`.
 
-    `text` is FROM:TO:STEP, both ends included, or comma-separated values; errors as those of
-    `word_value`.
+    `text` is FROM:TO:STEP, both ends included, or comma-separated values.
     """
     words = text.split(",")
     if ":" in text:
@@ -150,8 +149,7 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
 def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
-    Each has the names and values in the order of `varied`; the last varies fastest. Raises
-    DetectError if nothing is varied, or there are too many, and as `parameter_values` does.
+    In the order of `varied`, the last varies fastest. DetectError if there are none or too many.
     """
     if not varied:
         raise DetectError(
@@ -172,11 +170,10 @@ def tune_run(
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[DiscComparison, list[str]]]:
-    """Detect discs in frames of a run with each setting, and compare them.
+    """Detect discs in frames of a run with each setting, and compare them with the reference.
 
-    `compare` compares their rows with the reference; `on_progress` is called after every frame of
-    every setting. Yields the comparison of each setting, and why frames could not be processed:
-    these count as frames without detections.
+    `on_progress` is called after every frame of every setting. Yields the comparison of each, and
+    why frames could not be processed: these count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame in frames]
@@ -221,10 +218,7 @@ def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) indices of the settings on the Pareto front of recall and precision.
-
-    By increasing recall; of equals the first. Recalls and precisions (N,) are NaN if undefined.
-    """
+    """(M,) settings on the Pareto front, by increasing recall; NaN rates are undefined."""
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
     # By decreasing recall, then precision: points no better than those before are dominated.
@@ -236,10 +230,9 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
 def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
     """The setting at the knee of the curve of precision over recall; None without any.
 
-    That is the point of the front farthest beyond the chord between the front's ends, both axes
-    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
-    Haystack, 2011). If no point is beyond the chord, there is no knee, and the point with the
-    largest harmonic mean of recall and precision is used instead.
+    That is the point of the front farthest beyond the chord between its ends, axes scaled to its
+    extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a Haystack, 2011). If none is
+    beyond, the one with the largest harmonic mean of recall and precision is used.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     front = pareto_front(r, p)

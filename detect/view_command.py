@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from detect.drawing.frame import draw_rows
-from detect.errors import DetectError, FrameError, imported_for
+from detect.errors import DetectError, FrameError
 from detect.options import View
 from detect.row_files import SeenRows, open_rows
 from detect.seen import circle_on_floor, summed_steps
@@ -22,6 +22,7 @@ from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.messages import imported_for
 from redetect.storage import demand_place, write_bytes
 
 _EDGE, _LINE, _MAP = (255, 170, 0), (60, 220, 60), (80, 140, 220)
@@ -32,7 +33,7 @@ _EARLIEST_DATE_S = 1e8
 def perform(options: View) -> int:
     """Execute the command; returns the exit code."""
     os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    with imported_for("detect view needs the package rerun-sdk", "view"):
+    with imported_for("detect view needs the package rerun-sdk", "view", DetectError):
         import rerun as rr
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)

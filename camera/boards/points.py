@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from camera.boards.board import Board
 from camera.boards.charuco import both_heights, find_charuco
 from camera.errors import CalibrationError
-from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.array_types import FloatArray, GreyImage, IntArray
 
 # Half the side of the window around a corner, as a share of its squares in the image.
 _WINDOW = 0.3
@@ -50,7 +50,14 @@ def find_board(
         If the board is not there, or too little of a ChArUco board is.
     """
     if board.kind == "charuco":
-        return _charuco(image, board)
+        indices, pixels = find_charuco(image, board)
+        if len(indices) < _FEWEST_POINTS:
+            raise CalibrationError(
+                f"{len(indices)} corners of a {board} in the image: expected at least "
+                f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
+                "sharp and large enough to be read?"
+            )
+        return indices, pixels
     if board.kind == "checkerboard":
         grid = _checkerboard(image, board, window)
     else:
@@ -108,10 +115,9 @@ def _reductions(image: GreyImage) -> Iterator[GreyImage]:
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
-    """Refine saddle points, each in a window without other features.
+    """Refine saddle points, each in its own small window without other features.
 
-    Each corner has its own small window: a larger one is affected by distortion of the edges, and
-    attracted by the next corner if it contains that. NaN corners remain NaN.
+    A larger window is affected by distortion and attracted by the next corner. NaN remain NaN.
     """
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
@@ -141,9 +147,8 @@ def _spacing(grid: NDArray[np.float32]) -> FloatArray:
 def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
     """Bring a (rows, columns, 2) grid of corners into the board's own order.
 
-    The board is seen from its printed side, so right x down points into the image; and the square
-    right below the first corner is black, as the one beyond it is. A board that looks the same
-    turned begins in the image's upper left.
+    Seen from the print, right x down points into the image, and the square right below the first
+    corner is black; a board that looks the same turned begins in the image's upper left.
     """
     grid = _from_the_front(grid)
     centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
@@ -162,26 +167,6 @@ def _from_the_front(grid: FloatArray) -> FloatArray:
     if np.sum(right[:, 0]) * np.sum(down[:, 1]) < np.sum(right[:, 1]) * np.sum(down[:, 0]):
         return grid[:, ::-1]
     return grid
-
-
-def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    indices, pixels = find_charuco(image, board)
-    if len(indices) < _FEWEST_POINTS:
-        raise CalibrationError(
-            f"{len(indices)} corners of a {board} in the image: expected at least "
-            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
-            "sharp and large enough to be read?"
-        )
-    return indices, pixels
-
-
-def _least_spacing(grid: NDArray[np.float32]) -> float:
-    """Least distance of neighbours that were both seen, pixels."""
-    steps = np.concatenate(
-        [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    )
-    steps = steps[np.isfinite(steps)]
-    return float(steps.min()) if len(steps) else 10.0
 
 
 def _circles(image: GreyImage, board: Board) -> FloatArray:
@@ -209,12 +194,13 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 
     Places without a measurable circle are unchanged.
     """
-    spacing = _least_spacing(grid.astype(np.float32))
+    steps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1) for k in (0, 1)]
+    reach = 0.5 * min(each.min(initial=np.inf) for each in steps)
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):
         # Twice, because the first window is around the finder's centre.
         for _ in range(2):
-            moved = _centroid(image, result[index], 0.5 * spacing)
+            moved = _centroid(image, result[index], reach)
             if moved is None:
                 break
             result[index] = moved
@@ -224,33 +210,21 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | None:
     """Centroid of the dark blob in the square window around `at`; None if there is none."""
     half = max(int(reach), 3)
-    u, v = int(np.rint(at[0])), int(np.rint(at[1]))
+    u, v = np.clip(np.rint(at).astype(int), 0, np.array(image.shape[::-1]) - 1).tolist()
     top, left = max(v - half, 0), max(u - half, 0)
     window = image[top : v + half + 1, left : u + half + 1].astype(np.float64)
     if min(window.shape) < 5:
         return None
-    light = np.percentile(window, 90.0)
-    dark = float(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
+    light, dark = np.percentile(window, 90.0), float(image[v, u])
     if light - dark < 20.0:
         return None
     # Paper and ink are uniform; only pixels on the circle's edge have fractional weights.
     weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
     weight[weight < 0.15] = 0.0
-    connected = _blob(weight, v - top, u - left)
-    if connected is None:
-        return None
-    weight = np.where(connected, weight, 0.0)
-    total = weight.sum()
+    _, labels = cv2.connectedComponents((weight > 0.0).astype(np.uint8), connectivity=4)
+    blob = labels == labels[v - top, u - left]
+    if blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any():
+        return None  # it is cut off
+    weight[~blob] = 0.0
     rows, columns = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]]
-    return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
-
-
-def _blob(weight: FloatArray, row: int, column: int) -> BoolArray | None:
-    """The blob at a place of the window, if it does not touch the window's edge."""
-    mask = (weight > 0.0).astype(np.uint8)
-    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:
-        return None
-    _, labels = cv2.connectedComponents(mask, connectivity=4)
-    blob = np.asarray(labels == labels[row, column])
-    edge = blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any()
-    return None if edge else blob
+    return np.array([np.sum(weight * each) / weight.sum() for each in (columns, rows)])

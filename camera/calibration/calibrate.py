@@ -14,8 +14,8 @@ from camera.calibration.adjustment import (
     Adjusted,
     Estimate,
     Points,
-    circle_shifts,
-    project_estimate,
+    residuals_of,
+    with_unfitted_terms,
 )
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
@@ -26,7 +26,6 @@ from camera.calibration.consensus import (
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
-from camera.calibration.unfitted import with_unfitted_terms
 from camera.errors import CalibrationError, CameraError
 from camera.uncertainty import UNPOSED, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
@@ -46,10 +45,7 @@ _ASPECT_SIGMA = 0.003
 
 
 def largest_rms_px(width: int) -> float:
-    """Largest RMS residual of a good fit: points are accurate to some tenths of a pixel.
-
-    It is larger for large images, which are softer.
-    """
+    """Largest RMS residual of a good fit; it is larger for large images, which are softer."""
     return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
@@ -224,10 +220,7 @@ def aspect_of(calibration: Calibration) -> Aspect:
 def calibrate_freely(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
-    """As `calibrate`, with scales independent of each other if the views determine their ratio.
-
-    Otherwise it is that of the settings, with a warning.
-    """
+    """As `calibrate`, with free scales if the views determine their ratio; else with a warning."""
     try:
         free = calibrate(views, board, size, replace(settings, aspect=None))
     except CalibrationError:
@@ -264,11 +257,7 @@ def _without_wrong_points(
     """Exclude points that were found wrongly; the second result is their number."""
     if not settings.robust:
         return points, 0
-    seen = points.pixels
-    if radius_m > 0.0:
-        shifts = circle_shifts(estimate, points, radius_m)
-        seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
-    residuals = seen - project_estimate(estimate, points)[0]
+    residuals = residuals_of(estimate, points, radius_m)
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
     # A picture with too few remaining points is unchanged: the robust loss handles it.
     right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]

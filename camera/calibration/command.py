@@ -211,12 +211,11 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
     free = np.any(calibration.lens.span(None) != 0.0, axis=1)
-    lines = [
-        f"  {name:8s} {value:12.6g}{_plus_minus(s, is_free=is_free)}"
-        for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free)
-    ]
     count, views = len(calibration.points.board), len(calibration.names)
-    lines.insert(0, f"intrinsics from {count} points in {views} pictures:")
+    lines = [f"intrinsics from {count} points in {views} pictures:"]
+    for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free):
+        uncertain = f" +- {s:.2g}{'' if is_free else '  (not fitted)'}" if s else "  (fixed)"
+        lines.append(f"  {name:8s} {value:12.6g}{uncertain}")
     ratio = aspect_of(calibration)
     if ratio.sigma > 0.0:
         lines.append(f"scaleY / scaleX {ratio.value:.5f} +- {ratio.sigma:.5f}")
@@ -241,10 +240,3 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
-
-
-def _plus_minus(sigma: float, *, is_free: bool) -> str:
-    """How uncertain a parameter is."""
-    if sigma == 0.0:
-        return "  (fixed)"
-    return f" +- {sigma:.2g}" + ("" if is_free else "  (not fitted)")

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, project_estimate
+from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, residuals_of
 from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
 from camera.errors import CalibrationError
@@ -122,7 +122,7 @@ def _fitted(
         rest = points.of(others)
         posed = best_poses(found.of(others), rest)
         found = found.with_poses(others, posed)
-        residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
+        residuals[~used[points.views]] = residuals_of(posed, rest)
     typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))
     return Consensus(
         fit=fit,
@@ -133,10 +133,7 @@ def _fitted(
 
 
 def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:
-    """(V,) root of the mean squared distance of each view's points, the nearest share of them.
-
-    Infinite where one of these is NaN.
-    """
+    """(V,) RMS residual of the best share of each view's points; infinite where one is NaN."""
     squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
     ordered = squares[np.lexsort((squares, points.views))]
     of_views = np.split(ordered, np.cumsum(points.counts)[:-1])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from camera.calibration.adjustment import project_estimate
+from camera.calibration.adjustment import project_estimate, rms
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
@@ -114,10 +114,8 @@ def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> Byte
         cv2.drawMarker(
             picture, _place(place, scale), _PROJECTED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA
         )
-    rms = float(np.sqrt(np.mean(np.sum((found - projected) ** 2, axis=1))))
-    return _captioned(
-        picture, f"{calibration.names[view]}: found (o), projected (+), RMS {rms:.2f} px"
-    )
+    size = f"RMS {rms(found - projected):.2f} px"
+    return _captioned(picture, f"{calibration.names[view]}: found (o), projected (+), {size}")
 
 
 def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:

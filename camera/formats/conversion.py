@@ -213,11 +213,8 @@ def convert_to_camera(
 
     A polynomial and tangential terms without a denominator are copied. Otherwise the rational part
     is fitted with the source's tangential terms and, if that is not close enough, all terms and a
-    polynomial together.
-
-    Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
-    ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of `pose`; by default those of the source if
-    it has them, else the identity.
+    polynomial. Source, rows, result and errors are those of `convert_to_foreign`. The pose,
+    ``sensor2Tcp`` and ``mountIndex`` are those of `pose`, else of the source, else the identity.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)
@@ -283,10 +280,7 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
 
 
 def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) pixels of the target, denser towards the border, where models part; and their rays.
-
-    Rays are undistorted normalised coordinates of what the source sees there.
-    """
+    """(N, 2) pixels of the target, denser at the border, and rays that the source sees there."""
     bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
     axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
     width, height = target_size(source, rows)

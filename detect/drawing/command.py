@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from camera.calibration.images import quiet_opencv
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, picture_name, png_of
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
@@ -20,7 +21,6 @@ from detect.runs.plan import FramePlan, FrameTask
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
-from detect.sources.video import quiet_opencv
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage
 from redetect.storage import demand_place, write_bytes

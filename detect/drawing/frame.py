@@ -1,9 +1,8 @@
 """Drawing of a frame's rows into its image: discs, verticals, markers, tilt, and their residuals.
 
-Outlines of discs are projected through the lens, and through the frame's tilt if rows are corrected
-for it; verticals through the lens, with error bars of one standard deviation at the horizon (the
-report's figures 5, 6 and 8). With reference rows, the missed ones are drawn as well, and unmatched
-rows have a different colour.
+Outlines of discs are projected through the lens, and through the tilt by which rows are levelled;
+verticals have error bars of one standard deviation at the horizon (the report's figures 5, 6, 8).
+With reference rows, missed ones are drawn as well, and unmatched rows in another colour.
 """
 
 from __future__ import annotations
@@ -105,20 +104,16 @@ def _scaled(points: FloatArray, scale: int) -> FloatArray:
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
-    """Distorted curves of lines: (N, P, 2) pixels from top to bottom.
-
-    `ends` (N, 4) are xtop, ytop, xbottom, ybottom in undistorted normalised coordinates.
-    """
+    """(N, P, 2) pixels of lines from top to bottom; `ends` (N, 4) are normalised coordinates."""
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     return camera.distort((1.0 - share) * ends[:, None, :2] + share * ends[:, None, 2:])
 
 
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Error bars of one standard deviation of the bearing, at the lines' crossings of the horizon.
+    """Error bars of one standard deviation of bearings, where lines cross the level horizon.
 
-    The horizon is that of the level robot; lines that end before it are extended. `ends`: (N, 4),
-    as for `line_curves`; `sigma_rad`: (N,). Returns (N, 2, 2) pixels; NaN for lines that do not
-    cross the horizon in front of the camera.
+    Lines that end before it are extended. `ends`: (N, 4), as for `line_curves`; `sigma_rad`: (N,).
+    Returns (N, 2, 2) pixels; NaN for lines that do not cross it in front of the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))
@@ -229,10 +224,7 @@ def _count(what: str, match: FrameMatch, compared: bool) -> str:
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
-    """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
-
-    Pixels without a direction in the camera's calibration are dark red.
-    """
+    """A grey image as (H, W, 3) blue, green, red to draw into; unseen pixels are dark red."""
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if camera is not None and camera.seen_share < 1.0:
         unseen = _unseen(camera)
@@ -275,10 +267,7 @@ def draw_text(
     canvas: ByteArray, text: str, at: ArrayLike, colour: Colour, size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:  # fmt: skip
-    """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
-
-    `shift` moves the text, by more in wide pictures.
-    """
+    """Draw ASCII text, its base line from u, v plus `shift`, unless that is far outside."""
     place = np.asarray(at, dtype=np.float64)
     if np.all(np.abs(place) < _FARTHEST_PX):
         times = enlargement(canvas)

@@ -2,12 +2,9 @@
 
 Edges of markers are straight only in a pinhole image. All fits to edges therefore use *straight*
 positions, ``(scale x + offset)`` of the undistorted normalised coordinates, and their results are
-distorted again. Without a camera both are the same.
-
-The rough corners of a region are those of the quadrangle of largest area in its hull (algorithm B
-of RAWSEEDS deliverable D2.1 part 2); the report searches it by coordinate ascent, this module
-exhaustively over all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
-(0, 1).
+distorted again. The rough corners of a region are those of the quadrangle of largest area in its
+hull (algorithm B of RAWSEEDS deliverable D2.1 part 2, which searches by coordinate ascent, this
+module over all diagonals). A square is (0, 0) top left, (1, 0), (1, 1) bottom right, (0, 1).
 """
 
 from __future__ import annotations
@@ -92,10 +89,7 @@ def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 
 def rough_corners(hull: FloatArray) -> FloatArray | None:
-    """Four corners (4, 2) of a region from its convex hull (N, 2); None if that has fewer.
-
-    Clockwise as seen in the image; the first is arbitrary.
-    """
+    """Four corners (4, 2), clockwise in the image, of a hull (N, 2); None if it has fewer."""
     if len(hull) < 4:
         return None
     corners = hull[list(largest_quadrangle(hull))]
@@ -104,10 +98,7 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
 
 @kernel()
 def largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
-    """Indices of the largest quadrangle among points (N, 2), in order.
-
-    For each diagonal, the highest triangles on both sides are combined.
-    """
+    """Indices of the largest quadrangle among points (N, 2), in order, over all diagonals."""
     n = len(points)
     largest, best = -1.0, (0, 0, 0, 0)
     for i in range(n - 2):
@@ -143,10 +134,7 @@ def is_convex(corners: FloatArray) -> bool:
 
 
 def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
-    """Whether a quadrangle (4, 2) contains the centre of one of `others` (N, 4, 2), or vice versa.
-
-    All are clockwise and convex.
-    """
+    """Whether a clockwise quadrangle contains the centre of one of (N, 4, 2), or vice versa."""
 
     def inside(corners: FloatArray, point: FloatArray) -> BoolArray:
         side, to = corners[..., _NEXT, :] - corners, point[..., None, :] - corners

@@ -63,10 +63,7 @@ class ReportInputs:
 
 
 def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
-    """Read and compare all rows of a run.
-
-    Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
-    """
+    """Read and compare all rows of a run; DetectError or LandmarkFileError if one is bad."""
     files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)
     if not names:
@@ -225,9 +222,6 @@ def _uncertainty(inputs: ReportInputs) -> list[Part]:
     return parts
 
 
-# -- against the reference --------------------------------------------------------------------
-
-
 def _discs(result: DiscComparison | None) -> list[Part]:
     """Rates and errors of discs, and consistency of the covariances."""
     if result is None:
@@ -272,14 +266,8 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
     return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
 
 
-# -- frames, tilt, settings -------------------------------------------------------------
-
-
 def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:
-    """Tables of the worst frames, and the frames to be shown with the reasons.
-
-    The first one has most discs. Without a reference to rank them, the others are some frames.
-    """
+    """Tables of the worst frames; frames to show with the reasons, first that with most discs."""
     done = {name: seen for name, seen in zip(inputs.names, inputs.rows) if processed(seen)}
     named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []

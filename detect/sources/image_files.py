@@ -1,7 +1,4 @@
-"""Image files as a source, and the image of each step, which is never outside the run.
-
-Only the names of the images are kept in memory.
-"""
+"""Image files as a source, and the image of each step, which is never outside the run."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
@@ -20,9 +18,7 @@ from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
 from redetect.storage.bounded import leads_out, link_out
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
-
 WILDCARDS = frozenset("*?[")
 
 
@@ -185,12 +181,10 @@ class ImageFiles(Source):
 
 def _matching_images(pattern: Path) -> ImageNames:
     """The images that a pattern matches, or one image, whose name may look like a pattern."""
-    if WILDCARDS & set(str(pattern.parent)) and not pattern.parent.is_dir():
-        raise DetectError(
-            f"{pattern}: wildcards in a folder's name: expected them in the last part only"
-        )
     if not pattern.parent.is_dir():
-        raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
+        wild = "wildcards in a folder's name: expected them in the last part only"
+        missing = f"no such folder: {pattern.parent}"
+        raise DetectError(f"{pattern}: {wild if WILDCARDS & {*str(pattern.parent)} else missing}")
     name = glob.escape(pattern.name) if pattern.is_file() else pattern.name
     found = ImageNames(pattern.parent, name)
     if not found.names:

@@ -7,9 +7,10 @@ import re
 from pathlib import Path
 
 from camera import Camera, read_camera
+from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
+from detect.sources.image_files import WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FramesAlongPoses,
@@ -63,10 +64,7 @@ def open_source(
     *,
     posed: bool = False,
 ) -> ImageRun:
-    """Open a source with or without a calibration; without one the result is not a `Run`.
-
-    Parameters and errors as for `open_run`. If `posed`, a calibration without a pose is ignored.
-    """
+    """Open a source as `open_run` does; without a calibration, posed if `posed`, it is no `Run`."""
     options = options or SourceOptions()
     source = _source(name, options)
     if isinstance(camera, Path):

@@ -98,11 +98,8 @@ def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTil
 
 def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
     if words[0] != "TILT" or len(words) != 8:
-        raise LandmarkFileError(
-            name,
-            line,
-            f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count",
-        )
+        found = f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count"
+        raise LandmarkFileError(name, line, found)
     try:
         pitch, roll, cpp, cpr, crr = map(float, words[2:7])
         lines = int(words[7])

@@ -14,10 +14,7 @@ TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """The times of images (s) by prefix; rows are separated by blanks or a comma.
-
-    Raises LandmarkFileError if the file cannot be read, a row is malformed or an image has two.
-    """
+    """The times of images (s) by prefix; LandmarkFileError if a row is malformed or repeated."""
     times: dict[str, float] = {}
     with opened(path, "file of times") as stream:
         for row, _, line in rows_of_words(stream, os.fspath(path)):
@@ -29,11 +26,8 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
             except (IndexError, ValueError):
                 prefix, seconds = "", float("nan")
             if len(words) != 2 or not isfinite(seconds):
-                raise LandmarkFileError(
-                    path,
-                    line,
-                    f"{excerpt(' '.join(words))}: expected an image's prefix and seconds",
-                )
+                found = f"{excerpt(' '.join(words))}: expected an image's prefix and seconds"
+                raise LandmarkFileError(path, line, found)
             if prefix in times:
                 raise LandmarkFileError(path, line, f"{excerpt(prefix)} is listed a second time")
             times[prefix] = seconds

@@ -292,9 +292,9 @@ def test_wrong_command_lines(small_run: Path, capsys: Captured, wrong: list[str]
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (["circles", "images/e", "--radius-m", "-1"], "radius_m is -1: expected above 0"),
-        (["lines", "images/e", "--join-threshold", "-0.1"], "join_threshold is -0.1: expected 0"),
-        (["compare", "images/e", "--gate-m", "0"], "gate_m is 0: expected above 0"),
+        (["circles", "images/e", "--radius-m", "-1"], "--radius-m is -1: expected above 0"),
+        (["lines", "images/e", "--join-threshold", "-0.1"], "--join-threshold is -0.1: expected 0"),
+        (["compare", "images/e", "--gate-m", "0"], "--gate-m is 0: expected above 0"),
     ],
 )
 def test_a_setting_out_of_its_bounds_is_one_line(
@@ -352,7 +352,7 @@ def test_demands_decide_the_exit_code(
 def test_demands_are_shares(compared_run: Path, capsys: Captured, least: str) -> None:
     with pytest.raises(SystemExit):
         main(["compare", str(compared_run), "--min-recall", least])
-    assert f"min_recall is {least}: expected 0 to 1" in " ".join(capsys.readouterr().err.split())
+    assert f"--min-recall is {least}: expected 0 to 1" in " ".join(capsys.readouterr().err.split())
 
 
 def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:

@@ -273,7 +273,7 @@ def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> N
     with pytest.raises(SystemExit) as caught:
         main(["poses", "somewhere", "--outlier-sigma", "0"])
     assert caught.value.code == 2
-    assert "outlier_sigma is 0" in capsys.readouterr().err
+    assert "--outlier-sigma is 0" in capsys.readouterr().err
 
 
 @pytest.mark.long

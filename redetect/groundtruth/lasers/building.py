@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ezdxf import units
-from ezdxf.enums import InsertUnits
-from ezdxf.filemanagement import readfile
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import read_table
-from redetect.messages import one_line
+from redetect.messages import imported_for, one_line
 from redetect.storage.bounded import read_content
 
 #: Curved walls are approximated by segments no farther from the curve than this (m).
@@ -79,6 +76,10 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
 def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
     pieces: list[tuple[float, float, float, float]] = []
     read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
+    with imported_for(f"{path}: drawings are read by the package ezdxf", "dxf", GroundTruthError):
+        from ezdxf import units
+        from ezdxf.enums import InsertUnits
+        from ezdxf.filemanagement import readfile
     try:
         drawing = readfile(os.fspath(path))
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))

@@ -17,6 +17,7 @@ import numpy as np
 
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Minimum
+from redetect.messages import imported_for
 from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
@@ -26,7 +27,6 @@ from redetect.slam.models import with_heading
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
 _TOLERANCE, _MOST_STEPS = 1e-10, 200
-_MISSING = "--solver gtsam needs GTSAM, which is not installed: pip install 'redetect[slam]'"
 
 
 def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[Estimate]:
@@ -56,10 +56,8 @@ def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[
 
 def load_gtsam() -> Any:
     """GTSAM; `SlamError` if it is not installed."""
-    try:
+    with imported_for("--solver gtsam needs the package gtsam", "slam", SlamError):
         import gtsam
-    except ImportError:
-        raise SlamError(_MISSING) from None
     return gtsam
 
 
