@@ -378,8 +378,13 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
 
 
 def chance_of_agreeing(xy: FloatArray) -> float:
-    """Probability that a landmark anywhere falls on one of (n, 2) landmarks by chance."""
-    return float(len(xy) * np.pi * REACH_M**2 / covered_area(xy))
+    """Probability that a landmark in the covered area falls on one of (n, 2) by chance."""
+    low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
+    xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
+    x, y = xy.T[:, :, None, None]
+    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
+    area_m2 = float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
+    return float(len(xy) * np.pi * REACH_M**2 / area_m2)
 
 
 def _refined(
@@ -400,12 +405,3 @@ def _refined(
         pose,
         log10_false_alarms(len(pairs), present, chance_of_agreeing(earlier.xy), tried),
     )
-
-
-def covered_area(xy: FloatArray) -> float:
-    """Area within the cover distance of any point (m^2), on a grid."""
-    low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
-    xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
-    x, y = xy.T[:, :, None, None]
-    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
-    return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)

@@ -28,13 +28,14 @@ from redetect.slam.commands.files import (
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck
-from redetect.slam.mapping.run_map import MappedRun, Mounting, as_json, map_run, table_lines
+from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.slam.settings import PLACE
 from redetect.storage import demand_free, write_bytes
+from redetect.tables import plain
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
@@ -77,7 +78,8 @@ def perform(command: Map) -> int:
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = mapped.odometry_check()
-    write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
+    results = plain(_results(mapped, check, command))
+    write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
     if not few:
@@ -191,19 +193,19 @@ def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str,
     results: dict[str, Any] = {
         "version": __version__,
         "configuration": flags_of(command, ("output", "force", "interactive")),
-        "table": as_json(mapped.table),
-        "odometry": as_json(check),
+        "table": asdict(mapped.table),
+        "odometry": asdict(check),
         "minimised": mapped.cost,
         "steps": mapped.steps,
         "left_out": asdict(mapped.left_out),
     }
     if (found := mapped.mounting) is not None:
         results["mounting"] = {
-            "rotation_rad": found.change[:3].tolist(),
-            "place_m": found.change[3:5].tolist(),
-            "height_m": float(found.change[5]),
-            "covariance": found.covariance.tolist(),
-            "robot_from_camera": found.robot_from_camera.tolist(),
+            "rotation_rad": found.change[:3],
+            "place_m": found.change[3:5],
+            "height_m": found.change[5],
+            "covariance": found.covariance,
+            "robot_from_camera": found.robot_from_camera,
             "chi_squared_gained": found.gain,
         }
     return results

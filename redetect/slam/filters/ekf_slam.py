@@ -35,11 +35,12 @@ from redetect.slam.filters.frames import (
     Filter,
     FilterRun,
     FrameRows,
+    frames_of,
     numbers_from,
     run_filter,
 )
-from redetect.slam.models import tilt_jacobian
-from redetect.slam.recording import Recording
+from redetect.slam.models import move, tilt_jacobian
+from redetect.slam.recording import LineRows, Recording
 
 #: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
 #: assume that bearings are linear in these.
@@ -55,6 +56,8 @@ _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 _POSE = np.arange(POSE_SIZE)
 # Increment of the state's size; some unused numbers cost less than copying its covariance often.
 _CHUNK = 64
+# For poses alone the state is limited to this many discs: its update costs their number squared.
+_MOST_DISCS = 300
 
 
 class EkfSlam(Filter):
@@ -240,3 +243,34 @@ def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = 
             "expected known association, or a run without lines"
         )
     return run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
+
+
+def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Poses by EKF-SLAM with the identifiers of discs: a start where odometry is too wrong.
+
+    Odometry with a systematic error winds up: after a loop its heading may be half a turn off, and
+    least squares from there end in a wrong minimum, with the path wound once too often. The filter
+    corrects the pose in each frame, so that no error winds up while discs are in view. It forgets
+    discs not seen for long, and begins again after a lost step.
+
+    Takes the first pose (3,) (m, m, rad); returns the start and the pose after each step (N + 1, 3)
+    as estimated at the time, theta not wrapped. Raises `SlamError` if covariances contradict each
+    other.
+    """
+    lost = set(recording.lost.tolist())
+    poses = np.empty((len(recording) + 1, 3))
+    poses[0] = start
+    ekf, seen = EkfSlam(poses[0]), dict[int, int]()
+    for k, rows in enumerate(frames_of(recording)):
+        if k in lost:
+            ekf, seen = EkfSlam(move(poses[k], recording.steps[k])), {}
+        else:
+            ekf.predict(recording.steps[k], recording.step_covariance[k])
+        ekf.measure(rows._replace(lines=LineRows.of()))
+        seen.update(dict.fromkeys(rows.circles.ids[rows.circles.identified].tolist(), k))
+        if len(seen) > _MOST_DISCS:
+            kept = dict(sorted(seen.items(), key=lambda item: -item[1])[: _MOST_DISCS // 2])
+            ekf.forget(seen.keys() - kept.keys(), set())
+            seen = kept
+        poses[k + 1] = ekf.state[:3]
+    return poses
