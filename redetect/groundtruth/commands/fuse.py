@@ -55,11 +55,8 @@ def perform(options: Fuse) -> int:
         known = read_common_covariance(options.laser)
         streams["laser"], common = without_common(streams["laser"], known)
     fusion = fuse(odometry, streams, settings)
-    fusion = replace(
-        fusion,
-        poses=with_common(fusion.poses, common),
-        filtered=with_common(fusion.filtered, common),
-    )
+    poses, filtered = (with_common(path, common) for path in (fusion.poses, fusion.filtered))
+    fusion = replace(fusion, poses=poses, filtered=filtered)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
@@ -85,10 +82,9 @@ def perform(options: Fuse) -> int:
 
 
 def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -> None:
-    assert fusion.poses.covariances is not None
-    sigma = 1e3 * np.sqrt(
-        np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
-    )
+    covariances = fusion.poses.covariances
+    assert covariances is not None
+    sigma = 1e3 * np.sqrt(np.median(covariances[:, 0, 0] + covariances[:, 1, 1]))
     used = ", ".join(f"{count} from {name}" for name, count in fusion.used.items())
     print(
         f"{options.output}: {len(fusion.poses)} poses out of {used}; "

@@ -153,25 +153,17 @@ def describe(
     """Sets by status, visits and how their front was found, and the residuals of scanners."""
     segments = []
     for segment, front in sorted(track.fronts.items()):
-        times = track.times_s[track.segment == segment]
-        segments.append(
-            {"visit": segment, "from_s": float(times[0]), "to_s": float(times[-1]), "front": front}
-        )
+        times = track.times_s[track.segment == segment].tolist()
+        visit = {"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front}
+        segments.append(visit)
     entries = []
     excess = excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):
         out = scanner.name in left_out
         found = (track.corrections[k], track.correction_sigma[k])
-        shift, sigma = left_out.get(scanner.name, found)
-        entries.append(
-            {
-                "name": scanner.name,
-                "correction": shift.tolist(),
-                "sigma": sigma.tolist(),
-                "suspect": bool(out or excess[k] > 1.0),
-                "left_out": out,
-            }
-        )
+        shift, sigma = (values.tolist() for values in left_out.get(scanner.name, found))
+        entry = {"name": scanner.name, "correction": shift, "sigma": sigma}
+        entries.append({**entry, "suspect": bool(out or excess[k] > 1.0), "left_out": out})
     good = np.isin(track.status, (OK, REACQUIRED))
     shared = (track.covariances - track.noise)[good]
     counts = np.bincount(track.status, minlength=len(STATUS)).tolist()

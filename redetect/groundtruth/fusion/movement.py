@@ -219,8 +219,23 @@ class MovementProblem:
             states, covariances = smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
+        # The second half of a gap that was cut follows odometry from the measurements after it.
         for begin, end in gaps:
-            self._anchor(begin, end, variances, states, covariances, carried=bool(carried[end]))
+            gap, inner = slice(begin, end + 1), slice(begin + 1, end)
+            odometry = Odometry(self.controls[gap], variances[gap])
+            back, spreads = predicted_backward(odometry, states[end], covariances[end])
+            way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
+            way -= way[0]
+            half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
+            apart = pose_differences(back[1:-1, :POSE], states[inner, :POSE])
+            states[begin + half : end] = back[half:-1]
+            covariances[begin + half : end] = spreads[half:-1]
+            # A robot that was carried in the gap may have been anywhere along its path then, so
+            # covariances include the other end's path as a possibility.
+            if carried[end]:
+                share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
+                other = share[:, None, None] * apart[:, :, None] * apart[:, None]
+                covariances[inner, :POSE, :POSE] += other
         return Smoothed(states, covariances, innovations, slips)
 
     def _ends_that_did_not_fit(self, innovations: Innovations) -> list[int]:
@@ -234,36 +249,6 @@ class MovementProblem:
             if first > 0 and times_s[first] - times_s[first - 1] > UNMEASURED_S:
                 found.append(int(nodes[first]))
         return found
-
-    def _anchor(
-        self,
-        begin: int,
-        end: int,
-        variances: FloatArray,
-        states: FloatArray,
-        covariances: FloatArray,
-        *,
-        carried: bool,
-    ) -> None:
-        """Determine the second half of a gap that was cut from the measurements after it.
-
-        A robot that was `carried` in the gap may have been anywhere along its path then, so
-        covariances include the other end's path as a possibility.
-        """
-        gap = slice(begin, end + 1)
-        back, spreads = predicted_backward(
-            Odometry(self.controls[gap], variances[gap]), states[end], covariances[end]
-        )
-        way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
-        way -= way[0]
-        half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
-        apart = pose_differences(back[1:-1, :POSE], states[begin + 1 : end, :POSE])
-        states[begin + half : end] = back[half:-1]
-        covariances[begin + half : end] = spreads[half:-1]
-        if carried:
-            share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
-            other = share[:, None, None] * apart[:, :, None] * apart[:, None]
-            covariances[begin + 1 : end, :POSE, :POSE] += other
 
     def gate(self) -> float:
         """Largest squared normalised innovation."""

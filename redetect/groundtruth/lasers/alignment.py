@@ -117,7 +117,12 @@ def align_scanners(
     gates = np.geomspace(s.gate_m, 0.08, 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = _round(scans, steps["merged"], s)
-    steps["together"] = _together(scans, steps["realigned"], s)
+    together = steps["realigned"]
+    for _ in range(_ROUNDS):  # until no scanner moves
+        before, together = together, _round(scans, together, s)
+        if np.abs(together - before).max() < 1e-5:
+            break
+    steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
     whole = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
@@ -242,16 +247,6 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
     return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), s.keep)
 
 
-def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
-    """Rounds until no scanner moves."""
-    for _ in range(_ROUNDS):
-        before = poses
-        poses = _round(scans, poses, s)
-        if np.abs(poses - before).max() < 1e-5:
-            break
-    return poses
-
-
 def _whole_to_map(
     stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
     narrowing_m: list[float],
@@ -276,9 +271,5 @@ def icp_by_step(
     They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
     (3,).
     """
-    return np.array(
-        [
-            fit_outline(points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
-            for k in range(steps + 1)
-        ]
-    )
+    from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
+    return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

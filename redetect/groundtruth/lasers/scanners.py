@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import struct
@@ -30,7 +31,7 @@ from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, deman
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
-from redetect.storage.bounded import read_plain_array
+from redetect.storage.bounded import read_content, read_plain_array
 
 MOST_READINGS = 4096
 
@@ -320,44 +321,28 @@ def read_scans(
 
 def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
     """Read the two arrays, checking the sizes stated in the file and without unpickling."""
+    content = read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
+    place, arrays = f"{path}: unreadable .npz", []
     try:
-        with zipfile.ZipFile(path) as archive:
-            times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
-            return times, _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
-    except GroundTruthError:
-        raise
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for name, kind, dimensions in (("times_s", np.float64, 1), ("ranges_mm", np.uint16, 2)):
+                place = f"{path}: {name}"
+                info = archive.getinfo(f"{name}.npy")
+                if info.file_size > _LARGEST_FILE_BYTES:
+                    raise ValueError(f"larger than {_LARGEST_FILE_BYTES} bytes")
+                with archive.open(info) as stream:
+                    file, dtype = cast(BinaryIO, stream), np.dtype(kind)
+                    arrays.append(read_plain_array(file, dtype, dimensions, info.file_size))
+    except KeyError:
+        raise GroundTruthError(f"{place}: no such array: expected times_s and ranges_mm") from None
     # Errors of damaged archives: names that are not UTF-8, offsets beyond the file, ...
     except (
         zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
-        struct.error,
+        struct.error, zlib.error,
     ) as error:  # fmt: skip
-        said = one_line(str(error), 200)
-        raise GroundTruthError(f"{path}: unreadable .npz: {said}") from None
-
-
-def _member(
-    path: str | os.PathLike[str],
-    archive: zipfile.ZipFile,
-    name: str,
-    dtype: np.dtype[Any],
-    dimensions: int,
-) -> NDArray[Any]:
-    place = f"{path}: {name}"
-    try:
-        info = archive.getinfo(f"{name}.npy")
-    except KeyError:
-        raise GroundTruthError(f"{place}: no such array: expected times_s and ranges_mm") from None
-    if info.file_size > _LARGEST_FILE_BYTES:
-        raise GroundTruthError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
-    try:
-        with archive.open(info) as stream:
-            return read_plain_array(cast(BinaryIO, stream), dtype, dimensions, info.file_size)
-    except (ValueError, zlib.error) as error:
-        raise GroundTruthError(f"{place}: {error}") from None
+        raise GroundTruthError(f"{place}: {one_line(str(error), 200)}") from None
+    times, ranges = arrays
+    return times, ranges
 
 
 def _read_rows(

@@ -8,6 +8,7 @@ that the beams agree. Errors of one set affect the next one's pose only through 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.ndimage import convolve1d
 from scipy.stats import trim_mean
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
 from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
@@ -123,21 +124,25 @@ class Tracker:
                 searched_s = t
                 # From the scans of this set alone, if they show the robot.
                 found = acquire(self.sets[i], self.fixed, self.body, self.settings)
-                acquired = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
-                if acquired is not None:
+                if found is None:
+                    continue
+                with suppress(GeometryError):
+                    pose, motion = self._fit(i, found, np.zeros(3), 0.0), np.zeros(3)
                     if self.track.status[i] == OK:
                         self.track.status[i] = REACQUIRED
-                    pose, motion, segment, tracked = acquired, np.zeros(3), segment + 1, True
+                    segment, begun, tracked = segment + 1, i, True
                     posed_s = before_s = determined_s = t
-                    self.track.segment[i], begun = segment, i
+                    self.track.segment[i] = segment
                 continue
             step, before_s = t - before_s, t
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - determined_s)
-            fitted = self._fit(i, predicted, motion, t - posed_s)
-            if fitted is None:
+            try:
+                fitted = self._fit(i, predicted, motion, t - posed_s)
+            except GeometryError as reason:
+                self.track.reasons[i] = str(reason)
                 self.track.status[i], pose = COASTING, predicted
                 continue
             error = pose_differences(fitted, predicted)
@@ -152,35 +157,28 @@ class Tracker:
 
     def _fit(
         self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
-    ) -> FloatArray | None:
-        """Pose of set i near a prediction over `unseen_s` without poses; None, with a reason."""
+    ) -> FloatArray:
+        """Pose of set i near a prediction over `unseen_s` without poses, or a `GeometryError`."""
         s = self.settings
         seen = self._points(i, predicted, motion, unseen_s)
         if len(seen.points) < s.least_readings:
-            self.track.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
-            return None
+            raise GeometryError(f"{len(seen.points)} new readings where the robot should be")
         start, count = self._aligned(seen, predicted)
         if count < s.least_readings:
-            self.track.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
-            return None
+            raise GeometryError(f"{count} readings within {s.gate_m:g} m of the outline")
         found = self._refine(i, seen, start)
         pose, used, chi2 = found.pose, found.used, found.chi2
         if used < s.least_readings:
-            self.track.reasons[i] = f"{used} readings on the outline"
-            return None
+            raise GeometryError(f"{used} readings on the outline")
         if chi2 > _LARGEST_CHI2 * (used - 3.0):
-            self.track.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used} readings"
-            return None
+            raise GeometryError(f"squared normalised residuals {chi2:.0f} of {used} readings")
         far = math.hypot(pose[0] - predicted[0], pose[1] - predicted[1])
         if far > 0.1 + 2.0 * self.speed * unseen_s:
-            self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
-            return None
+            raise GeometryError(f"{far:.2f} m from where the robot should be")
         beams = explain_set(self.sets[i], self.fixed, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
-            self.track.reasons[i] = (
-                f"{beams.through} beams see through the robot, {beams.agree} see it"
-            )
-            return None
+            through, agree = beams.through, beams.agree
+            raise GeometryError(f"{through} beams see through the robot, {agree} see it")
         self._store(i, found, beams)
         return pose
 

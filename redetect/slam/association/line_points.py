@@ -79,24 +79,13 @@ def _wrapped(angle: float) -> float:
 
 
 @kernel()
-def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[float, float]:
-    """How far from their origins two rays cross; negative behind."""
-    ux, uy = math.sin(angle[i]), -math.cos(angle[i])
-    vx, vy = math.sin(angle[j]), -math.cos(angle[j])
-    determinant = vx * uy - ux * vy
-    if abs(determinant) < 1e-9:
-        return -1.0, -1.0
-    x, y = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
-    return (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
-
-
-@kernel()
 def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
     """Points (k, 2) where rays of frames some steps apart cross, ahead of both, and the frames."""
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
     frames = []
     for i in range(len(angle)):
+        ux, uy = math.sin(angle[i]), -math.cos(angle[i])
         for gap in _GAPS:
             other = frame[i] + gap
             if other >= len(start) - 1:
@@ -105,11 +94,16 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
                 parallax = abs(_wrapped(angle[j] - angle[i]))
                 if parallax < _LEAST_PARALLAX_SIGMAS * math.hypot(sigma[i], sigma[j]):
                     continue
-                near, far = _crossing(centre, angle, i, j)
+                vx, vy = math.sin(angle[j]), -math.cos(angle[j])
+                determinant = vx * uy - ux * vy
+                if abs(determinant) < 1e-9:
+                    continue
+                x, y = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
+                near, far = (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
                 if min(near, far) < _NEAREST_M or max(near, far) > _FARTHEST_M:
                     continue
-                points.append(centre[i, 0] + near * math.sin(angle[i]))
-                points.append(centre[i, 1] - near * math.cos(angle[i]))
+                points.append(centre[i, 0] + near * ux)
+                points.append(centre[i, 1] + near * uy)
                 frames.append(frame[i])
     return np.array(points, dtype=np.float64).reshape(-1, 2), np.array(frames, dtype=np.int64)
 

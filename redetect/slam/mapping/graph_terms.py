@@ -106,16 +106,9 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
 def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
     """The function to minimise; infinite if the camera could not see a disc."""
     error = errors(graph, estimate, weighting)
-    loss = Loss(weighting.loss, weighting.loss_scale)
-    return robust_cost(
-        [
-            (error.odometry, Loss()),
-            (error.discs, loss),
-            (error.lines[:, None], loss),
-            (error.prior, Loss()),
-            (error.place, Loss()),
-        ]
-    )
+    plain, loss = Loss(), Loss(weighting.loss, weighting.loss_scale)
+    parts = (error.odometry, error.discs, error.lines[:, None], error.prior, error.place)
+    return robust_cost(zip(parts, (plain, loss, loss, plain, plain)))
 
 
 def linearise(
