@@ -37,10 +37,9 @@ def perform(options: Noise) -> int:
 
 
 def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
-    """Rows of a landmark file with noise added.
+    """Rows of a landmark file with noise added; without noise they are unchanged.
 
-    Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
-    comment at the head states what was added. Without noise the rows are unchanged.
+    Covariances become the sum of both; a comment at the head states what was added.
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])

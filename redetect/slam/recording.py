@@ -158,9 +158,8 @@ def first_poses(runs: Sequence[Recording]) -> IntArray:
 
 
 def joined(runs: Sequence[Recording]) -> Recording:
-    """Runs as one: a lost step leads from the end of each to the start of the next.
-
-    The frame after that step has no rows; it is called `start`.
+    """Runs as one: a lost step leads from the end of each to the start of the next, a frame without
+    rows called `start`.
     """
     if len(runs) == 1:
         return runs[0]
@@ -188,10 +187,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
 def landmark_files(
     run: Path, *, circles: bool = True, lines: bool = False, stem: str | None = None
 ) -> list[Path]:
-    """The landmark files of a run folder, of the requested kinds; for a file, itself.
-
-    Their name is `stem`, by default map, or else detected.
-    """
+    """The landmark files of a run folder, named `stem` (map, else detected); of a file, itself."""
     if not run.is_dir():
         _demand_landmarks(run)
         return [run]
@@ -298,10 +294,7 @@ def recording_of_frames(
 
 
 def frames_of_discs(recording: Recording) -> list[Frame]:
-    """Steps and rows of discs as frames, the inverse of `recording_of_frames`.
-
-    The rows' quality is 1.
-    """
+    """Steps and rows of discs, of quality 1, as frames: the inverse of `recording_of_frames`."""
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
     quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))

@@ -64,8 +64,7 @@ _STANDS_M, _MOVES_M = 0.01, 1.0
 def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     """Maximum likelihood estimate of odometry's random errors, near those given.
 
-    Long gaps are excluded: a linearised filter may be lost at their ends, and then the likelihood
-    does not depend on the noise.
+    Without long gaps: the filter may be lost at their ends, whatever the noise.
     """
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
@@ -92,8 +91,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """Factor of odometry's variances over seconds to those expected from single samples.
 
     A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
-    over a gap. So most measurements are dropped, and odometry's predictions between the remaining
-    ones are compared with them. The factor is 1 unless the errors are significantly larger.
+    over a gap. So its predictions between measurements seconds apart are compared with these. The
+    factor is 1 unless the errors are significantly larger.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -121,8 +120,7 @@ def useful_terms(
     """(3,) mask of odometry's systematic errors whose estimates improve predictions over seconds.
 
     They are estimated from sample to sample. If these include odometry's own jitter, which measured
-    poses do not confirm, a spurious scale of turns results (regression dilution). Over seconds, and
-    over gaps, such an estimate makes predictions worse.
+    poses do not confirm, a spurious scale of turns results (regression dilution).
     """
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0
@@ -326,10 +324,9 @@ def leave_out(
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
-    Parameters as for `fuse`. Segments are those of the first stream; the other streams are left out
-    at the same times. The first and the last segment are not predicted, since a fused path extends
-    from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
-    three segments within the odometry's time.
+    Parameters as for `fuse`. Segments are those of the first stream; the others are left out at the
+    same times. A fused path ends with the measured poses: the first and the last segment are not
+    predicted. Raises `GroundTruthError` if there are fewer than three within the odometry's time.
     """
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)

@@ -47,10 +47,7 @@ def noise_of(settings: FuseSettings) -> FloatArray:
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
-    """Pauses of odometry, as the times of the samples before and after each.
-
-    Only their total movement is known, not the path. No two samples may have the same time.
-    """
+    """Pauses of odometry, as the times of the samples before and after each, which are distinct."""
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
 
@@ -113,9 +110,8 @@ def gather(
 ) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
     """All measurements within the odometry's time, in order, with usable covariances.
 
-    Of several poses at one time in a stream, the last counts. Returns each measurement's stream,
-    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream the number of covariances that
-    had to be increased.
+    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
+    stream the number of covariances that had to be increased.
     """
     found = []
     repaired = {}

@@ -65,9 +65,8 @@ _SETTLED_RAD = 1e-3
 def predicted_backward(
     odometry: Odometry, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
-
-    `end` (6,) and `end_spread` (6, 6) are those at the last of the N nodes.
+    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry, from the last of N
+    nodes with `end` (6,) and `end_spread` (6, 6).
     """
     controls, variances = odometry
     count = len(controls)
@@ -154,8 +153,7 @@ class MovementProblem:
     ) -> Innovations:
         """Innovations of the measurements in a forward filter.
 
-        It begins with the given means and deviations of odometry's systematic errors, by default
-        those of the settings.
+        `systematic`: initial means and deviations of systematic errors; by default the settings'.
         """
         return self.forward(self._variances(noise), systematic=systematic)
 
@@ -175,10 +173,7 @@ class MovementProblem:
         return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone.
-
-        `slips` (N, 3): variances of movements that are added for slips.
-        """
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter, given `slips` (N, 3)."""
         history = empty_history(len(self.times_s))
         self.forward(self._variances(noise) + slips, history=history)
         return history.filtered, history.filtered_covariance
@@ -303,10 +298,7 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Combine odometry and measured poses with covariances on common nodes.
-
-    The nodes are from the first measurement within the odometry's time to the last.
-    """
+    """Odometry and measured poses on common nodes, from the first measurement to the last."""
     names, times, measured, covariances, repaired = gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]

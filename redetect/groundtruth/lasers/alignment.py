@@ -1,9 +1,8 @@
 """Poses of fixed scanners, aligned with each other and with the building, step by step.
 
 The steps are those of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners are aligned by ICP;
-their scans are merged one after the other; each scanner is aligned again with the others' merged
-scans, in rounds until none moves; finally all as one body with the map, then each, together with
-the walls' offsets.
+their scans are merged one after the other; each is aligned again with the others', in rounds until
+none moves; finally all as one body with the map, then each, together with the walls' offsets.
 """
 
 from __future__ import annotations
@@ -266,10 +265,8 @@ def _whole_to_map(
 def icp_by_step(
     points: FloatArray, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
 ) -> FloatArray:
-    """(steps + 1,) root mean square distances (m) of the readings used from the map.
-
-    They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
-    (3,).
+    """(steps + 1,) rms distances (m) from the map of the readings used by an ICP of a scanner's
+    points (n, 2) to the map, from a start (3,).
     """
     from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
     return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

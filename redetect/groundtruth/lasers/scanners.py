@@ -48,10 +48,7 @@ _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 @dataclass(frozen=True, eq=False)
 class Scanner:
-    """A laser scanner.
-
-    Raises `GroundTruthError` if a shape or value is impossible.
-    """
+    """A laser scanner; raises `GroundTruthError` if a shape or value is impossible."""
 
     name: str  # Its scans are in ``<name>.scans.npz``
     # (3,): x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame
@@ -95,11 +92,7 @@ class Scanner:
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
-        """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
-        millimetres.
-
-        NaN if nothing was hit.
-        """
+        """(..., readings, 2) points in the scanner's frame (m), NaN without a hit; ranges in mm."""
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
         angles = self.angles_rad
         return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
@@ -162,11 +155,7 @@ def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Pat
 
 
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
-    """Read a ``scanners.json``: the scanners, in the file's order.
-
-    Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
-    scanners have the same name.
-    """
+    """The scanners of a ``scanners.json``, in order; `GroundTruthError` if it is malformed."""
     return _scanners(JsonObject.read(path))
 
 
@@ -183,10 +172,7 @@ def write_scanners(
 
 
 def read_robot(path: str | os.PathLike[str]) -> Robot:
-    """Read a ``robot.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``robot.json``; raises `GroundTruthError` if it is malformed."""
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
     if len(outline) < 3:
@@ -232,10 +218,7 @@ def _scanner(entry: JsonObject) -> Scanner:
 
 @dataclass(frozen=True, eq=False)
 class Scans:
-    """Scans of one scanner over time.
-
-    Raises `GroundTruthError` if shapes or types disagree or a time is not finite.
-    """
+    """Scans of one scanner over time; raises `GroundTruthError` if shapes or types disagree."""
 
     # (N,): seconds on the scanner's clock (of a scan's middle beam), in the order of measurement.
     # In some real logs they step back.
@@ -258,10 +241,7 @@ class Scans:
 
 
 def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
-    """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
-
-    Raises `GroundTruthError` if there is none, or more than one.
-    """
+    """The one file with a scanner's scans (see `_ENDINGS`); `GroundTruthError` if not one."""
     found = [path for end in _ENDINGS if (path := Path(folder) / (name + end)).is_file()]
     if len(found) != 1:
         what = "no scans" if not found else f"scans in {len(found)} files"

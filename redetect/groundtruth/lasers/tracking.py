@@ -268,8 +268,7 @@ class Tracker:
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
-        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
-        motion: robots drive forward.
+        First by the readings of some sets; if ambiguous, by the motion: robots drive forward.
         """
         if len(self.body.symmetries) == 0:
             return "outline"
@@ -323,10 +322,7 @@ class Tracker:
         return ahead
 
     def _scales(self, good: IntArray) -> FloatArray:
-        """Factors on the covariances if residuals are larger than the scanners' noise.
-
-        From the residuals of half a second, since one set's are too few.
-        """
+        """Factors on covariances where residuals of half a second are larger than the noise."""
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
         total, squared = (
             convolve1d(values, np.ones(37), mode="constant")
@@ -360,8 +356,7 @@ def track_by_lasers(
 ) -> LaserTrack:
     """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`).
 
-    If the readings are outside or inside of the outline on all sides, it was drawn too small or too
-    large: then its faces are moved, as `outline_moved_m` says.
+    If the readings are outside or inside of the outline on all sides, its faces are moved.
     """
     settings = LaserSettings() if settings is None else settings
     allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0
@@ -382,9 +377,8 @@ def track_without_suspects(
 ) -> tuple[LaserTrack, dict[str, FloatArray]]:  # fmt: skip
     """Follow the robot, excluding scanners whose readings disagree with the others'.
 
-    They are excluded one at a time, the worst first, and only while at least three scanners remain.
-    Returns the track and, for the excluded ones, the shift that their readings suggest and its
-    standard deviations (2, 3).
+    The worst is excluded first, while three or more remain. Returns the track and, for the excluded
+    ones, the shift that their readings suggest and its standard deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
     while True:
@@ -413,8 +407,8 @@ def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArra
 def usual_sets_per_pose(track: LaserTrack) -> int:
     """Number of consecutive sets that are close enough to average, at least 1.
 
-    While the robot speeds up or begins to turn, the mean of poses over a time T is off by a T^2/24,
-    which is less than their noise over this time only.
+    If the robot speeds up or begins to turn, the mean over a time T is off by a T^2/24: less than
+    the noise over this time only.
     """
     intervals = np.diff(track.times_s)
     if not len(intervals):

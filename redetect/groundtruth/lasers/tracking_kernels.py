@@ -156,10 +156,10 @@ def _face_of(
     x: float, y: float, bx: float, by: float, range_m: float, faces: FloatArray,
     normal: FloatArray, gate_m: float,
 ) -> int:  # fmt: skip
-    """The face that a reading at (x, y) belongs to, -1 for none; (bx, by) is its beam's direction.
+    """The face of a reading at (x, y), -1 for none; (bx, by) is its beam's direction.
 
-    Of faces turned to the scanner that which the beam meets first; where its range is not given
-    (below 0), the nearest one within the gate.
+    Of faces turned to the scanner that which the beam meets first; without its range (below 0), the
+    nearest one within the gate.
     """
     best, face = np.inf, -1
     for k in range(faces.shape[0]):

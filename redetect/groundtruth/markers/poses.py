@@ -1,9 +1,9 @@
 """The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
 
 The chosen solver (of OpenCV or pycolmap) gives initial poses, which are refined by least squares
-over all corners. If all markers agree, the mirror image of the markers is tested, too, since it may
-explain the corners as well. If not, each marker's own two solutions are hypotheses, and the one
-with which most others agree determines the wrong markers.
+over all corners. If all markers agree, their mirror image is tested, which may explain the corners,
+too. If not, the hypothesis of a single marker with which most others agree determines the wrong
+ones.
 """
 
 from __future__ import annotations
@@ -222,8 +222,7 @@ class PoseEstimate:
 def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     """All poses of a robot that its markers' corners allow.
 
-    Raises `GeometryError` if there is no view, no pose explains any of them, or equally many
-    support poses that exclude each other.
+    Raises `GeometryError` if no pose explains a view, or poses that exclude each other do as well.
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")

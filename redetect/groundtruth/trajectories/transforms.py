@@ -109,10 +109,8 @@ def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
 
 
 def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(..., 3, 3) covariance of (x, y, theta) (m, m, rad).
-
-    `world_from_robot`: (..., 4, 4). `covariance`: (..., 6, 6), of the right perturbation
-    (translation m, rotation rad).
+    """(..., 3, 3) covariance of (x, y, theta) (m, m, rad) of poses (..., 4, 4), from that of their
+    right perturbations (..., 6, 6) (translation m, rotation rad).
     """
     jacobian = planar_jacobian(world_from_robot)
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))

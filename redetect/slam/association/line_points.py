@@ -188,10 +188,10 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
 def take_points(
     points: FloatArray, frames: IntArray, rays: Rays, reach: float
 ) -> tuple[IntArray, FloatArray]:
-    """Select points greedily: the best one with its rays, then the best of the other rays, etc.
+    """Select points (k, 2) greedily: the best one with its rays, then the best of the other rays.
 
-    Takes `points` (k, 2), `frames` (k,), and the widest gate of a bearing (rad); returns `labels`
-    (n,), `found` (m, 2).
+    Takes their `frames` (k,), and the widest gate of a bearing (rad); returns `labels` (n,) of the
+    rays, `found` (m, 2).
     """
     # Log likelihood ratio of a ray from a vertical to one from anywhere.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)
@@ -292,10 +292,7 @@ def rays_of(
     sigma_scale: float,
     heading_sigma_rad: float,
 ) -> Rays:
-    """The rows of verticals as rays in the map.
-
-    Takes `path` (N + 1, 3), `camera_xy` (2,).
-    """
+    """The rows of verticals as rays in the map, by the `path` (N + 1, 3) and `camera_xy` (2,)."""
     lines = recording.lines
     row = np.lexsort((lines.bearing_rad, lines.frame))
     frame, bearing = lines.frame[row], lines.bearing_rad[row]
@@ -314,10 +311,7 @@ def rays_of(
 
 
 def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
-    """The points in which rays intersect, the best first.
-
-    Returns `labels` (n,), `points` (k, 2).
-    """
+    """Labels (n,) of rows by the points in which their rays intersect, and these points (k, 2)."""
     points, frames = _crossings(rays)
     taken, found = take_points(points, frames, rays, _GATE * float(rays.sigma.max(initial=0.0)))
     labels = np.empty(len(taken), dtype=np.int64)

@@ -152,9 +152,8 @@ def _best_motion(
     """The motion under which most landmarks of one constellation fall on those of another.
 
     Every pair of landmarks of the first with every pair of the second of the same length gives a
-    motion; agreeing landmarks are counted. Returns the rotation about the first constellation's
-    centre and the shift, the number of agreeing landmarks, and the number of motions tried. Motions
-    near those `besides` (k, 3) are not considered.
+    motion. Returns the rotation about the first constellation's centre and the shift, the number of
+    agreeing landmarks, and that of motions tried, without those near `besides` (k, 3).
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -246,8 +245,7 @@ def stretches_of(
     """The constellations with enough landmarks along a run of `count` frames.
 
     They consist of `length` frames, and begin every `stride` frames, by default a fifth of it. Of
-    more landmarks than `most`, those with most rows are used. Takes `frames, labels` (n,), `xy`
-    (M, 2).
+    more landmarks than `most`, those with most rows count. `frames, labels` (n,), `xy` (M, 2).
     """
     found = []
     for start in range(0, max(count - length // 2, 1), stride or length // _OVERLAPPING):
@@ -278,8 +276,7 @@ def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
 def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
     """All pairs of stretches that show one place significantly, the most significant first.
 
-    Landmarks that two stretches already share are ignored; stretches that share three or more need
-    no match.
+    Landmarks that two stretches share are ignored; if these are three or more, they need no match.
     """
     candidates: list[tuple[Stretch, Stretch, Motion]] = []
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
@@ -323,10 +320,7 @@ class Motion(NamedTuple):
 def motion_onto(
     moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray | None = None
 ) -> Motion:
-    """The motion under which most landmarks (n, 2) fall on those of another constellation.
-
-    With `besides` (3,), the best one that is not near this pose.
-    """
+    """The motion under which most landmarks (n, 2) fall on others; not one near `besides` (3,)."""
     centre = moved.sum(axis=0) / max(len(moved), 1)
     others = np.zeros((0, 3))
     if besides is not None:
@@ -339,11 +333,7 @@ def motion_onto(
 def refined_motion(
     place: FloatArray, target: FloatArray, pose: FloatArray, least_agreeing: int
 ) -> tuple[FloatArray, IntArray] | None:
-    """The pose that aligns landmarks with those they agree with, by least squares, and the pairs.
-
-    From a pose nearby; None if too few agree. Pairs are (k, 2), as from `mutual_pairs`: the
-    target's first.
-    """
+    """The least-squares pose, from one nearby, of agreeing landmarks, and their `mutual_pairs`."""
     for _ in range(5):
         pairs = mutual_pairs(target, apply(pose, place), REACH_M)
         if len(pairs) < least_agreeing:

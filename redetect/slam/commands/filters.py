@@ -215,8 +215,8 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
 def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
     """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
 
-    Root mean square, median and largest distance of positions (m) and headings (rad), and those of
-    the last pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
+    Rms, median and largest distance of positions (m) and headings (rad), and those of the last
+    pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
     """
     other = np.asarray(reference, dtype=np.float64)
     if len(other) != len(path.poses):

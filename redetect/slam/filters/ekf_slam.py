@@ -232,9 +232,8 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
 def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
     """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
-    If identities have to be found, discs far from all others are new ones, numbered from 1 in the
-    order of their first sight; lines may be anywhere on a ray at first, so that they cannot be
-    recognised: their rows must have identifiers, else `SlamError` is raised.
+    If identities have to be found, discs far from all others are new ones, numbered from 1. Lines
+    may be anywhere on a ray at first: `SlamError` is raised if their rows have no identifiers.
     """
     pairing = associator or Associator()
     if pairing.method != "known" and len(recording.lines):

@@ -18,8 +18,7 @@ from redetect.slam.recording import LineRows, Recording
 class Graph:
     """The measurements of a run, each with a root of its information.
 
-    A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 that after
-    step k.
+    A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 after step k.
     """
 
     steps: FloatArray  # (N, 3): odometry (m, m, rad)
@@ -67,10 +66,7 @@ class Estimate:
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
-    """The problem of a run's odometry and discs; `with_lines` adds lines.
-
-    Rows without an identifier are ignored.
-    """
+    """The problem of a run's odometry and discs with an identifier; `with_lines` adds lines."""
     circles = recording.circles
     known = circles.ids >= 0
     ids, index = np.unique(circles.ids[known], return_inverse=True)
@@ -96,10 +92,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
 
 
 def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
-    """The problem with the bearings of some lines.
-
-    Takes `line_ids` (K,).
-    """
+    """The problem with the bearings of some lines, `line_ids` (K,)."""
     place = {int(number): k for k, number in enumerate(line_ids)}
     usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]
     members = [(r, place[i]) for r, k in enumerate(usable) for i in rows.ids[k]]

@@ -116,9 +116,8 @@ def linearise(
 ) -> Linear:
     """The problem linearised at an estimate, with unknowns as in `Layout`; the mounting is shared.
 
-    The mounting changes by a rotation vector in the robot frame, applied from the left, and a
-    translation, restricted to the unknown numbers. `by_tilt`: instead of these, by pitch and roll
-    that all frames share.
+    The unknown numbers of the mounting change by a rotation vector in the robot frame, applied from
+    the left, and a translation; with `by_tilt` pitch and roll of all frames take their place.
     """
     layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
@@ -157,10 +156,7 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 def _disc_rows(
     graph: Graph, estimate: Estimate, weighting: Weighting
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(n, 2) predicted minus measured rows of discs (m).
-
-    Also their derivatives (n, 2, k) by pose, disc and mounting.
-    """
+    """(n, 2) predicted minus measured discs (m), and derivatives by pose, disc and mounting."""
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
     seen, (by_pose, by_disc) = disc_in_robot(pose, disc), disc_jacobians(pose, disc)
     if estimate.mounting is None:
