@@ -31,7 +31,7 @@ from redetect.groundtruth.markers.adjustment import (
 )
 from redetect.groundtruth.markers.session import Network, Rig, View
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import apply, exp_se3
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
@@ -62,7 +62,7 @@ class PoseProblem:
     @property
     def robot_points(self) -> FloatArray:
         """(N, 3) corners in the robot's frame (m)."""
-        return apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
+        return se3.apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
 
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
@@ -132,7 +132,7 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
             step = -np.linalg.solve(now.normal + np.diag(added), now.gradient)
         except np.linalg.LinAlgError:
             raise GeometryError(UNDETERMINED) from None
-        ahead = pose @ exp_se3(step)
+        ahead = pose @ se3.exp(step)
         cost = _cost(problem, ahead, now.covariance)
         gain = float(step @ (added * step - now.gradient))
         settled = np.abs(step).max() < _SMALLEST_STEP or gain <= _COST_TOLERANCE * now.cost

@@ -21,7 +21,7 @@ from redetect.array_types import FloatArray
 from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
@@ -157,7 +157,7 @@ def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     """A (4, 4) pose in the form that `parse_pose` reads."""
     return {
         "translation_m": pose[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+        "quaternion_xyzw": se3.quaternion_xyzw(pose).tolist(),
     }
 
 
@@ -170,7 +170,7 @@ def parse_pose(entry: JsonObject) -> FloatArray:
         raise GroundTruthError(
             f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
-    return transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
+    return se3.transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
 
 
 def _joint_covariance(

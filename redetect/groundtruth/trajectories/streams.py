@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import parse_numbers, read_rows
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
@@ -142,7 +142,7 @@ def write_planar_poses(
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
     """Format (N,) times and (N, 4, 4) poses as a TUM trajectory: t x y z qx qy qz qw."""
-    quaternions = quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
+    quaternions = se3.quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
     return "".join(
         " ".join([f"{t:.6f}", *(f"{v:.6f}" for v in pose[:3, 3]), *(f"{v:.9f}" for v in q)]) + "\n"
         for t, pose, q in zip(times_s, world_from_robot, quaternions)

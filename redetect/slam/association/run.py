@@ -27,6 +27,7 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import chain_steps, compose, rotation
+from redetect.slam.association import loops
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -38,16 +39,6 @@ from redetect.slam.association.loop_closing import (
     pairs_by_position,
     pairs_by_votes,
     solve_path,
-)
-from redetect.slam.association.loops import (
-    MOST_COMPARED,
-    REACH_M,
-    STRETCH_FRAMES,
-    Match,
-    Search,
-    Stretch,
-    find_matches,
-    stretches_of,
 )
 from redetect.slam.association.registration import ANYWHERE, register_maps
 from redetect.slam.errors import SlamError
@@ -77,7 +68,7 @@ _LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
 # Least gap between frames, longer than a landmark stays visible or is waited for locally.
-_EVERYWHERE = Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
+_EVERYWHERE = loops.Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +81,7 @@ class RunAssociation:
     # (n,): from frame to frame only.
     local_circle_labels: IntArray
     local_line_labels: IntArray
-    matches: tuple[Match, ...]  # the loops that were closed
+    matches: tuple[loops.Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the corresponding path; None without map level
 
 
@@ -117,7 +108,7 @@ def associate_run(
     report = progress or (lambda _: None)
     local = _associated_locally(recording, settings, camera_xy, report)
     circle_labels, line_labels = local
-    matches: tuple[Match, ...] = ()
+    matches: tuple[loops.Match, ...] = ()
     path = None
     if settings.map_level and len(recording.circles):
         run = _Run(_without_lines(recording), settings, camera_xy, report)
@@ -177,7 +168,7 @@ class _Closed(NamedTuple):
     labels: IntArray  # (n,): see `_Run`
     path: FloatArray  # (N + 1, 3): the path solved with these labels
     xy: FloatArray  # (M, 2): the landmarks' positions (m)
-    matches: tuple[Match, ...]  # the loops
+    matches: tuple[loops.Match, ...]  # the loops
     stretch_frames: int  # length of the stretches that were matched
 
 
@@ -224,7 +215,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     recording, frames = run.recording, run.frames
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
-    stretches: list[list[Stretch]] = []
+    stretches: list[list[loops.Stretch]] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # a part begins with its own start, not with the end of the one before
@@ -236,7 +227,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         parts.append(closed)
         some, length = (own.frames, closed.labels, closed.xy, len(part)), closed.stretch_frames
         least = ANYWHERE.least_agreeing
-        stretches.append(stretches_of(*some, length=length, stride=length, least=least))
+        stretches.append(loops.stretches_of(*some, length=length, stride=length, least=least))
     if len(parts) == 1:
         return parts[0]
     run.report("laying parts on each other")
@@ -257,24 +248,26 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
 
 def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Closed:
     """Close all loops, starting from a path (by default odometry)."""
-    recording, settings, frames, search = run.recording, run.settings, run.frames, Search()
+    recording, settings, frames, search = run.recording, run.settings, run.frames, loops.Search()
     if path is not None:  # most of it is in its place already
         search = _EVERYWHERE._replace(
             most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
         )
     at = run.solved(labels, path)
-    matches: list[Match] = []
+    matches: list[loops.Match] = []
     length = search.stretch_frames
     while True:
         for number in range(1, _MOST_ROUNDS + 1):
             run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
             some = (frames, at.labels, at.xy, len(recording))
-            found = find_matches(stretches_of(*some, length=length, most=MOST_COMPARED), search)
+            found = loops.find_matches(
+                loops.stretches_of(*some, length=length, most=loops.MOST_COMPARED), search
+            )
             found = consistent_matches(found, matches, at.path, recording.step_covariance)
             at, found = _with_matches(run, at, found)
-            stretches = stretches_of(frames, at.labels, at.xy, len(recording), length=length)
-            spread = _isotropic(len(at.xy), REACH_M)
+            stretches = loops.stretches_of(frames, at.labels, at.xy, len(recording), length=length)
+            spread = _isotropic(len(at.xy), loops.REACH_M)
             if run.by_discs:
                 swayed = _with_sway(recording, settings)
                 spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
@@ -287,25 +280,25 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
                 break
             search = _EVERYWHERE._replace(
                 stretch_frames=length,
-                attached_frames=_EVERYWHERE.attached_frames * length // STRETCH_FRAMES,
+                attached_frames=_EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES,
             )
         if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
             return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
         length = min(2 * length, _LONGEST)
-        search = Search(stretch_frames=length)
+        search = loops.Search(stretch_frames=length)
 
 
 def _sparse(run: _Run, at: _Solved, length: int) -> bool:
     """Whether stretches of a length have too few discs to be recognised."""
     often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
     some = (run.frames[often], at.labels[often], at.xy, len(run.recording))
-    stretches = stretches_of(*some, length=length, stride=length, least=0)
+    stretches = loops.stretches_of(*some, length=length, stride=length, least=0)
     return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
 
 
 def _with_matches(
-    run: _Run, before: _Solved, matches: Sequence[Match]
-) -> tuple[_Solved, list[Match]]:
+    run: _Run, before: _Solved, matches: Sequence[loops.Match]
+) -> tuple[_Solved, list[loops.Match]]:
     """The run with matches closed, except those that its rows contradict, and the closed ones.
 
     In a regular pattern of discs, odometry cannot exclude every wrong match. These bend the path,
@@ -314,7 +307,7 @@ def _with_matches(
     if not matches:
         # Lines intersect elsewhere along the solved path.
         return (before if run.by_discs else run.solved(before.labels, before.path)), []
-    at, closed = before, list[Match]()
+    at, closed = before, list[loops.Match]()
     waiting = [sorted(matches, key=lambda match: (match.later_frame, match.earlier_frame))]
     fewest = math.ceil(len(matches) / _MOST_PARTS)
     while waiting:
@@ -373,7 +366,7 @@ def without_clutter(
         if not last and np.any(kept):
             known, numbers = np.unique(labels[kept], return_inverse=True)
             rows = replace(swayed, circles=swayed.circles.only(kept))
-            stretches = stretches_of(frames[kept], numbers, places[known], len(recording))
+            stretches = loops.stretches_of(frames[kept], numbers, places[known], len(recording))
             spread = _spread(rows, path, numbers, settings.sigma_scale)
             pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
             merged, _ = merge_labels(frames[kept], numbers, pairs)
@@ -428,7 +421,7 @@ def _merged_lines(
         return labels
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
-        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording))
+        stretches = loops.stretches_of(recording.lines.frame, labels, xy, len(recording))
         pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:

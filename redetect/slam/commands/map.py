@@ -15,16 +15,7 @@ from camera import write_camera
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks.map_file import covariance_file, write_map, write_path
-from redetect.slam.commands.files import (
-    MAP_NAME,
-    MAP_PICTURE,
-    PATH_NAME,
-    camera_of_run,
-    default_output,
-    flags_of,
-    recordings_of,
-    write_json,
-)
+from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck
@@ -52,13 +43,15 @@ MOST_LANDMARKS_TOGETHER = 5000
 
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
-    output = command.output or default_output(command.run)
-    joint_name = covariance_file(Path(MAP_NAME)).name
+    output = command.output or files.default_output(command.run)
+    joint_name = covariance_file(Path(files.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
-    paths = several if command.more else [PATH_NAME]
-    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE] + [CAMERA_NAME] * command.calibrate
+    paths = several if command.more else [files.PATH_NAME]
+    names = [files.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE] + [
+        CAMERA_NAME
+    ] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
-    runs = recordings_of(command)
+    runs = files.recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
     mapped = mapped_run_of(command, recording)
@@ -71,7 +64,7 @@ def perform(command: Map) -> int:
     few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
     if few:
         final = mapped.landmarks_jointly()
-    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    write_map(output / files.MAP_NAME, final, head, overwrite=command.force)
     if not few:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
@@ -79,7 +72,7 @@ def perform(command: Map) -> int:
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = mapped.odometry_check()
     results = plain(_results(mapped, check, command))
-    write_json(output / TABLE_NAME, results, overwrite=command.force)
+    files.write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
     if not few:
@@ -88,7 +81,7 @@ def perform(command: Map) -> int:
             "localize` assumes independent errors"
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
-    write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
+    write_bytes(output / files.MAP_PICTURE, drawn, overwrite=command.force)
     if (found := mapped.mounting) is not None and mapped.graph.camera is not None:
         mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
@@ -101,7 +94,7 @@ def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     demand(command, SlamError, start=PLACE, loss_scale=ABOVE_0)
     camera = None
     if command.calibrate or len(recording.lines):
-        camera = camera_of_run(command.run, command.camera)
+        camera = files.camera_of_run(command.run, command.camera)
     weighting = Weighting(
         loss=command.loss,
         loss_scale=command.loss_scale,
@@ -192,7 +185,7 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
 def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str, Any]:
     results: dict[str, Any] = {
         "version": __version__,
-        "configuration": flags_of(command, ("output", "force", "interactive")),
+        "configuration": files.flags_of(command, ("output", "force", "interactive")),
         "table": asdict(mapped.table),
         "odometry": asdict(check),
         "minimised": mapped.cost,
