@@ -42,8 +42,7 @@ class CircleRows:
     frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
     xy: FloatArray  # (n, 2): centres in the robot frame (m)
     covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
-    # (n,): -1 if unknown, as are all below 0; the first known one of a row with several.
-    ids: IntArray
+    ids: IntArray  # (n,): the first known one of each row; below 0 if there is none
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -76,8 +75,7 @@ class LineRows:
     frame: IntArray  # (n,): of each row, ascending from 0
     bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
     sigma_rad: FloatArray  # (n,): its standard deviation, above 0
-    # All lines of each row (joined rows have several); empty if unknown.
-    ids: tuple[tuple[int, ...], ...]
+    ids: tuple[tuple[int, ...], ...]  # all lines of each row (joined ones); empty if unknown
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -31,8 +31,8 @@ _LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
 _LEAST_PART_S, _LEAST_JUMP_S = 10.0, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
 _COVERED = 0.5
-# Largest ratio of the squared errors at an offset that is taken to those near the expected one, of
-# other movements, and, beyond the width of its own minimum, elsewhere.
+# Largest ratio of the squared errors at another offset to those near the expected one or of others'
+# movements, and to those elsewhere, beyond the width of its own minimum.
 _MUCH_BETTER, _ALONE, _OWN_WIDTH_S = 0.25, 0.5, 3.0
 # Movements do not match if their squared errors are larger than this share of those of unrelated
 # ones, in segments with much movement.

@@ -213,10 +213,8 @@ class Gating(NamedTuple):
     """Conditions for rejecting a measurement, and for restarting the filter from one."""
 
     largest_squared: float  # Largest squared normalised innovation
-    # After this number of consecutive rejections the pose is set to the measured one, with
-    # `restart_variances`, however far off the filter was
-    restart_after: int
-    restart_variances: FloatArray  # (3,)
+    restart_after: int  # Consecutive rejections after which the pose is set to the measured one
+    restart_variances: FloatArray  # (3,): with these variances
     lost_variance: float  # The same immediately if the heading's variance (rad^2) is larger
     cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
 
@@ -228,8 +226,7 @@ class FilterHistory(NamedTuple):
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
-    # (N, d, d): derivatives of each node's prediction with respect to the node before
-    transitions: FloatArray
+    transitions: FloatArray  # (N, d, d): derivatives of predictions by the node before
 
 
 class Innovations(NamedTuple):

@@ -58,8 +58,7 @@ class LocalisationErrors:
     heading_sigma: float  # Of the heading (rad)
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
-    # Heading of the ground truth minus that of the aligned localisation (rad)
-    heading_offset: float
+    heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
 
 
 def as_localisation(

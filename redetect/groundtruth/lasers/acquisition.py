@@ -57,8 +57,7 @@ _LARGEST_CHI2 = 4.0
 class Background(NamedTuple):
     """A scanner's static background, beam by beam."""
 
-    # (readings,): a reading below this is of a new object; infinite if the beam sees nothing
-    near_m: FloatArray
+    near_m: FloatArray  # (readings,): a reading below this is new; infinite without any
     quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
 
 
@@ -98,8 +97,7 @@ class ScanSets:
     """Sets of scans, at most one per scanner, taken at about the same time."""
 
     times_s: FloatArray  # (sets,): mean time of the set's scans
-    # (sets, scanners): row of `ranges_mm` per scanner; -1 if the scanner has none in the set.
-    rows: IntArray
+    rows: IntArray  # (sets, scanners): rows of `ranges_mm`; -1 if a scanner has none in the set
     ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
     ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
 

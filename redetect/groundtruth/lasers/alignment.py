@@ -51,16 +51,12 @@ class Alignment:
     """Estimated poses of the scanners."""
 
     scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
-    # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
-    steps: dict[str, FloatArray]
-    # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
-    pairs: dict[tuple[int, int], float]
+    steps: dict[str, FloatArray]  # Poses after each of `STEPS`, at first in the measured frame
+    pairs: dict[tuple[int, int], float]  # Shares of two scans that coincide after their ICP
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
-    # (3 scanners, 3 scanners): covariance of their poses, jointly
-    covariance: FloatArray
-    # Standard deviation of the offsets of the walls' ends from the map (m); 0 if it is exact.
-    map_sigma_m: float
+    covariance: FloatArray  # (3 scanners, 3 scanners): of their poses, jointly
+    map_sigma_m: float  # Standard deviation of the walls' ends from the map (m); 0 if exact
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 

@@ -51,14 +51,10 @@ class Scanner:
     """A laser scanner; raises `GroundTruthError` if a shape or value is impossible."""
 
     name: str  # Its scans are in ``<name>.scans.npz``
-    # (3,): x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame
-    pose: FloatArray
-    # (3, 3): of the pose, (x, y, theta) in the same frame; zeros if it is known exactly.
-    covariance: FloatArray
-    # Beam i points to first_angle + i step in the scanner's frame.
-    first_angle_rad: Annotated[float, FINITE]
-    # Negative where it is mounted upside down
-    angle_step_rad: Annotated[float, NOT_0]
+    pose: FloatArray  # (3,): x, y (m), theta (rad) in the world or, on board, the robot's frame
+    covariance: FloatArray  # (3, 3): of the pose; zeros if it is known exactly
+    first_angle_rad: Annotated[float, FINITE]  # Beam i points to first + i step in its frame
+    angle_step_rad: Annotated[float, NOT_0]  # Negative where it is mounted upside down
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
     max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)
@@ -102,8 +98,7 @@ class Scanner:
 class Robot:
     """A robot to be tracked by laser scanners."""
 
-    # (K, 2): corners of the closed polygon that the scanners see, in the robot's frame (m)
-    outline: FloatArray
+    outline: FloatArray  # (K, 2): corners of the polygon that scanners see, in its frame (m)
     largest_speed_m_s: float  # Upper bound of its speed
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
@@ -220,11 +215,8 @@ def _scanner(entry: JsonObject) -> Scanner:
 class Scans:
     """Scans of one scanner over time; raises `GroundTruthError` if shapes or types disagree."""
 
-    # (N,): seconds on the scanner's clock (of a scan's middle beam), in the order of measurement.
-    # In some real logs they step back.
-    times_s: FloatArray
-    # (N, readings): readings in millimetres, 0 if nothing was returned
-    ranges_mm: NDArray[np.uint16]
+    times_s: FloatArray  # (N,): of scans' middle beams, as measured; some real logs step back
+    ranges_mm: NDArray[np.uint16]  # (N, readings): in millimetres, 0 if nothing was returned
 
     def __post_init__(self) -> None:
         count = len(self.times_s)

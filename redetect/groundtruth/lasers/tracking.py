@@ -62,28 +62,21 @@ class LaserTrack:
     # (N,): index into `STATUS`. Poses are valid if it is OK or REACQUIRED, and except for one
     # direction if it is UNDETERMINED.
     status: IntArray
-    # (N,): number of the acquisition that the set belongs to; -1 if the robot is lost.
-    segment: IntArray
+    segment: IntArray  # (N,): number of the set's acquisition; -1 if the robot is lost
     poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
-    # (N, 3, 3): of (x, y, theta), from the readings' noise and the scanners' poses
-    covariances: FloatArray
+    covariances: FloatArray  # (N, 3, 3): from the readings' noise and the scanners' poses
     noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
-    # (N, 3): velocity (m/s) and turn (rad/s) in the world, from the poses before and after
-    motion: FloatArray
+    motion: FloatArray  # (N, 3): velocity (m/s) and turn (rad/s) in the world
     readings: IntArray  # (N,): number of readings used for the pose
     rms_m: FloatArray  # (N,): their root mean square distance from the outline
     chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
     beams: FloatArray  # (N, 6): as in `BeamCounts`
-    # (N, 3): the least determined direction of (x, y, theta times the outline's radius), where it
-    # is UNDETERMINED
-    weak: FloatArray
+    weak: FloatArray  # (N, 3): least determined direction of x, y, theta times the radius
     reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
-    # (scanners, 3): corrections of the scanners' given poses that their residuals suggest
-    corrections: FloatArray
+    corrections: FloatArray  # (scanners, 3): of their poses, as their residuals suggest
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
-    # By how much each face of the given outline was moved outward to fit the readings (m)
-    outline_moved_m: float = 0.0
+    outline_moved_m: float = 0.0  # By how much its faces were moved outward to fit (m)
 
 
 class Tracker:
@@ -112,8 +105,7 @@ class Tracker:
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""
         pose, motion = np.zeros(3), np.zeros(3)
-        # Times of the last set, the last pose, the last one determined in all directions, and the
-        # last search.
+        # Times of the last set, pose, pose determined in all directions, and search.
         before_s = posed_s = determined_s = searched_s = -math.inf
         segment, begun, tracked = -1, 0, False
         for i, t in enumerate(self.sets.times_s.tolist()):

@@ -143,8 +143,7 @@ class MapProblem(NamedTuple):
     measured: FloatArray  # (poses, 3): measured by hand
     prior: FloatArray  # (3 poses, 3 poses): information of the measured poses
     walls: FloatArray  # (S, 4): pieces of wall, seen from both sides (m)
-    # (scanners, 3): poses on one body, the only pose; otherwise each scanner has a pose.
-    mounts: FloatArray | None = None
+    mounts: FloatArray | None = None  # (scanners, 3): on one body, the only pose; else no body
 
     def fit(self, starts: FloatArray, narrowing_m: Sequence[float], weak_sigma_m: float) -> MapFit:
         """The most likely poses near starts.

@@ -65,8 +65,7 @@ class Chain(NamedTuple):
 class ChainProjection(NamedTuple):
     """Pixels of points and their derivatives by right perturbations of the three poses."""
 
-    # (N, 2): NaN where a point is not in front of its camera or past the distortion's fold
-    pixels: FloatArray
+    pixels: FloatArray  # (N, 2): NaN behind the camera or past the distortion's fold
     by_camera: FloatArray  # (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_body: FloatArray
     by_part: FloatArray
@@ -126,8 +125,7 @@ class Bundle:
 
     cameras: tuple[Camera, ...]  # C lenses
     parts: int  # P, the number of parts
-    # (C + P + B, 4, 4): `world_from_camera`, then `body_from_part`, then `world_from_body`
-    poses: FloatArray
+    poses: FloatArray  # (C + P + B, 4, 4): of cameras, of parts in bodies, of bodies
     free: BoolArray  # (C + P + B,)
     seen: ChainPoints
     view: IntArray  # (N,): which part in which image each point is of: 0 to V - 1
@@ -192,8 +190,8 @@ class AdjustedBundle:
     residuals: FloatArray  # (N, 2): measured minus predicted pixels, of all points
     cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
-    # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, the bodies marginalised;
-    # zeros for fixed ones. That of the corners' covariances, not scaled by the residuals.
+    # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, zeros for fixed ones, by
+    # the corners' covariances, not scaled by the residuals.
     covariance: FloatArray
 
     @property

@@ -42,8 +42,7 @@ class PairConsensus:
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
     agrees: BoolArray  # (T,): which of them agree with it
-    # (T,): whether these are the solutions that fit the image best
-    first: BoolArray
+    first: BoolArray  # (T,): whether these are the solutions that fit the image best
 
     @property
     def support(self) -> int:

@@ -201,11 +201,9 @@ def _pycolmap(problem: refinement.PoseProblem) -> list[FloatArray]:
 class PoseEstimate:
     """Pose estimate from the corners of one time."""
 
-    # The best first; several if the markers are ambiguous.
-    candidates: tuple[refinement.RefinedPose, ...]
+    candidates: tuple[refinement.RefinedPose, ...]  # The best first; several if ambiguous
     views: BoolArray  # (V,): which of all views they explain
-    # Log-odds of the first against each candidate: 0 for the first
-    log_odds: tuple[float, ...]
+    log_odds: tuple[float, ...]  # Of the first against each candidate: 0 for the first
 
     @property
     def ambiguous(self) -> bool:

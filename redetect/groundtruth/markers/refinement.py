@@ -50,8 +50,7 @@ class PoseProblem:
     network: Network
     rig: Rig
     seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
-    # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
-    view: IntArray
+    view: IntArray  # (N,): marker in an image of each corner: four of 0, up to V - 1
     settings: PoseSettings
 
     @property
@@ -89,12 +88,10 @@ class RefinedPose:
     """A local minimum."""
 
     world_from_robot: FloatArray  # (4, 4)
-    # (6, 6): of the right perturbation: translation (m) and rotation (rad) in the robot's axes
-    covariance: FloatArray
+    covariance: FloatArray  # (6, 6): of the right perturbation (m, rad), in the robot's axes
     cost: float  # Squared Mahalanobis length of all residuals, without robust weights
     degrees_of_freedom: int
-    # (V,): root mean square of each view's normalised residuals: about 1 where all is well
-    view_errors: FloatArray
+    view_errors: FloatArray  # (V,): rms of each view's normalised residuals: about 1 if right
     view_rms_px: FloatArray  # (V,): root mean square of each view's residuals, per coordinate
 
     @property
@@ -176,8 +173,7 @@ class _Linearised(NamedTuple):
     cost: float
     gradient: FloatArray  # (6,): J'r
     normal: FloatArray  # (6, 6): J'J
-    # Weights stay those of this step: a cost that also changes them is no measure.
-    covariance: FloatArray
+    covariance: FloatArray  # For this step: a cost that also changes weights is no measure
 
 
 def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:

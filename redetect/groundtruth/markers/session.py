@@ -38,11 +38,8 @@ class Rig:
     dictionary: str  # The set of markers that defines the identifiers
     ids: tuple[int, ...]  # The markers, M of them
     widths_m: FloatArray  # (M,): widths of the black squares
-    # (M, 4, 4): a marker's frame has its origin at the centre, x right, y up, z out of the print
-    robot_from_marker: FloatArray
-    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    robot_from_marker: FloatArray  # (M, 4, 4): markers' x right, y up, z out of the print
+    covariance: FloatArray  # (6 M, 6 M): of right perturbations (m, rad); zeros if exact
 
     @property
     def corners(self) -> FloatArray:
@@ -55,13 +52,10 @@ class Network:
     """Cameras fixed in the world."""
 
     names: tuple[str, ...]  # The cameras, C of them
-    # Their calibrations. The mounting in a ``.cam`` file is ignored.
-    cameras: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # Their lenses; the mounting in a ``.cam`` file is ignored
     calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's file
     world_from_camera: FloatArray  # (C, 4, 4)
-    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    covariance: FloatArray  # (6 C, 6 C): of right perturbations (m, rad); zeros if exact
 
 
 def marker_corners(width_m: float) -> FloatArray:

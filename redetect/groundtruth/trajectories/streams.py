@@ -38,10 +38,8 @@ class PlanarPoses:
     """
 
     times_s: FloatArray  # (N,): seconds, not decreasing
-    # (N, 3): x, y (m) and theta (rad). Headings may be beyond +-pi, as in the real streams.
-    poses: FloatArray
-    # (N, 3, 3): covariances of (x, y, theta); may be singular due to rounding in files.
-    covariances: FloatArray | None = None
+    poses: FloatArray  # (N, 3): x, y (m), theta (rad), which may be beyond +-pi, as in real streams
+    covariances: FloatArray | None = None  # (N, 3, 3); may be singular due to rounding in files
 
     def __post_init__(self) -> None:
         count = len(self.times_s)

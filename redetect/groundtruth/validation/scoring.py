@@ -73,9 +73,7 @@ class PoseScore(ErrorFigures):
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
     normalised: int  # Poses with an invertible covariance
-    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
-    # right. NaN without covariances.
-    normalised_error: float
+    normalised_error: float  # Mean of these: 1 if covariances are right; NaN without any
 
     def lines(self) -> list[str]:
         """The figures to print."""
@@ -139,8 +137,7 @@ class Relations(NamedTuple):
 
     from_s: FloatArray  # (N,)
     to_s: FloatArray  # (N,): may be the earlier one
-    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
-    from_to: FloatArray
+    from_to: FloatArray  # (N, 3): x, y (m), theta (rad) of the second pose in the first's frame
 
 
 @dataclass(frozen=True)

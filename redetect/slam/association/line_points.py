@@ -63,9 +63,8 @@ class Rays(NamedTuple):
 
     row: IntArray  # (n,): index of each ray's row in the run
     centre: FloatArray  # (n, 2): the camera's position (m)
-    # (n,): its direction in the map, and in the robot frame (rad).
-    angle: FloatArray
-    bearing: FloatArray
+    angle: FloatArray  # (n,): its direction in the map (rad)
+    bearing: FloatArray  # (n,): the same in the robot frame (rad)
     sigma: FloatArray  # (n,): of it (rad)
     frame: IntArray  # (n,): ascending from 0
     start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f

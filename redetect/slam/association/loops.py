@@ -49,13 +49,10 @@ SHARED_BY_ONE_PLACE = 3
 class Search(NamedTuple):
     """Parameters of the search."""
 
-    # Largest motion between the two constellations.
-    most_turn_rad: float = 0.8
+    most_turn_rad: float = 0.8  # largest motion between the two constellations
     most_shift_m: float = 8.0
-    # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: int = 7
-    # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: float = 1e-3
+    least_agreeing: int = 7  # of landmarks, whatever the number of false alarms
+    false_alarms: float = 1e-3  # largest expected number of them in the whole search
     # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
     # `earlier_step`-th of these.
     later_step: int = 1
@@ -69,8 +66,7 @@ class Search(NamedTuple):
 class _Cells(NamedTuple):
     """A grid in which the nearest landmark is looked up."""
 
-    # Its low corner (m).
-    low_x: float
+    low_x: float  # its low corner (m)
     low_y: float
     nearest: IntArray  # (columns, rows): landmark nearest to a cell's centre, -1 if out of reach
 
@@ -221,14 +217,11 @@ class Stretch:
 class Match:
     """Two stretches that show one place."""
 
-    # Middle frames of the two.
-    earlier_frame: int
+    earlier_frame: int  # middle frames of the two
     later_frame: int
     pairs: IntArray  # (k, 2): labels of the same landmark in the earlier and the later stretch
-    # (3,): pose that maps the later stretch's landmarks, in the map, onto the earlier one's.
-    motion: FloatArray
-    # Logarithm of the expected number of matches at least as good by chance.
-    log10_false_alarms: float
+    motion: FloatArray  # (3,): maps the later stretch's landmarks onto the earlier one's
+    log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
 def stretches_of(

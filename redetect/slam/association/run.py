@@ -75,11 +75,9 @@ _EVERYWHERE = loops.Search(math.pi, math.inf, later_step=2, earlier_step=3, atta
 class RunAssociation:
     """Labels of a run's rows, numbered from 0 in the order of first sight."""
 
-    # (n,): final label of each row; -1 if a row of a disc fits none, or none that is seen often.
-    circle_labels: IntArray
+    circle_labels: IntArray  # (n,): final; -1 for rows that fit no disc that is seen often
     line_labels: IntArray
-    # (n,): from frame to frame only.
-    local_circle_labels: IntArray
+    local_circle_labels: IntArray  # (n,): from frame to frame only
     local_line_labels: IntArray
     matches: tuple[loops.Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the corresponding path; None without map level

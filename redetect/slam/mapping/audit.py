@@ -48,13 +48,11 @@ class Group:
 
     rows: IntArray  # (k,): indices of the rows among the recording's discs
     id: int  # their identifier in the file
-    # Whether they show another landmark, a new one, or nothing that is known.
-    kind: Kind
+    kind: Kind  # whether they show another landmark, a new one, or nothing that is known
     new_id: int  # that landmark; -1 for `drop`
     xy: FloatArray  # (k, 2): positions of the rows in the map (m)
     own_m: float  # distance of their median from the landmark of that identifier
-    # (k,): squared error of each row against the map without any of the suspects.
-    row_chi_squared: FloatArray
+    row_chi_squared: FloatArray  # (k,): of each row against the map without all suspects
     # Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
     chi_squared: float
     mended_chi_squared: float

@@ -50,16 +50,12 @@ class ChiSquared:
     landmarks: int  # n: discs and lines
     steps: int  # t: odometry measurements, the start's pose counted as one
     measurements: int  # m: landmark rows used
-    # Parts of chi-squared.
-    odometry: float
+    odometry: float  # parts of chi-squared
     discs: float
     lines: float
-    # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
-    chi_squared: float
+    chi_squared: float  # their sum, by the files' covariances, whatever loss was minimised
     expected: int  # dim(z) - dim(x): numbers measured minus numbers estimated
-    # chi_squared / expected: the factor on the variances that would make both equal; NaN without
-    # redundancy.
-    factor: float
+    factor: float  # chi_squared / expected, of the variances; NaN without redundancy
     root: float  # its root: the factor on the standard deviations
 
 
@@ -117,8 +113,7 @@ class LeftOut:
 
     rows_without_id: int
     discs_seen_once: int  # they are in the map, but nothing checks them
-    # Lines without enough parallax in rows of their own, or whose position is lost later.
-    lines_without_parallax: int
+    lines_without_parallax: int  # in rows of their own, or whose position is lost later
     line_rows: int  # rows of these lines
     line_ids: tuple[int, ...]  # their identifiers
 
@@ -127,8 +122,7 @@ class LeftOut:
 class Mounting:
     """A camera's mounting as estimated from the run."""
 
-    # (6,): rotation vector in the robot frame (rad) and position (m), true minus calibrated.
-    change: FloatArray
+    change: FloatArray  # (6,): rotation vector (rad) and position (m), true minus calibrated
     covariance: FloatArray  # (6, 6), zero for numbers that were not estimated
     robot_from_camera: FloatArray  # (3, 4)
     gain: float  # decrease of the sum of squares from the mounting as calibrated

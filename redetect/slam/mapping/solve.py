@@ -42,8 +42,7 @@ class Marginals:
     poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
     discs: FloatArray  # (M, 2, 2)
     lines: FloatArray  # (K, 2, 2)
-    # (6, 6): of the rotation vector (rad) and the position (m), zero for known numbers.
-    mounting: FloatArray | None
+    mounting: FloatArray | None  # (6, 6): of rotation vector (rad) and position (m); 0 if known
 
 
 @dataclass(frozen=True, eq=False)
