@@ -30,10 +30,7 @@ NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file with a JSON object.
-
-    Raises `GroundTruthError` if it cannot be read or is not one.
-    """
+    """Read a file with a JSON object; raises `GroundTruthError` if it cannot be read or is none."""
     text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
         content = json.loads(text)
@@ -51,8 +48,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
 class JsonObject:
     """An object of a JSON file, whose values are read by their names.
 
-    Missing or wrong values raise a `GroundTruthError` that states the place, the value and what was
-    expected.
+    Missing or wrong values raise a `GroundTruthError` with place, value and what was expected.
     """
 
     def __init__(self, place: str, value: Any) -> None:
@@ -176,10 +172,7 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
 def write_json(
     path: str | os.PathLike[str], content: Mapping[str, Any], *, overwrite: bool = False
 ) -> None:
-    """Write a JSON object with a line per entry of its objects, whole or not at all.
-
-    Numbers that are not finite, which JSON does not have, are null.
-    """
+    """Write a JSON object, a line per entry of its objects, whole or not at all; NaN is null."""
     write_bytes(path, (_laid_out(content) + "\n").encode(), overwrite=overwrite)
 
 
@@ -200,8 +193,7 @@ def _laid_out(value: Any, indent: str = "") -> str:
 def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
     """The text of a file (UTF-8, perhaps with a byte order mark), packed (``.gz``) or not.
 
-    `largest_bytes`: larger files are rejected. `expected`: the expected content, for the message
-    about a file that is not text.
+    Larger files than `largest_bytes` are rejected; `expected` is what the text should contain.
     """
     content = read_content(path, largest_bytes, "file", GroundTruthError)
     try:
@@ -244,8 +236,7 @@ def read_table(
     """Rows separated by commas or blanks after an optional head.
 
     `head` are the comma-separated names of the columns, `words` those with words; the others have
-    finite numbers. Raises `GroundTruthError` if the file cannot be read or a row is malformed; it
-    names file and line.
+    finite numbers. Raises `GroundTruthError` with file and line if a row is malformed.
     """
     names = head.split(",")
     rows: list[TableRow] = []

@@ -93,8 +93,7 @@ class NormalEquations:
     border: FloatArray  # (K, s), between shared and other unknowns
     corner: FloatArray  # (s, s)
     corner_gradient: FloatArray  # (s,)
-    # (s, s): covariance of shared unknowns that are not estimated, but add to the others' errors.
-    considered: FloatArray | None = None
+    considered: FloatArray | None = None  # (s, s): covariance of shared ones, not estimated
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Steps of both kinds of unknowns, with the diagonal scaled by 1 + damping (Marquardt).

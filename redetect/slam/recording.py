@@ -11,15 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks import (
-    Frame,
-    Step,
-    circle_arrays,
-    circle_landmarks,
-    is_positive_definite,
-    read_frames,
-)
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
@@ -51,8 +44,7 @@ class CircleRows:
     frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
     xy: FloatArray  # (n, 2): centres in the robot frame (m)
     covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
-    # (n,): -1 if unknown, as are all below 0; the first known one of a row with several.
-    ids: IntArray
+    ids: IntArray  # (n,): the first known one of each row; below 0 if there is none
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -85,8 +77,7 @@ class LineRows:
     frame: IntArray  # (n,): of each row, ascending from 0
     bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
     sigma_rad: FloatArray  # (n,): its standard deviation, above 0
-    # All lines of each row (joined rows have several); empty if unknown.
-    ids: tuple[tuple[int, ...], ...]
+    ids: tuple[tuple[int, ...], ...]  # all lines of each row (joined ones); empty if unknown
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -160,9 +151,8 @@ def first_poses(runs: Sequence[Recording]) -> IntArray:
 
 
 def joined(runs: Sequence[Recording]) -> Recording:
-    """Runs as one: a lost step leads from the end of each to the start of the next.
-
-    The frame after that step has no rows; it is called `start`.
+    """Runs as one: a lost step leads from the end of each to the start of the next, a frame without
+    rows called `start`.
     """
     if len(runs) == 1:
         return runs[0]
@@ -190,10 +180,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
 def landmark_files(
     run: Path, *, circles: bool = True, lines: bool = False, stem: str | None = None
 ) -> list[Path]:
-    """The landmark files of a run folder, of the requested kinds; for a file, itself.
-
-    Their name is `stem`, by default map, or else detected.
-    """
+    """The landmark files of a run folder, named `stem` (map, else detected); of a file, itself."""
     if not run.is_dir():
         _demand_landmarks(run)
         return [run]
@@ -258,9 +245,9 @@ def read_recording(
         positive definite; the message names file, step and row.
     """
     files = landmark_files(Path(run), circles=circles, lines=lines, stem=stem)
-    frames = list(read_frames(files[0]))
+    frames = list(landmarks.read_frames(files[0]))
     for other in files[1:]:
-        frames = _merged(frames, list(read_frames(other)), files[0], other)
+        frames = _merged(frames, list(landmarks.read_frames(other)), files[0], other)
     found = recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
@@ -269,7 +256,7 @@ def read_recording(
 
 
 def recording_of_frames(
-    frames: Sequence[Frame], name: str, noise: OdometryNoise = ASSUMED
+    frames: Sequence[landmarks.Frame], name: str, noise: OdometryNoise = ASSUMED
 ) -> Recording:
     """Gather frames to arrays."""
     if not frames:
@@ -284,7 +271,7 @@ def recording_of_frames(
         )
     unstated = ~np.any(covariance, axis=(1, 2))
     covariance[unstated] = noise.covariance(numbers[unstated, :3])
-    for bad in np.flatnonzero(~is_positive_definite(covariance)):
+    for bad in np.flatnonzero(~landmarks.is_positive_definite(covariance)):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
             "definite: expected a covariance of dx, dy and dphi of full rank"
@@ -299,11 +286,8 @@ def recording_of_frames(
     )
 
 
-def frames_of_discs(recording: Recording) -> list[Frame]:
-    """Steps and rows of discs as frames, the inverse of `recording_of_frames`.
-
-    The rows' quality is 1.
-    """
+def frames_of_discs(recording: Recording) -> list[landmarks.Frame]:
+    """Steps and rows of discs, of quality 1, as frames: the inverse of `recording_of_frames`."""
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
     quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
@@ -311,17 +295,17 @@ def frames_of_discs(recording: Recording) -> list[Frame]:
     frames = []
     for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers.tolist())):
         some = slice(starts[k], starts[k + 1])
-        seen = circle_landmarks(
+        seen = landmarks.circle_landmarks(
             circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
         )
-        frames.append(Frame(Step(prefix, *row), seen))
+        frames.append(landmarks.Frame(landmarks.Step(prefix, *row), seen))
     return frames
 
 
-def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
+def _circle_rows(frames: Sequence[landmarks.Frame], name: str) -> CircleRows:
     seen = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
-    rows = circle_arrays([row for _, row in seen])
-    for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
+    rows = landmarks.circle_arrays([row for _, row in seen])
+    for bad in np.flatnonzero(~landmarks.is_positive_definite(rows.covariance)):
         k, row = seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
@@ -331,7 +315,7 @@ def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
     return CircleRows(frame, rows.xy, rows.covariance, rows.ids)
 
 
-def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
+def _line_rows(frames: Sequence[landmarks.Frame], name: str) -> LineRows:
     seen = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
     for k, row in seen:
         if not row.sigma > 0.0:
@@ -344,7 +328,9 @@ def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
     )
 
 
-def _merged(first: list[Frame], second: list[Frame], one: Path, other: Path) -> list[Frame]:
+def _merged(
+    first: list[landmarks.Frame], second: list[landmarks.Frame], one: Path, other: Path
+) -> list[landmarks.Frame]:
     """Frames with the landmarks of both files, whose steps must be the same."""
     if len(first) != len(second):
         raise SlamError(f"{other}: {len(second)} steps: expected {len(first)}, as in {one}")
@@ -355,5 +341,5 @@ def _merged(first: list[Frame], second: list[Frame], one: Path, other: Path) -> 
                 f"{other}: step {k + 1} ({b.step.prefix}) is not that of {one} "
                 f"({a.step.prefix}): expected files of one run"
             )
-        merged.append(Frame(a.step, a.landmarks + b.landmarks))
+        merged.append(landmarks.Frame(a.step, a.landmarks + b.landmarks))
     return merged

@@ -64,8 +64,7 @@ class ClockSegment:
     offset_s: float = 0.0  # Robot time minus ground truth time there
     rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
     angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
-    # Standard deviations; infinite if the segment does not determine the value
-    sigma_offset_s: float = math.inf
+    sigma_offset_s: float = math.inf  # Standard deviations; infinite if not determined
     sigma_rate: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
     # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
@@ -73,8 +72,7 @@ class ClockSegment:
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
-    # From the segment alone, if one line through all segments replaced offset and deviation
-    own_offset_s: float | None = None
+    own_offset_s: float | None = None  # From the segment alone, if one line replaced these two
     own_sigma_s: float | None = None
 
 
@@ -155,11 +153,7 @@ def _extended(
 
 
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
-    """Read a clock file that `groundtruth sync` wrote.
-
-    Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
-    message names it.
-    """
+    """Read a clock file of `groundtruth sync`; raises `GroundTruthError` if it is malformed."""
     rows = JsonObject.read(path).rows("segments")
     segments = tuple(map(_segment, rows))
     for row, (before, after) in zip(rows[1:], pairwise(segments)):
@@ -192,10 +186,9 @@ def _segment(row: JsonObject) -> ClockSegment:
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     """Put segments on the straight line through all of them, if that agrees with each.
 
-    A clock that is neither disciplined nor set has a constant rate over minutes. Segments that are
-    minutes apart then determine its rate much better than each alone, and its offset somewhat
-    better. They are unchanged if fewer than two are determined, a clock was set, or one line does
-    not explain them: its squared error has a probability below one in a thousand.
+    A clock that is neither disciplined nor set has a constant rate over minutes, which segments
+    minutes apart determine much better than each alone. They are unchanged if fewer than two are
+    determined, a clock was set, or one line explains them with a probability below 0.001.
     """
     determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}
@@ -240,16 +233,11 @@ class PtpdLog:
 
     times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
     offset_s: FloatArray  # (N,): clock minus master
-    # (N,): observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
-    drift: FloatArray
+    drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
 
 
 def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
-    """Read a log of ptpd.
-
-    Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
-    the master.
-    """
+    """Read a log of ptpd; raises `GroundTruthError` if it has no offset from the master."""
     rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}
     content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)

@@ -20,10 +20,8 @@ from redetect.plane import between, log_motion
 #: Noise of a robot at rest, without which covariances would be singular.
 CREEP_M2_PER_S = (1e-4) ** 2
 CREEP_RAD2_PER_S = (1e-4) ** 2
-# The turn scale applies to distinct turns only: more than this (rad) from a second before to a
-# second after, some four standard deviations of wheels at 1 m/s. Smaller ones may be random errors
-# of odometry, which measured headings contradict, so that the scale would be biased towards -1
-# (regression dilution).
+# The turn scale applies to distinct turns only, larger than this (rad) within a second before and
+# after: if random errors of odometry counted, it would be biased towards -1 (regression dilution).
 _DISTINCT_OVER_S = 1.0
 _DISTINCT_RAD = 0.06
 # Odometry pauses if samples are farther apart than both, in seconds and in usual intervals.
@@ -47,10 +45,7 @@ def noise_of(settings: FuseSettings) -> FloatArray:
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
-    """Pauses of odometry, as the times of the samples before and after each.
-
-    Only their total movement is known, not the path. No two samples may have the same time.
-    """
+    """Pauses of odometry, as the times of the samples before and after each, which are distinct."""
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
 
@@ -113,9 +108,8 @@ def gather(
 ) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
     """All measurements within the odometry's time, in order, with usable covariances.
 
-    Of several poses at one time in a stream, the last counts. Returns each measurement's stream,
-    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream the number of covariances that
-    had to be increased.
+    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
+    stream the number of covariances that had to be increased.
     """
     found = []
     repaired = {}

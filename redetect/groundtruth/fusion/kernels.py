@@ -156,9 +156,7 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 def squared_innovation(
     innovation: FloatArray, s: FloatArray, s_inverse: FloatArray
 ) -> tuple[float, float]:
-    """Normalised square of an innovation with covariance `s`, whose inverse is filled in; and the
-    determinant of `s`.
-    """
+    """Normalised square of an innovation of covariance `s`, and its determinant; inverts `s`."""
     determinant = _invert_3x3(s, s_inverse)
     squared = 0.0
     for i in range(POSE):
@@ -215,10 +213,8 @@ class Gating(NamedTuple):
     """Conditions for rejecting a measurement, and for restarting the filter from one."""
 
     largest_squared: float  # Largest squared normalised innovation
-    # After this number of consecutive rejections the pose is set to the measured one, with
-    # `restart_variances`, however far off the filter was
-    restart_after: int
-    restart_variances: FloatArray  # (3,)
+    restart_after: int  # Consecutive rejections after which the pose is set to the measured one
+    restart_variances: FloatArray  # (3,): with these variances
     lost_variance: float  # The same immediately if the heading's variance (rad^2) is larger
     cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
 
@@ -230,8 +226,7 @@ class FilterHistory(NamedTuple):
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
-    # (N, d, d): derivatives of each node's prediction with respect to the node before
-    transitions: FloatArray
+    transitions: FloatArray  # (N, d, d): derivatives of predictions by the node before
 
 
 class Innovations(NamedTuple):
@@ -363,11 +358,9 @@ def filter_forward(
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """Smooth a filter's history, from the last node to the first (Rauch, Tung, Striebel).
+    """States (N, d) and covariances (N, d, d) smoothed backward (Rauch, Tung, Striebel).
 
-    Across a restart of the filter, only odometry's systematic errors are propagated backward.
-
-    Returns `states`, `covariances` (N, d), (N, d, d).
+    Across a restart of the filter, only odometry's systematic errors are propagated.
     """
     expected = history.predicted_covariance[1:].copy()
     # States without variance do not change.

@@ -58,8 +58,7 @@ class LocalisationErrors:
     heading_sigma: float  # Of the heading (rad)
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
-    # Heading of the ground truth minus that of the aligned localisation (rad)
-    heading_offset: float
+    heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
 
 
 def as_localisation(
@@ -185,10 +184,7 @@ def _stationary(
 def _bridged(
     path: PlanarPoses, aligned: PlanarPoses, measured_s: FloatArray, errors: LocalisationErrors
 ) -> PlanarPoses:
-    """A path with gaps filled by an aligned localisation plus its errors given at both ends.
-
-    The localisation's covariances are those of its alignment.
-    """
+    """A path with gaps filled by an aligned localisation plus its errors given at both ends."""
     assert path.covariances is not None
     times, poses, covariances = path.times_s, path.poses.copy(), path.covariances.copy()
     there, _ = interpolate_poses(aligned, times)

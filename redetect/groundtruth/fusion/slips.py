@@ -26,8 +26,7 @@ _LEAST_RUN, _LEAST_LAST_RUN = 10, 20
 # A squared innovation beyond this share of the gate is no return to the predicted path.
 _NO_RETURN = 1.0 / 3.0
 # Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried,
-# with the cost of a measurement: one that contradicts nothing any more costs about as much as a
-# rejected one.
+# with the cost of a measurement, about that of a rejected one.
 _TRIED_LENGTHS, _TRIED_RATES = (1, 2, 4, 8, 16, 32), {1.0: 20.0, 100.0: 50.0}
 # The run's squared errors must become smaller by this factor.
 _LEAST_GAIN = 0.8
@@ -112,10 +111,7 @@ def _stretches(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
-    """Begin and end of long runs of rejections, after an accepted measurement.
-
-    The measurement at which the filter restarted belongs to the run.
-    """
+    """Begin and end of long runs of rejections, or restarts, after an accepted measurement."""
     rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
     return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]
 

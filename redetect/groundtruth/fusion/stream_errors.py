@@ -49,8 +49,7 @@ def roughness(values: FloatArray) -> float:
 def jitter_ratio(poses: PlanarPoses) -> float:
     """Jitter of poses in their standard deviations: about 1 if these are right.
 
-    The largest of x, y and the heading; 0 if it is unknown: without covariances, or
-    with too few or too slow poses.
+    The largest of x, y and the heading; 0 without covariances, or with too few or too slow poses.
     """
     count = len(poses) - _ORDER
     if poses.covariances is None or count < _FEWEST:
@@ -70,10 +69,7 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
 
 def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
-    """Poses with covariances raised to their jitter, and the factor of the deviations.
-
-    The factor is 1, and the poses are unchanged, if their covariances can be right.
-    """
+    """Poses with covariances raised to their jitter, and the deviations' factor; 1 if right."""
     factor = jitter_ratio(poses)
     if factor <= _BELIEVED:
         return poses, 1.0
@@ -82,9 +78,7 @@ def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
 
 
 def read_common_covariance(stream: str | os.PathLike[str]) -> FloatArray:
-    """(3, 3) covariance that is common to a stream's poses, from the .json that
-    `groundtruth laser` wrote beside it; zeros if there is none.
-    """
+    """(3, 3) common covariance of a stream's poses, from the .json beside it; zeros without one."""
     path = Path(stream).with_suffix(".json")
     if path.is_file():
         content = JsonObject.read(path)
@@ -94,10 +88,7 @@ def read_common_covariance(stream: str | os.PathLike[str]) -> FloatArray:
 
 
 def without_common(poses: PlanarPoses, common: FloatArray) -> tuple[PlanarPoses, FloatArray]:
-    """Poses without the common part (3, 3) of their covariances, and that part.
-
-    The part is zeros, and the poses are unchanged, if it is negligible.
-    """
+    """Poses without the common part (3, 3) of their covariances; that part, 0 if negligible."""
     if poses.covariances is None or not len(poses):
         return poses, np.zeros((3, 3))
     variances = np.diagonal(poses.covariances, axis1=1, axis2=2)

@@ -160,10 +160,7 @@ def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
     jumps_left: int,
 ) -> list[ClockSegment]:  # fmt: skip
-    """One segment's clock; several parts if the clock was set within it.
-
-    `start_s`: an offset from which the refinement by whole poses also starts.
-    """
+    """One segment's clock, from `start_s`, too; several parts if the clock was set within it."""
     headings = np.unwrap(segment.poses[:, 2])
     # Means of ten, with less noise.
     means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
@@ -352,10 +349,7 @@ def _rounding(odometry: PlanarPoses) -> FloatArray:
 
 
 def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatArray) -> PlanarPoses:
-    """Measured poses with odometry's own jitter and rounding added to their covariances.
-
-    A localisation jitters from sample to sample, and this error does not accumulate.
-    """
+    """Measured poses with odometry's jitter and rounding in their covariances: of each sample."""
     covariances = measured.covariances
     if covariances is None:
         covariances = np.diag([0.0, 0.0, roughness(np.unwrap(measured.poses[:, 2])) ** 2])
@@ -370,8 +364,7 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     """Means of up to five samples, since single ones are noisier than interpolated ones.
 
-    If samples have a constant phase relative to the measured poses, that difference would look like
-    a better or worse fit of the clock.
+    With a constant phase of both streams that would look like a better or worse fit of the clock.
     """
     # Relative to the first one, since sums of times since 1970 lose digits.
     begin_s = odometry.times_s[0]

@@ -21,7 +21,7 @@ from redetect.array_types import FloatArray
 from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
@@ -38,11 +38,8 @@ class Rig:
     dictionary: str  # The set of markers that defines the identifiers
     ids: tuple[int, ...]  # The markers, M of them
     widths_m: FloatArray  # (M,): widths of the black squares
-    # (M, 4, 4): a marker's frame has its origin at the centre, x right, y up, z out of the print
-    robot_from_marker: FloatArray
-    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    robot_from_marker: FloatArray  # (M, 4, 4): markers' x right, y up, z out of the print
+    covariance: FloatArray  # (6 M, 6 M): of right perturbations (m, rad); zeros if exact
 
     @property
     def corners(self) -> FloatArray:
@@ -55,13 +52,10 @@ class Network:
     """Cameras fixed in the world."""
 
     names: tuple[str, ...]  # The cameras, C of them
-    # Their calibrations. The mounting in a ``.cam`` file is ignored.
-    cameras: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # Their lenses; the mounting in a ``.cam`` file is ignored
     calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's file
     world_from_camera: FloatArray  # (C, 4, 4)
-    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    covariance: FloatArray  # (6 C, 6 C): of right perturbations (m, rad); zeros if exact
 
 
 def marker_corners(width_m: float) -> FloatArray:
@@ -71,10 +65,7 @@ def marker_corners(width_m: float) -> FloatArray:
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read a ``rig.json``; its markers are returned in the order of their identifiers.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``rig.json``, its markers by identifier; `GroundTruthError` if it is malformed."""
     content = JsonObject.read(path)
     dictionary = content.text("dictionary", "its name")
     markers = content.objects("markers")
@@ -94,8 +85,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 def read_network(path: str | os.PathLike[str]) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
-    missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file is malformed.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))
@@ -161,7 +151,7 @@ def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     """A (4, 4) pose in the form that `parse_pose` reads."""
     return {
         "translation_m": pose[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+        "quaternion_xyzw": se3.quaternion_xyzw(pose).tolist(),
     }
 
 
@@ -174,7 +164,7 @@ def parse_pose(entry: JsonObject) -> FloatArray:
         raise GroundTruthError(
             f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
-    return transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
+    return se3.transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
 
 
 def _joint_covariance(
@@ -222,10 +212,7 @@ class View:
 
 
 def find_runs(session: Path) -> list[Path]:
-    """The run folders of a session that contain detected markers.
-
-    Raises `GroundTruthError` if there are none.
-    """
+    """The run folders of a session with detected markers; `GroundTruthError` if there are none."""
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())
@@ -238,11 +225,7 @@ def find_runs(session: Path) -> list[Path]:
 
 
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
-    """The markers found in a run's images, in the file's order, and the images' times.
-
-    The run folder contains ``detected.markers`` and ``<name>.times``. Frames are numbered instead
-    if not `timed`.
-    """
+    """The markers in a run folder's images, in order, and these images' times or numbers."""
     times_path = run / f"{run.resolve().name}.times"
     times = read_times(times_path) if timed else {}
     frames = []
@@ -273,10 +256,7 @@ def read_network_frames(runs: Sequence[Path], network: Network) -> list[MarkerFr
 def group_by_time(
     frames: Sequence[MarkerFrame], tolerance_s: float
 ) -> list[tuple[MarkerFrame, ...]]:
-    """Groups of images of different cameras, in order of time.
-
-    A group's images are within the tolerance of its first; each camera occurs at most once.
-    """
+    """Groups of images of different cameras within the tolerance of the first, in order of time."""
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
         near = bool(groups) and frame.time_s - groups[-1][0].time_s <= tolerance_s

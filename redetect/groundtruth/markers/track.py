@@ -16,8 +16,8 @@ from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
 from redetect.landmarks import squared_mahalanobis
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
@@ -84,16 +84,13 @@ class Track:
         )
         return PlanarPoses(
             np.array([time_s for time_s, _ in posed], dtype=np.float64),
-            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], heading(poses)]),
-            planar_covariance(poses, covariances),
+            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], se3.heading(poses)]),
+            se3.planar_covariance(poses, covariances),
         )
 
 
 def excess_of(pose: RefinedPose) -> float:
-    """Factor by which a pose's covariance is too small for its residuals.
-
-    It is 1 unless they are larger than chance makes one in a thousand.
-    """
+    """Factor by which a pose's covariance is too small for its residuals; 1 if by chance."""
     freedom = pose.degrees_of_freedom
     if freedom < 1 or pose.cost <= chdtri(freedom, _CHANCE):
         return 1.0
@@ -103,11 +100,7 @@ def excess_of(pose: RefinedPose) -> float:
 def track_by_markers(
     groups: Iterable[tuple[MarkerFrame, ...]], rig: Rig, network: Network, settings: PoseSettings
 ) -> Track:
-    """Compute the robot's poses from the markers found in a session's images.
-
-    `groups` are the images of each time (`redetect.groundtruth.markers.session.group_by_time`),
-    their cameras' indices those of `network`.
-    """
+    """The robot's poses from the markers in images, those of one time in a group."""
     tracked: list[TrackedTime] = []
     unknown = 0
     for group in groups:
@@ -153,7 +146,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
             {
                 "x_y_theta": [
                     *(round(float(v), 6) for v in candidate.world_from_robot[:2, 3]),
-                    round(float(heading(candidate.world_from_robot)), 6),
+                    round(float(se3.heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
                 "rms_px": round(candidate.rms_px, 4),

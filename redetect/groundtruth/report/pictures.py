@@ -1,8 +1,4 @@
-"""Figures of the report, and pictures that accompany results.
-
-The former (SVG) are the map with paths and ellipses, and errors over time; the latter (PNG) are a
-rig, the scanners' alignment, and errors at reference poses.
-"""
+"""Figures of the report (SVG), and pictures that accompany results (PNG), reproducible."""
 
 from __future__ import annotations
 
@@ -21,8 +17,8 @@ from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
 from redetect.groundtruth.markers.session import Rig, marker_corners
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.onboard import OF_A_WALL_M
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
@@ -137,9 +133,7 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
 def _area(
     tracks: Sequence[Track], building: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Corners of the drawn area: the paths with a margin, or else the whole building; and inches
-    on the page per metre.
-    """
+    """Corners of the drawn area (paths, or else the building), and inches on the page per m."""
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places:
         places = [np.array([[0.0, 0.0]]) if building is None else building.reshape(-1, 2)]
@@ -229,10 +223,7 @@ def draw_walls(axes: Axes, building: FloatArray) -> None:
 
 
 def draw_rig(estimate: RigEstimate) -> bytes:
-    """Draw a rig from three sides; returns a PNG's bytes, the same for the same input.
-
-    Pairwise estimates are drawn as the position of one marker relative to the other.
-    """
+    """Draw a rig and its markers' pairwise estimates from three sides; returns a PNG's bytes."""
     rig = estimate.rig
     agreeing, differing = _clouds(estimate)
     with figure_file((13.5, 5.0), "png") as (figure, content):
@@ -262,7 +253,7 @@ def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
     poses, pairs = estimate.rig.robot_from_marker, sorted(estimate.pairs.items())
     estimates = [np.zeros((0, 4, 4))]
     for (a, b), pair in pairs:
-        estimates += [poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)]
+        estimates += [poses[a] @ pair.estimates, poses[b] @ se3.inverse(pair.estimates)]
     places = np.concatenate(estimates)[:, :3, 3]
     agrees = np.array([one for _, pair in pairs for one in (*pair.agrees, *pair.agrees)], bool)
     return places[agrees], places[~agrees]
@@ -270,10 +261,10 @@ def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
 
 def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
     for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker):
-        outline = apply(pose, marker_corners(width)[[0, 1, 2, 3, 0]])
+        outline = se3.apply(pose, marker_corners(width)[[0, 1, 2, 3, 0]])
         label = "adjusted markers" if marker == rig.ids[0] else None
         axes.plot(outline[:, across], outline[:, up], color="black", lw=1.4, label=label, zorder=3)
-        normal = apply(pose, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6 * width]]))
+        normal = se3.apply(pose, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6 * width]]))
         axes.plot(normal[:, across], normal[:, up], color="black", lw=0.8, zorder=3)
         axes.annotate(
             str(marker), (float(normal[1, across]), float(normal[1, up])), ha="center",
@@ -290,7 +281,7 @@ def draw_alignment(
     """Draw scanners' points on the map for measured and aligned poses; returns a PNG's bytes.
 
     Beside them, `icp_rms_m`: for each scanner, the distances from the map (m) after each step of an
-    ICP from its measured pose. The same input gives the same bytes.
+    ICP from its measured pose.
     """
     with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]
@@ -320,10 +311,7 @@ def draw_alignment(
 
 
 def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
-    """Draw errors, at least one, with bounds from their covariances; returns a PNG's bytes.
-
-    `score`: of these errors. The same input gives the same bytes.
-    """
+    """Draw errors, at least one, their `score` and bounds by covariances; returns a PNG's bytes."""
     with figure_file((13.5, 6.4), "png") as (figure, content):
         linear, angular = figure.subplots(2, 1)
         names = [str(reference.index) for reference in errors.references]
@@ -373,11 +361,7 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
 
 
 def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
-    """Draw the scans on board on the map, for each set of poses; returns a PNG's bytes.
-
-    The sets are the reference poses from distances alone, those refined by scans, and the ground
-    truth. The same input gives the same bytes.
-    """
+    """Draw the scans on board on the map, by each set of poses; returns a PNG's bytes."""
     kept = [i for i, r in enumerate(errors.references) if r.still is not None]
     refined = np.stack([errors.references[i].pose for i in kept])
     distances = np.stack([errors.references[i].distances.pose for i in kept])

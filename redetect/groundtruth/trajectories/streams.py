@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import parse_numbers, read_rows
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
@@ -38,10 +38,8 @@ class PlanarPoses:
     """
 
     times_s: FloatArray  # (N,): seconds, not decreasing
-    # (N, 3): x, y (m) and theta (rad). Headings may be beyond +-pi, as in the real streams.
-    poses: FloatArray
-    # (N, 3, 3): covariances of (x, y, theta); may be singular due to rounding in files.
-    covariances: FloatArray | None = None
+    poses: FloatArray  # (N, 3): x, y (m), theta (rad), which may be beyond +-pi, as in real streams
+    covariances: FloatArray | None = None  # (N, 3, 3); may be singular due to rounding in files
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
@@ -83,10 +81,9 @@ class PlanarPoses:
 
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
-    """Keep only the last of all poses with the same time.
+    """Keep only the last of all poses with the same time, as of buffers that are read occasionally.
 
-    If time stamps are coarser than samples, as with buffers that are read occasionally, several
-    poses have the same time. The robot moved between them, but its speed cannot be computed.
+    The robot moved between them, but its speed cannot be computed.
     """
     last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
     return poses if np.all(last) else poses.only(last)
@@ -96,8 +93,7 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
     All rows have 4, or all have 13, numbers separated by commas or blanks; blank lines and `#`
-    comments, which the real files do not have, are skipped. Raises `GroundTruthError` if the file
-    cannot be read or a row is malformed; the message names file and line.
+    comments are skipped. Raises `GroundTruthError` with file and line if a row is malformed.
     """
     rows: list[list[float]] = []
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)
@@ -144,7 +140,7 @@ def write_planar_poses(
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
     """Format (N,) times and (N, 4, 4) poses as a TUM trajectory: t x y z qx qy qz qw."""
-    quaternions = quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
+    quaternions = se3.quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
     return "".join(
         " ".join([f"{t:.6f}", *(f"{v:.6f}" for v in pose[:3, 3]), *(f"{v:.9f}" for v in q)]) + "\n"
         for t, pose, q in zip(times_s, world_from_robot, quaternions)
@@ -163,9 +159,8 @@ def interpolate_poses(
 ) -> tuple[PlanarPoses, BoolArray]:
     """Interpolate poses and covariances linearly at ascending times (N,), wrapping headings.
 
-    Between neighbours farther apart than the largest gap there are no poses, except at the
-    neighbours' own times. Returns the interpolated poses, and a mask (N,) of the times that have
-    one.
+    Between neighbours farther apart than the largest gap there are none. Returns the interpolated
+    poses, and a mask (N,) of the times that have one.
     """
     if len(poses) == 0:
         raise GroundTruthError("no poses to interpolate between")

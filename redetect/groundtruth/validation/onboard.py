@@ -1,9 +1,8 @@
 """Fit of the readings on board, at the reference poses, to the building's walls.
 
-The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
-fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls do not determine a direction or the results disagree. From all reference poses together, the
-range errors and the mounts of the scanners are estimated.
+The robot is at rest, so its readings are averaged first. The fit starts at the pose from distances,
+its prior; both are combined by their covariances, unless the walls leave a direction undetermined
+or they disagree. All reference poses together give range errors and the scanners' mounts.
 """
 
 from __future__ import annotations
@@ -233,9 +232,8 @@ def refine_mounts(
 ) -> RefinedMounts | None:
     """Mounts of the scanners on board for which readings fit the walls at all reference poses.
 
-    Least squares over the mounts and all poses. Only the poses from distances, with their
-    covariances, tie the mounts to the robot's frame; the measured mounts are not a prior.
-    None if fewer than three poses have both distances and scans.
+    Least squares over the mounts and all poses; only the poses from distances tie the mounts to the
+    robot's frame. None if fewer than three poses have both distances and scans.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
     used = [

@@ -72,10 +72,7 @@ class Distance:
 
 
 def read_survey(path: str | os.PathLike[str]) -> Survey:
-    """Read a ``fiducials.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``fiducials.json``; raises `GroundTruthError` if it is malformed."""
     content = JsonObject.read(path)
     content.demand_version()
     fiducials, robot_points = (_points(content, key) for key in ("fiducials", "robot_points"))
@@ -83,10 +80,9 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
-    """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
+    """Read a ``distances.csv`` between the survey's points, in the file's order.
 
-    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names an unknown
-    point.
+    Raises `GroundTruthError` if a row is malformed or names an unknown point.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
@@ -152,10 +148,9 @@ class Measured(NamedTuple):
 
 
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
+    """All minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    By Levenberg-Marquardt from many starts: with all headings, all around the fiducial of the first
-    distance.
+    By Levenberg-Marquardt with all headings, from all around the fiducial of the first distance.
     """
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
@@ -182,9 +177,7 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
 
 
 def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """Measured minus expected distances (..., K) (m) of poses (..., 3), and their derivatives by
-    the poses (..., K, 3).
-    """
+    """(..., K) measured minus expected distances (m) of poses (..., 3); derivatives by these."""
     arm = measured.levers @ np.swapaxes(rotation(pose[..., 2]), -1, -2)
     apart = pose[..., None, :2] + arm - measured.fiducials
     length = np.hypot(apart[..., 0], apart[..., 1])
@@ -290,9 +283,8 @@ def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> lis
 def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> SurveyedFiducials:
     """Estimate the positions of fiducials from the distances between them, by least squares.
 
-    Distances do not determine a rigid motion: the positions are aligned with the drawing, and the
-    standard deviations are those of a free network (of least trace). Raises `GroundTruthError` if
-    the distances leave more than that undetermined.
+    They are aligned rigidly with the drawing; the standard deviations are those of a free network
+    (of least trace). Raises `GroundTruthError` if the distances leave more undetermined.
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])

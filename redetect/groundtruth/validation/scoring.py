@@ -73,9 +73,7 @@ class PoseScore(ErrorFigures):
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
     normalised: int  # Poses with an invertible covariance
-    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
-    # right. NaN without covariances.
-    normalised_error: float
+    normalised_error: float  # Mean of these: 1 if covariances are right; NaN without any
 
     def lines(self) -> list[str]:
         """The figures to print."""
@@ -97,10 +95,7 @@ class PoseScore(ErrorFigures):
 
 
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
-    """Errors of poses whose truth is known at the same times.
-
-    If the truth has covariances, the normalised error includes them. `unmatched` is passed on.
-    """
+    """Errors of poses whose truth, perhaps with covariances, is known at the same times."""
     normalised = normalised_errors(poses, truth)
     normalised = normalised[np.isfinite(normalised)]
     return PoseScore(
@@ -142,8 +137,7 @@ class Relations(NamedTuple):
 
     from_s: FloatArray  # (N,)
     to_s: FloatArray  # (N,): may be the earlier one
-    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
-    from_to: FloatArray
+    from_to: FloatArray  # (N, 3): x, y (m), theta (rad) of the second pose in the first's frame
 
 
 @dataclass(frozen=True)
@@ -157,8 +151,7 @@ class RelativeScore(ErrorFigures):
 def read_relations(path: str | os.PathLike[str]) -> Relations:
     """Read relations: rows t_i, t_j, x, y, z, roll, pitch, yaw separated by blanks or commas.
 
-    Only x, y and yaw are used, as poses are on a floor. Raises `GroundTruthError` if the file
-    cannot be read or a row is malformed; the message names file and line.
+    Only x, y and yaw are used. Raises `GroundTruthError` with file and line if one is malformed.
     """
     rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
     if not rows:
@@ -170,10 +163,9 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
 def score_relations(
     poses: PlanarPoses, relations: Relations, largest_gap_s: float = np.inf
 ) -> RelativeScore:
-    """Compare poses, interpolated at the relations' times, with known relations.
+    """Compare poses, interpolated at the relations' times (not in longer gaps), with these.
 
-    Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
-    has poses at both its times.
+    Raises `GroundTruthError` if no relation has poses at both its times.
     """
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
@@ -261,9 +253,8 @@ class ReferenceErrors(NamedTuple):
 
     @property
     def sigma(self) -> FloatArray:
-        """(E, 2) standard deviations of position (m) and heading (rad), from both covariances.
-
-        For the position, the root of the trace; NaN if the ground truth has no invertible one.
+        """(E, 2) standard deviations of position (m; root of the trace) and heading (rad), from
+        both covariances; NaN if the ground truth has no invertible one.
         """
         found = np.full((len(self.poses), 2), np.nan)
         if self.poses.covariances is not None and self.reference_poses.covariances is not None:

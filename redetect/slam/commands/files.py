@@ -70,10 +70,9 @@ def recording_of(flags: RunFlags) -> Recording:
 
 
 def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
-    """Read the calibration that belongs to a run, a folder or a file in one.
+    """The calibration of a run, by default ``<run>.cam``, or the only ``.cam`` in its folder.
 
-    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
-    there is none, `camera.CameraError` if it is ambiguous.
+    Raises `SlamError` if there is none, `camera.CameraError` if it is ambiguous.
     """
     if camera is not None:
         return camera if isinstance(camera, Camera) else read_camera(camera)

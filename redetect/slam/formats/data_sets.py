@@ -61,9 +61,8 @@ def _names(times: FloatArray) -> tuple[str, ...]:
 def discs_of_ranges(
     range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Landmarks measured by range and bearing, as positions in the robot frame.
-
-    Takes `range_m, bearing_rad` (n,); returns `xy` (n, 2), `covariance` (n, 2, 2).
+    """(n, 2) positions, and covariances (n, 2, 2), of landmarks in the robot frame, measured by
+    range and bearing (n,).
     """
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
@@ -127,10 +126,7 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
 
 
 def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
-    """A robot's log, with landmarks as discs; steps have no covariance.
-
-    Takes the standard deviations of ranges and bearings.
-    """
+    """A robot's log, with landmarks as discs of given sigmas; steps have no covariance."""
     velocity, seen = _log(odometry, "time v omega"), _seen_by_robot(odometry)
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     steps = _velocity_steps(velocity, seen.times)
@@ -239,9 +235,8 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
 
 
 def trees_of(scan: FloatArray) -> FloatArray:
-    """Trunks in a scan: runs of beams with nearly equal range and a distant background.
-
-    Takes `scan` (361,); returns (n, 2).
+    """Ranges and bearings (n, 2) of trunks in a scan (361,): runs of beams of nearly equal range
+    with a distant background.
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])

@@ -62,10 +62,7 @@ def load_gtsam() -> Any:
 
 
 def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
-    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`.
-
-    Pose k has key k, disc j key N + 1 + j.
-    """
+    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`: keys of poses, then discs."""
     gtsam = load_gtsam()
     noise = gtsam.noiseModel
     root = noise.Gaussian.SqrtInformation
