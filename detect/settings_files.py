@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -72,7 +72,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
 
     Raises DetectError if there is no such field, or the value has another type.
     """
-    hints = get_type_hints(kind)
+    hints = {each.name: get_type_hints(kind)[each.name] for each in fields(kind)}
     if name not in hints:
         raise DetectError(
             f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"
