@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -68,7 +68,7 @@ def checked_settings(name: str, values: Any, kind: type[Settings]) -> Settings:
 
 def setting_value(kind: type, name: str, value: Any) -> Any:
     """A setting's value from JSON; DetectError if it is unknown or has another type."""
-    hints = get_type_hints(kind)
+    hints = {each.name: get_type_hints(kind)[each.name] for each in fields(kind)}
     if name not in hints:
         raise DetectError(
             f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"

@@ -66,8 +66,10 @@ def perform(options: Tune) -> int:
     output = run.output("tune") if options.output is None else options.output
     frames = SomeFrames(run.frames, every=options.every)
     if options.serve:
-        from detect.tuning_page import TuningSession, serve  # nothing else needs a server
+        # Nothing else needs a server.
+        from detect.tuning_page import LABELS_NAME, SETTINGS_NAME, TuningSession, serve
 
+        demand_free([output / SETTINGS_NAME, output / LABELS_NAME], overwrite=options.force)
         return serve(TuningSession(run, list(frames), base, output, options.force), options.port)
 
     names = "table.json", "curve.png"
