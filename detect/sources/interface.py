@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 #: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
 _BIT_DEPTHS = (8, 10, 12, 14, 16)
-# Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
-# expand, plus thumbnails and other metadata of cameras.
+# Limit of a file's size: 16 bits in four channels, times two, plus metadata of cameras.
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 
@@ -162,7 +161,7 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is truncated: its end is missing")
     claimed = claimed_size(content)
-    if claimed is not None and size is not None and size != claimed:
+    if claimed and size and size != claimed and claimed[0] * claimed[1] <= MOST_PIXELS:
         raise wrong_size(name, claimed, size)
     return gray_of_pixels(decoded_image(content, name, FrameError), name)
 
