@@ -46,7 +46,6 @@ EXPERT: dict[type, frozenset[str]] = {
     options.CompareOptions: all_but(options.CompareOptions, "only_identified"),
 }  # fmt: skip
 
-
 _QUALITY, _RESPONSE = "--quality-threshold", "--response-threshold"
 #: Former spellings of flags by command. In `detect all`, flags had the detector's name in front.
 _RENAMED = {

@@ -190,7 +190,7 @@ class Program:
 
     def _brief(self, kind: type) -> type:
         """The dataclass of a command without its expert flags, for its help."""
-        short = _without(kind, self.expert)
+        short: type = _without(kind, self.expert)
         if short is not kind:
             text, section, parameters = cleandoc(kind.__doc__ or "").partition("\n\nParameters\n")
             short.__doc__ = f"{text}\n\nMore flags are shown by {_HELP_ALL}.{section}{parameters}"
@@ -275,7 +275,7 @@ def _quietly() -> Iterator[None]:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
 
 
-def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
+def _without(kind: Any, expert: Mapping[type, frozenset[str]]) -> Any:
     """A dataclass whose expert fields are not flags; itself if it has none."""
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
@@ -284,10 +284,9 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
         hint, own = hints[each.name], cast(Any, copy(each))
         marks = getattr(hint, "__metadata__", ())
         inner = hint.__origin__ if marks else hint
-        nested = is_dataclass(inner)
         if each.name in hidden:
             hint = Annotated[hint, Suppress]
-        elif nested and (brief := _without(inner, expert)) is not inner:
+        elif is_dataclass(inner) and (brief := _without(inner, expert)) is not inner:
             own.default_factory = hint = brief
             for mark in marks:
                 hint = Annotated[hint, mark]

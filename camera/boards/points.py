@@ -15,8 +15,7 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 
 # Half the side of the window around a corner, as a share of its squares in the image.
 _WINDOW = 0.3
-_SMALLEST_HALF_WINDOW = 2
-_LARGEST_HALF_WINDOW = 9
+_SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW = 2, 9
 _FEWEST_POINTS = 8
 # Longer sides (px) to which an image is reduced, one after the other, to search a checkerboard: the
 # time grows faster than the image, and squares of a few pixels suffice.

@@ -32,8 +32,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
-_LARGEST_RMS_PX = 1.0
-_LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS = 1.0, 1.0 / 2000.0
 # Calibrations are warned about if the usual standard deviation of the projection is above this.
 _LARGEST_SIGMA_PX = 0.5
 # Residual, in standard deviations, beyond which a point is an outlier.

@@ -154,8 +154,7 @@ def _solved(
 ) -> tuple[FloatArray, Linearised, FloatArray] | None:
     """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
-    Weak priors: light changes little over a marker, the blur is nearly isotropic and close to its
-    initial estimate, the tone curve is nearly straight.
+    Weak priors: even light, a round blur close to its first estimate, a straight tone curve.
     """
     corners = start.corners
     blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)

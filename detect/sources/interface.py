@@ -153,8 +153,7 @@ def read_image(
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    An image with another width and height than `size` is not decoded. Raises FrameError, with
-    `name` for the image, if the content is not an image, or is truncated.
+    Only of the given `size`. FrameError, naming `name`, if it is no image, or truncated.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
