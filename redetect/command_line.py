@@ -19,6 +19,7 @@ from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
 from io import StringIO
+from itertools import takewhile
 from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -229,7 +230,8 @@ def _parsed_as(kind: type, default: Any, name: str, words: list[str]) -> Any:
         end_with(str(cause).replace(setting, named, 1))
     for word in unknown:
         if word.startswith("-"):
-            end_with(no_such(f"{name}: no flag", word.partition("=")[0], flags))
+            known = [flag for flag in flags if flag.startswith("-")]
+            end_with(no_such(f"{name}: no flag", word.partition("=")[0], known))
         end_with(f"{name}: {excerpt(word)}: one word too many: {name} --help lists the flags")
     return command
 
@@ -254,10 +256,12 @@ def _misunderstood(kind: type, words: Sequence[str], said: str) -> str:
     given = [word.partition("=")[0] for word in words]
     for flag in re.findall(r"--[a-z][\w.-]*", said):
         if flag in flags and "Required options" not in said:
-            after = words[given.index(flag) :] if flag in given else []
-            value = "".join(after[:1]).partition("=")[2] or "".join(after[1:2])
-            shown = flag if value.startswith("--") else f"{flag} {value}".strip()
-            return f"{shown}: expected {expectation(flags[flag][1])}"
+            expected = expectation(flags[flag][1])
+            own = max((k for k, word in enumerate(given) if word == flag), default=len(words))
+            after = takewhile(lambda word: not word.startswith("--"), words[own + 1 :])
+            values = [word.partition("=")[2] for word in words[own : own + 1]] + [*after]
+            shown = [flag, *filter(None, values)][: None if "numbers" in expected else 2]
+            return f"{' '.join(shown)}: expected {expected}"
     bare = {each.name for each in fields(kind) if each.default is each.default_factory}
     lacking = [flag for flag, (name, _) in flags.items() if name in bare and flag not in given]
     return f"expected {' '.join([each for each in lacking if each[0] == '-'] or lacking)}"
