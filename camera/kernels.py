@@ -1,7 +1,4 @@
-"""Compiled projection of single points and its inverse, for tables that need millions of them.
-
-`camera.model` and `camera.distortion` are the definitions; tests compare both.
-"""
+"""Compiled projection of points and its inverse, as `camera.model` and `distortion` define them."""
 
 from __future__ import annotations
 

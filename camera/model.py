@@ -132,8 +132,7 @@ class Camera:
     def camera_from_robot(self) -> FloatArray:
         """(3, 3) inverse of `rotation`.
 
-        Files give rotations in few digits, so this is not exactly the transpose; with it, what goes
-        from pixel to floor comes back to the same pixel.
+        Not quite the transpose, as files give few digits: pixels come back from the floor.
         """
         return _read_only(np.asarray(np.linalg.inv(self.rotation), dtype=np.float64))
 

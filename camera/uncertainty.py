@@ -118,8 +118,7 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
 def tilt_by_parameters(camera: Camera) -> FloatArray:
     """(2, 20) derivatives of pitch and roll, estimated from verticals all over the image.
 
-    With a wrong calibration, true verticals seem to lean; the tilt that makes them vertical is
-    fitted by least squares.
+    With a wrong calibration, verticals seem to lean: the tilt is fitted by least squares.
     """
     bearing, elevation = np.meshgrid(_BEARINGS, _ELEVATIONS, indexing="ij")
     ray = np.stack([np.sin(bearing), -np.cos(bearing), np.tan(elevation)], axis=-1)

@@ -46,7 +46,6 @@ EXPERT: dict[type, frozenset[str]] = {
     options.CompareOptions: all_but(options.CompareOptions, "only_identified"),
 }  # fmt: skip
 
-
 _QUALITY, _RESPONSE = "--quality-threshold", "--response-threshold"
 #: Former spellings of flags by command. In `detect all`, flags had the detector's name in front.
 _RENAMED = {
@@ -129,8 +128,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     code = PROGRAM.main(arguments)
     if code == EXIT_INTERRUPTED and arguments is None:
-        # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
-        # it was caught.
+        # Otherwise, Python dies of an interrupt that passed through some library's `exec`.
         atexit._run_exitfuncs()
         os._exit(code)
     return code

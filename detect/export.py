@@ -92,15 +92,11 @@ def perform(command: Export) -> int:
 
 
 def _times(command: Export) -> dict[str, float] | None:
-    if command.times is not None:
-        return read_times(command.times)
-    if command.rate_hz is not None:
-        return None
-    for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
-        beside = command.file.with_name(name)
-        if beside.is_file():
-            return read_times(beside)
-    return None
+    names = command.file.name, command.file.stem
+    beside = [command.file.with_name(f"{name}.times") for name in names]
+    found = [] if command.rate_hz is not None else [path for path in beside if path.is_file()]
+    path = command.times or next(iter(found), None)
+    return None if path is None else read_times(path)
 
 
 def read_tables(

@@ -31,8 +31,7 @@ def image_positions(
 ) -> FloatArray:
     """(..., 2) pixels of positions (..., 2) on the floor (m); NaN where not visible.
 
-    `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
-    `raised_m` higher than calibrated.
+    `levelled_by` are the pitch and roll (rad) of that, and the camera is `raised_m` higher.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
@@ -45,10 +44,9 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level the floor positions (m) that the calibrated camera measures.
+    """Level the floor positions (..., 2) (m) that the calibrated camera measures.
 
-    Positions (..., 2) were computed without the tilt; pitch and roll (..., 2) (rad) are given once
-    for all or broadcast against them. NaN where the levelled ray does not meet the floor.
+    Pitch and roll (..., 2) (rad) are broadcast. NaN where the levelled ray misses the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)

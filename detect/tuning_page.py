@@ -213,11 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
         raise DetectError("no such request")
 
     def _number(self, word: Any) -> int:
-        number = int(word)
-        if not 0 <= number < len(self.server.session.frames):
-            raise DetectError(
-                f"no frame {number}: expected 0 to {len(self.server.session.frames) - 1}"
-            )
+        number, count = int(word), len(self.server.session.frames)
+        if not 0 <= number < count:
+            raise DetectError(f"no frame {number}: expected 0 to {count - 1}")
         return number
 
     def _allowed(self, token: str) -> bool:

@@ -65,8 +65,7 @@ class VerticalTable:
 def build_vertical_table(camera: Camera) -> VerticalTable:
     """Compute the anchor and the verticals through it, for a calibrated camera in any pose.
 
-    Columns whose anchor lies outside the image have no vertical; a camera that looks more than 45
-    deg past the horizon gets a table without verticals.
+    There are none in columns without anchor, or more than 45 deg past the horizon.
     """
     height, width = camera.height, camera.width
     normalised = camera.undistort(camera.pixel_grid())
@@ -165,8 +164,7 @@ def trace_verticals(
 ) -> None:
     """Follow (N,) verticals from the anchor up and down, row by row, through a camera.
 
-    Results are (H, N) `column` and `elevation` (rad) of each vertical in each row; NaN where it is
-    not visible, or not continuously from the anchor on.
+    Results: (H, N) `column`, `elevation` (rad); NaN where not visible continuously from there.
     """
     column[:] = elevation[:] = math.nan
     for n in range(len(bearing)):

@@ -94,8 +94,7 @@ Share = Annotated[float, SHARE]
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
     """Reject settings with a number out of its bounds, which are given by attribute name.
 
-    Each number of a tuple is checked, None is skipped. The error states the setting, its value and
-    what was expected.
+    Each number of a tuple, but None. The error states the setting, its value, what is allowed.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)

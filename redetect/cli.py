@@ -26,7 +26,6 @@ PROGRAMS = {
 #: Commands of `detect` that are also commands of `redetect`.
 DIRECT = ("compare", "draw", "view", "report", "tune", "export", "explain", "demo")
 
-
 _QUIET = ("-q", "--quiet")
 
 _HEAD = (

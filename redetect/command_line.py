@@ -19,6 +19,7 @@ from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
 from io import StringIO
+from itertools import takewhile
 from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -129,8 +130,7 @@ class Program:
 
     name: str
     description: str  # for its `--help`
-    #: Dataclasses of flags, one for each command, whose name is that of the class in lower case,
-    #: and the module whose `perform` executes it.
+    #: Dataclasses of flags, called as their commands, and the module whose `perform` executes each.
     performed_by: Mapping[type, str]
     expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
 
@@ -191,7 +191,7 @@ class Program:
 
     def _brief(self, kind: type) -> type:
         """The dataclass of a command without its expert flags, for its help."""
-        short = _without(kind, self.expert)
+        short: type = _without(kind, self.expert)
         if short is not kind:
             text, section, parameters = cleandoc(kind.__doc__ or "").partition("\n\nParameters\n")
             short.__doc__ = f"{text}\n\nMore flags are shown by {_HELP_ALL}.{section}{parameters}"
@@ -242,7 +242,8 @@ def _parsed_as(kind: type, default: Any, name: str, words: list[str]) -> Any:
         end_with(str(cause).replace(setting, named, 1))
     for word in unknown:
         if word.startswith("-"):
-            end_with(no_such(f"{name}: no flag", word.partition("=")[0], flags))
+            known = [flag for flag in flags if flag.startswith("-")]
+            end_with(no_such(f"{name}: no flag", word.partition("=")[0], known))
         end_with(f"{name}: {excerpt(word)}: one word too many: {name} --help lists the flags")
     return command
 
@@ -267,10 +268,12 @@ def _misunderstood(kind: type, words: Sequence[str], said: str) -> str:
     given = [word.partition("=")[0] for word in words]
     for flag in re.findall(r"--[a-z][\w.-]*", said):
         if flag in flags and "Required options" not in said:
-            after = words[given.index(flag) :] if flag in given else []
-            value = "".join(after[:1]).partition("=")[2] or "".join(after[1:2])
-            shown = flag if value.startswith("--") else f"{flag} {value}".strip()
-            return f"{shown}: expected {expectation(flags[flag][1])}"
+            expected = expectation(flags[flag][1])
+            own = max((k for k, word in enumerate(given) if word == flag), default=len(words))
+            after = takewhile(lambda word: not word.startswith("--"), words[own + 1 :])
+            values = [word.partition("=")[2] for word in words[own : own + 1]] + [*after]
+            shown = [flag, *filter(None, values)][: None if "numbers" in expected else 2]
+            return f"{' '.join(shown)}: expected {expected}"
     bare = {each.name for each in fields(kind) if each.default is each.default_factory}
     lacking = [flag for flag, (name, _) in flags.items() if name in bare and flag not in given]
     return f"expected {' '.join([each for each in lacking if each[0] == '-'] or lacking)}"
@@ -288,7 +291,7 @@ def _quietly() -> Iterator[None]:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
 
 
-def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
+def _without(kind: Any, expert: Mapping[type, frozenset[str]]) -> Any:
     """A dataclass whose expert fields are not flags; itself if it has none."""
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
@@ -297,10 +300,9 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
         hint, own = hints[each.name], cast(Any, copy(each))
         marks = getattr(hint, "__metadata__", ())
         inner = hint.__origin__ if marks else hint
-        nested = is_dataclass(inner)
         if each.name in hidden:
             hint = Annotated[hint, Suppress]
-        elif nested and (brief := _without(inner, expert)) is not inner:
+        elif is_dataclass(inner) and (brief := _without(inner, expert)) is not inner:
             own.default_factory = hint = brief
             for mark in marks:
                 hint = Annotated[hint, mark]

@@ -20,15 +20,12 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 # Greatest length of the strips along the edges, in squares and in pixels: the lens bends edges.
 _ALONG, _LONGEST_PX = 0.4, 16.0
 # Largest and smallest half-width of a strip (px).
-_WIDEST_PX = 3.0
-_NARROWEST_PX = 1.2
+_WIDEST_PX, _NARROWEST_PX = 3.0, 1.2
 # By blur and the width of the gradient filter, the marker's edge reaches this far into the margin.
 _REACH_PX = 1.5
 # Largest distance from the predicted position, in squares; correlation with the printed pattern.
-_FARTHEST = 0.25
-_LEAST_AGREEMENT = 0.85
-_ITERATIONS = 40
-_STILL_PX = 1e-4
+_FARTHEST, _LEAST_AGREEMENT = 0.25, 0.85
+_ITERATIONS, _STILL_PX = 40, 1e-4
 # Number of neighbours from which a missing corner is predicted.
 _NEIGHBOURS = 12
 # Fewest corners that determine a plane.

@@ -15,12 +15,10 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 
 # Half the side of the window around a corner, as a share of its squares in the image.
 _WINDOW = 0.3
-_SMALLEST_HALF_WINDOW = 2
-_LARGEST_HALF_WINDOW = 9
+_SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW = 2, 9
 _FEWEST_POINTS = 8
-# Lengths of the longer side (px) to which an image is reduced, one after the other, to search a
-# checkerboard. The time of OpenCV's search grows faster than the image, especially without a board,
-# and squares of a few pixels suffice.
+# Longer sides (px) to which an image is reduced, one after the other, to search a checkerboard: the
+# time grows faster than the image, and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
 
@@ -173,8 +171,7 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
     flag = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     size = (board.columns, board.rows)
     pictures = image, 255 - image
-    # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
-    # ground are dark ones in the negative.
+    # Clustering tolerates perspective, the plain search clutter; in the negative, light is dark.
     for heights in zip(*map(both_heights, pictures)):
         for picture, (searched, in_image) in zip(pictures, heights):
             for extra in (0, cv2.CALIB_CB_CLUSTERING):

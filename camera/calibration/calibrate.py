@@ -32,8 +32,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
-_LARGEST_RMS_PX = 1.0
-_LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS = 1.0, 1.0 / 2000.0
 # Calibrations are warned about if the usual standard deviation of the projection is above this.
 _LARGEST_SIGMA_PX = 0.5
 # Residual, in standard deviations, beyond which a point is an outlier.
@@ -136,8 +135,7 @@ class Calibration:
     names: tuple[str, ...]  #: The views' names
     outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
-    #: RMS reprojection error (u and v together) in held-out views, by the sets of free coefficients
-    #: that were tried
+    #: RMS reprojection error in held-out views (px), by the free coefficients that were tried
     holdout_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 

@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 
@@ -21,7 +22,7 @@ from camera.calibration.calibrate import (
     calibrate_freely,
 )
 from camera.calibration.consensus import view_rms
-from camera.calibration.floor import file_name, write_picture
+from camera.calibration.floor import write_picture
 from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
@@ -82,7 +83,7 @@ def perform(options: Calibrate) -> int:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
-                place = options.pictures / f"{file_name(name)}.corners.png"
+                place = options.pictures / f"{name.replace(':', '-')}.corners.png"
                 write_picture(picture, place, force=options.force)
     for name, drawn in pictures(calibration, camera).items():
         write_bytes(names[name], drawn, overwrite=options.force)
@@ -121,8 +122,7 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     """The board with the number of corners in the pictures, if that contradicts the given one.
 
-    A larger board contains the given one. A smaller one may be part of a poorly visible board: it
-    counts if the given one is in none of the pictures examined.
+    A larger board contains the given one; a smaller one counts if that is in no picture.
     """
     given = max(board.columns, board.rows), min(board.columns, board.rows)
     votes: Counter[tuple[int, int]] = Counter()
@@ -138,8 +138,10 @@ def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     if counted == given or count < _VOTES:
         return board
     is_larger = counted[0] >= given[0] and counted[1] >= given[1]
-    if not is_larger and any(_has_board(image, board) for image in seen):
-        return board
+    for image in () if is_larger else seen:
+        with suppress(CalibrationError):
+            find_board(image, board)
+            return board
     columns, rows = counted if board.columns >= board.rows else counted[::-1]
     print(
         f"the board has {columns} x {rows} inner corners, by {count} of the first {len(seen)} "
@@ -147,14 +149,6 @@ def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
         file=sys.stderr,
     )
     return replace(board, columns=columns, rows=rows)
-
-
-def _has_board(image: GreyImage, board: Board) -> bool:
-    try:
-        find_board(image, board)
-    except CalibrationError:
-        return False
-    return True
 
 
 def find_views(

@@ -245,7 +245,7 @@ def write_floor_pictures(options: Floor, camera: Camera) -> None:
         return
     image = read_grey(floor)
     for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
-        place = options.pictures / f"{file_name(floor.name)}.{name}.png"
+        place = options.pictures / f"{floor.name}.{name}.png"
         write_picture(draw(image, camera), place, force=options.force)
 
 
@@ -254,8 +254,3 @@ def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> No
     place.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(place, cv2.imencode(".png", picture)[1].tobytes(), overwrite=force)
     print(f"written: {place}")
-
-
-def file_name(name: str) -> str:
-    """Of a picture, or a frame of a video."""
-    return name.replace(":", "-")

@@ -23,11 +23,9 @@ EXACT_PX = 1e-6
 
 # Number of rounds of Lawson's reweighting, which minimises the largest deviation.
 _LAWSON_ROUNDS = 25
-_STEPS = 60
-_LAWSON_STEPS = 5
+_STEPS, _LAWSON_STEPS = 60, 5
 # Cost of parameters that are impossible or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
-
 
 AnyCamera = Camera | ForeignCamera
 Rows = Literal["same", "halve", "double"]
@@ -36,8 +34,7 @@ Rows = Literal["same", "halve", "double"]
 _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 
 # Grids of pixels: for the fit, and for the largest deviation.
-_FIT_GRID = (41, 31)
-_CHECK_GRID = (129, 97)
+_FIT_GRID, _CHECK_GRID = (41, 31), (129, 97)
 # Largest deviation after least squares above which a fuller model is tried.
 _NEAR_PX = 0.02
 
@@ -47,8 +44,7 @@ class Converted:
     """A converted camera."""
 
     camera: AnyCamera
-    # Largest distance, over the image, between the pixels of a ray in the source and in the target
-    # (target's pixels).
+    # Largest distance of a ray's pixels in source and target, over the image (target's pixels)
     deviation_px: float
     at: tuple[float, float]  # the target's pixel where it is largest
 

@@ -80,8 +80,7 @@ def candidate_regions(
 ) -> tuple[list[Region], Counter[str]]:
     """Regions of an image that may be markers, and counts of rejected regions by reason.
 
-    In order of fine to coarse layers and high to low thresholds; the smallest specks are not
-    counted. The limits of a region's holes depend on the white area of the dictionary's markers.
+    From fine to coarse layers and high to low thresholds; limits of holes are the dictionary's.
     """
     layers = _layers(image, settings)
     white = float(dictionary.patterns.sum(axis=(1, 2)).mean()) * dictionary.cell**2

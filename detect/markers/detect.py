@@ -74,22 +74,18 @@ _LEAST_CORRELATION = 0.6
 _LEAST_LOG_ODDS = 15.0
 #: Least standard deviation of the whiteness of cells.
 _LEAST_CELL_SIGMA = 0.08
-#: Markers whose cells are blurred by more than this (in cells) are rejected. The first number of
-#: each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
-#: others (see `Templates.weakness`).
+#: Markers with a larger blur (in cells) are rejected: in dictionaries whose patterns hardly ever
+#: occur by chance, and in the others (see `Templates.weakness`).
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: The requirements on a fit increase from the first blur (in cells) to the second: many patterns
 #: fit blurred cells roughly, but only the right one fits them to within the noise.
 _STRICT_FROM, _STRICT_AT = 0.3, 0.6
-#: Largest misfit beyond the noise (in contrasts), and least mean agreement of the cells: for clear
-#: cells, and for blurred ones.
+#: Largest misfit beyond the noise (contrasts), least mean agreement: for clear, and blurred cells.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
 _BLURRED_MISFIT = (0.06, 0.03)
 _BLURRED_AGREEMENT = (0.92, 0.95)
 #: The same for patterns that also occur on other objects, and their largest error of a cell.
-_PLAIN_LARGEST_MISFIT = 0.04
-_PLAIN_LEAST_AGREEMENT = 0.95
-_PLAIN_LARGEST_CELL_ERROR = 0.25
+_PLAIN_MISFIT, _PLAIN_AGREEMENT, _PLAIN_CELL_ERROR = 0.04, 0.95, 0.25
 
 
 @dataclass(frozen=True)
@@ -338,9 +334,9 @@ def verified_quality(
     agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
     allowed = settings.largest_cell_error
     if templates.plain[template]:
-        misfit = min(misfit, _PLAIN_LARGEST_MISFIT)
-        agreement = max(agreement, _PLAIN_LEAST_AGREEMENT)
-        allowed = min(allowed, _PLAIN_LARGEST_CELL_ERROR)
+        misfit = min(misfit, _PLAIN_MISFIT)
+        agreement = max(agreement, _PLAIN_AGREEMENT)
+        allowed = min(allowed, _PLAIN_CELL_ERROR)
     if fit.explained < settings.least_explained or fit.misfit > misfit:
         return UNEXPLAINED
     error = np.abs(fit.cells - templates.cells[template])
@@ -378,8 +374,7 @@ def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, f
 def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[float, float]:
     """Log-odds of a template against the most likely other one and the most likely decoy.
 
-    Cells are treated as independent, with their stated precision, reduced for the mixing of
-    neighbouring cells by blur.
+    Cells count as independent, with their stated precision, less by the mixing due to blur.
     """
     mixing = 1.0 + 4.0 * float(np.exp(-0.25 / fit.blur_cells**2))
     sigma = np.hypot(mixing * fit.cell_sigma, _LEAST_CELL_SIGMA)

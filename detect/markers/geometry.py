@@ -64,8 +64,7 @@ class Picture:
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
     """An image (H, W) with its noise and the distortion of its lens.
 
-    Raises FrameError if the image is not an 8-bit grey image of the camera's size, or the
-    calibration has no direction for some of its pixels.
+    FrameError if it is not 8-bit grey, of the camera's size, or has pixels without a direction.
     """
     grey = plain_image(image, None if camera is None else (camera.height, camera.width))
     height, width = grey.shape
@@ -75,8 +74,7 @@ def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
 
 @functools.lru_cache(maxsize=4)
 def _straight_positions(camera: Camera | None, width: int, height: int) -> Float32Array:
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([u, v], axis=-1)
+    pixels = np.moveaxis(np.mgrid[:height, :width][::-1], 0, -1).astype(np.float64)
     straight = pixels if camera is None else _straightened(camera, pixels)
     if not np.all(np.isfinite(straight)):
         raise FrameError("the calibration has no direction for some pixels of the image")

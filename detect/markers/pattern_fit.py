@@ -38,8 +38,7 @@ _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
 #: If squared residuals in the margin are this many times those inside, the fit excludes it and
 #: this depth inside the marker: blurs, at most a share of a cell's size.
 _SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 2.0, 2.0, 0.5
-#: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
-#: one step, as a share of that.
+#: Largest motion of a corner from the edges' intersection (px or cells), and its share in a step.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 #: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
 #: and of the tone curve's curvature; the largest of the latter.
@@ -53,8 +52,7 @@ _OUTLIER = 3.0
 _LEAST_NOISE = 0.3
 #: Least number of pixels in excess of the number of parameters.
 _SPARE_PIXELS = 12
-#: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
-#: decide whether it may be that marker.
+#: Approximate largest number of pixels in a fit, and its steps: coarse, to decide, and whole.
 _FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
 
 
@@ -156,8 +154,7 @@ def _solved(
 ) -> tuple[FloatArray, Linearised, FloatArray] | None:
     """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
-    Weak priors: light changes little over a marker, the blur is nearly isotropic and close to its
-    initial estimate, the tone curve is nearly straight.
+    Weak priors: even light, a round blur close to its first estimate, a straight tone curve.
     """
     corners = start.corners
     blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)

@@ -29,8 +29,6 @@ from redetect.reporting.page import Part, figure_file, image_part
 
 #: Colours distinguishable in print and by the colour-blind; line styles differ as well.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
-
-
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _MOST_DOTS = 4000

@@ -49,8 +49,7 @@ _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file nam
 class ReportInputs:
     """A run's rows, and their comparison with the reference.
 
-    `names` are the prefixes of the frames in order, `rows` the rows of each. `sight` is None
-    without a calibration, comparisons are None without reference rows.
+    `names` are prefixes; `sight` is None without a calibration, comparisons without a reference.
     """
 
     run: ImageRun

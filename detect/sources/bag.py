@@ -139,8 +139,7 @@ def _cause(error: Exception) -> str:
 def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     """The pixels of a `sensor_msgs/Image`: grey values, or blue, green, red and perhaps opacity.
 
-    For Bayer patterns and YUV 4:2:2 they are the luminance. Raises FrameError for other encodings,
-    or if there is less data than the message states.
+    Luminance of Bayer and YUV 4:2:2. FrameError for other encodings, or if data are missing.
     """
     encoding, height, width = message.encoding, message.height, message.width
     bayer = _BAYER.fullmatch(encoding)
@@ -184,8 +183,7 @@ def content_of_message(message: Any, name: object) -> bytes | GreyImage:
 class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
-    The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; the topic as in
-    `SourceOptions`.
+    A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; the topic as in `SourceOptions`.
     """
 
     def __init__(self, path: Path, image_topic: str = "") -> None:

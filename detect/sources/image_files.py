@@ -38,8 +38,7 @@ def last_part(prefix: str) -> str:
 class ImageNames:
     """Names of a folder's image files that match a pattern, in natural order: numbers by value.
 
-    Hidden files are skipped unless the pattern begins with a dot: some systems store metadata in
-    files whose names are ``._`` followed by the image's name.
+    Hidden files (``._`` and a name: metadata) are skipped unless the pattern begins with a dot.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
@@ -66,8 +65,7 @@ class ImageNames:
     def image_of(self, prefix: str) -> Path | None:
         """A step's image, by the last part of its prefix; None if there is none.
 
-        A prefix that leads out of the run is a FrameError, so that a file of steps cannot cause
-        other files to be read.
+        FrameError if the prefix leads out of the run: steps cannot cause other files to be read.
         """
         name = prefix.strip('"')
         why = leads_out(name, *map(str, self._homes))
@@ -134,8 +132,7 @@ class RunFrames(Frames):
 class ImageFiles(Source):
     """Images in natural order of their names.
 
-    Calibration and times (by default ``<folder>.times``) are in the run's folder, and results are
-    written there: the folder of the images, or the one above ``images/``.
+    Calibration, times (``<folder>.times``) and results are in the folder of the run.
     """
 
     ships_images = False

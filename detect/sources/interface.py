@@ -155,15 +155,14 @@ def read_image(
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    An image with another width and height than `size` is not decoded. Raises FrameError, with
-    `name` for the image, if the content is not an image, or is truncated.
+    Only of the given `size`. FrameError, naming `name`, if it is no image, or truncated.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is truncated: its end is missing")
     claimed = claimed_size(content)
-    if claimed is not None and size is not None and size != claimed:
+    if claimed and size and size != claimed and claimed[0] * claimed[1] <= MOST_PIXELS:
         raise wrong_size(name, claimed, size)
     return gray_of_pixels(decoded_image(content, name, FrameError), name)
 

@@ -237,8 +237,7 @@ def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
 class FramesAlongPoses(Frames):
     """The frames of a source with known poses of the robot over time.
 
-    The pose of an image is interpolated between those before and after it. Images without a pose at
-    their time are not part of the run; the first one's step is zero.
+    Poses are interpolated. Images without one are not part of the run; the first step is zero.
     """
 
     def __init__(self, source: Source, stream: PoseStream) -> None:

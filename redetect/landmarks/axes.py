@@ -14,15 +14,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import FloatArray
 
 Axes = Literal["robotics", "dataset"]
 
 #: Meaning of the axes.
 MEANING: dict[str, str] = {"robotics": "X forward, Y left", "dataset": "X left, Y backward"}
 
-# Indices and signs of the old coordinates that become the new first, second and third; for the
-# conversion back, the signs of the first two differ.
+# Indices and signs of the old coordinates; for the conversion back, the first two signs differ.
 _ORDER = np.array([1, 0, 2])
 _SIGNS = np.array([-1.0, 1.0, 1.0])
 
@@ -32,8 +31,8 @@ def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = Fal
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
         return old
-    order, sign = _turn(old.shape[-1], back)
-    return np.asarray(old[..., order] * sign)
+    order = _ORDER[: old.shape[-1]]
+    return np.asarray(old[..., order] * (_SIGNS[order] if back else _SIGNS[: len(order)]))
 
 
 def to_dataset(values: ArrayLike) -> FloatArray:
@@ -48,10 +47,5 @@ def covariance_from_dataset(
     old = np.array(covariance, dtype=np.float64)
     if axes == "dataset":
         return old
-    order, sign = _turn(old.shape[-1], back)
+    order, sign = _ORDER[: old.shape[-1]], from_dataset(np.ones(old.shape[-1]), back=back)
     return np.asarray(old[..., order[:, None], order] * np.outer(sign, sign))
-
-
-def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
-    order = _ORDER[:size]
-    return order, (_SIGNS[order] if back else _SIGNS[:size])

@@ -272,8 +272,7 @@ def write_frames(
 ) -> None:
     """Write frames to a landmark file, whole or not at all, with a text as comments at its head.
 
-    Frames are written as they are iterated, so they need not all be in memory. If the file exists
-    and `overwrite` is false, raises `redetect.storage.OutputExistsError`.
+    They are written as they are iterated. OutputExistsError if it exists, unless `overwrite`.
     """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(format_head(head))

@@ -192,8 +192,7 @@ def read_plain_array(
 ) -> NDArray[Any]:
     """Read an array of a known type from a stream, to the array's end.
 
-    Arrays of more bytes than `largest_bytes` are rejected before memory is allocated. Raises a
-    ValueError that states on one line what was found instead.
+    Larger ones are rejected before memory is allocated, by a ValueError that says what it is.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
@@ -225,8 +224,7 @@ def read_plain_array(
 def claimed_size(content: bytes) -> tuple[int, int] | None:
     """Width and height (pixels) claimed by the header of an image file.
 
-    For a TIFF with enormous tiles that are larger than the image, those of a tile. None if this is
-    not a JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
+    Those of a TIFF's tiles, if larger and enormous. None for other kinds or a damaged header.
     """
     try:
         if content.startswith(b"\xff\xd8"):

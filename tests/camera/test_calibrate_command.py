@@ -308,7 +308,7 @@ def test_what_a_newcomer_gets_wrong(
     cv2.imwrite(str(tmp_path / "b.png"), empty[:200])
     assert "pictures before" in error("calibrate", str(tmp_path), *FLAGS, *output)
     (tmp_path / "b.png").write_bytes(b"no picture")
-    assert "not an image" in error("calibrate", str(tmp_path), *FLAGS, *output)
+    assert "expected an image" in error("calibrate", str(tmp_path), *FLAGS, *output)
     cam = tmp_path / "c.cam"
     write_camera(rays.camera, cam)
     assert "floor_yaw is nan" in error("floor", str(cam), "a.png", "--floor-yaw", "nan", *output)
