@@ -106,9 +106,8 @@ class NormalEquations:
             return step, np.zeros(0)
         eliminated = factored.solve(self.border)
         corner = self.corner + damping * np.diag(np.diag(self.corner))
-        shared = scaled_inverse(corner - self.border.T @ eliminated) @ (
-            -self.corner_gradient - self.border.T @ step
-        )
+        inverse = scaled_inverse(corner - self.border.T @ eliminated)
+        shared = inverse @ (-self.corner_gradient - self.border.T @ step)
         return step - eliminated @ shared, shared
 
 

@@ -52,9 +52,8 @@ class OdometryNoise(Bounded, error=SlamError):
 def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     """Motion model f: (..., 3) poses after odometry steps (..., 3); theta is not wrapped."""
     before, moved = np.broadcast_arrays(pose, step)
-    return np.concatenate(
-        [apply(before, moved[..., :2]), (before + moved)[..., 2:]], axis=-1, dtype=np.float64
-    )
+    xy, theta = apply(before, moved[..., :2]), (before + moved)[..., 2:]
+    return np.concatenate([xy, theta], axis=-1, dtype=np.float64)
 
 
 def with_heading(matrices: FloatArray) -> FloatArray:

@@ -22,9 +22,8 @@ def perform(options: Noise) -> int:
         options.run, circles=not options.lines, lines=options.lines, stem=options.stem
     )
     target = options.output or source.with_name(f"noisy{source.suffix}")
-    landmarks.write_rows(
-        target, noisy_rows(landmarks.read_rows(source), noise), overwrite=options.force
-    )
+    rows = noisy_rows(landmarks.read_rows(source), noise)
+    landmarks.write_rows(target, rows, overwrite=options.force)
     print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
     return 0
 

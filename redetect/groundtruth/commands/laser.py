@@ -48,9 +48,8 @@ def perform(options: Laser) -> int:
     for text in noise_warnings(read_scanners(calibration), scanners, calibration):
         warn(text)
     print_sweeps(scanners, sets, robot)
-    track, left_out = tracking.track_without_suspects(
-        sets, fixed, robot, scanners, options.settings
-    )
+    settings = options.settings
+    track, left_out = tracking.track_without_suspects(sets, fixed, robot, scanners, settings)
 
     average = options.average or tracking.usual_sets_per_pose(track)
     poses = tracking.combined_poses(track, average)
@@ -58,7 +57,7 @@ def perform(options: Laser) -> int:
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
-    content = {**provenance(options.settings, files), "sets_per_pose": average, **described}
+    content = {**provenance(settings, files), "sets_per_pose": average, **described}
     write_json(summary, content, overwrite=options.force)
 
     expected = int(np.sum(track.status != tracking.LOST))

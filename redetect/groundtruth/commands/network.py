@@ -43,9 +43,8 @@ def perform(command: NetworkCommand) -> int:
     for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
         chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
         if chosen:
-            table.append(
-                {"camera": name, "board": board, **outputs.residual_figures(adjusted, chosen)}
-            )
+            figures = outputs.residual_figures(adjusted, chosen)
+            table.append({"camera": name, "board": board, **figures})
     extra = {
         "made_by": outputs.provenance(command.settings),
         "reduced_cost": adjusted.reduced_cost,

@@ -101,9 +101,8 @@ def perform(options: Validate) -> int:
         content |= _scanners_on_board(references, segments)
         pictures["scans.png"] = draw_scans(errors, segments)
     folder.mkdir(parents=True, exist_ok=True)
-    write_planar_poses(
-        outputs["reference.csv"], scoring.stream_of(references), overwrite=options.force
-    )
+    stream = scoring.stream_of(references)
+    write_planar_poses(outputs["reference.csv"], stream, overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         write_bytes(outputs[name], data, overwrite=options.force)

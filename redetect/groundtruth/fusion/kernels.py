@@ -241,9 +241,7 @@ class Innovations(NamedTuple):
 def empty_history(nodes: int) -> FilterHistory:
     """A history to be filled; with zero nodes if none is needed."""
     states, spreads = (nodes, STATE), (nodes, STATE, STATE)
-    return FilterHistory(
-        np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
-    )
+    return FilterHistory(*map(np.empty, (states, spreads, states, spreads, spreads)))
 
 
 # Element by element, since an assignment of arrays takes seconds to compile.
@@ -394,9 +392,8 @@ def _smooth_in_place(
                 states[k, i] += gain[i, j] * (states[k + 1, j] - predicted[k + 1, j])
                 total = 0.0
                 for n in range(size):
-                    total += gain[i, n] * (
-                        covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
-                    )
+                    off = covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
+                    total += gain[i, n] * off
                 change[i, j] = total
         for i in range(size):
             for j in range(i + 1):

@@ -204,9 +204,8 @@ def _chained(
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):
-        pair = max(
-            (p for p in shares if (p[0] in placed) != (p[1] in placed)), key=lambda p: shares[p]
-        )
+        joining = (pair for pair in shares if (pair[0] in placed) != (pair[1] in placed))
+        pair = max(joining, key=shares.__getitem__)
         a, b = pair if pair[0] in placed else pair[::-1]
         a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
         poses[b] = compose(poses[a], a_from_b)

@@ -277,10 +277,9 @@ def read_scans(
         scans = Scans(times, ranges)
     except GroundTruthError as error:
         raise GroundTruthError(f"{path}: {error}") from None
-    if readings is not None and scans.ranges_mm.shape[1] != readings:
-        raise GroundTruthError(
-            f"{path}: {scans.ranges_mm.shape[1]} readings per scan: expected {readings}"
-        )
+    width = scans.ranges_mm.shape[1]
+    if readings not in (None, width):
+        raise GroundTruthError(f"{path}: {width} readings per scan: expected {readings}")
     back = np.flatnonzero(np.diff(scans.times_s) < 0.0)
     if ordered and back.size:
         i = int(back[0])

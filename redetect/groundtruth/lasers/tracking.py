@@ -379,9 +379,8 @@ def track_without_suspects(
         worst = int(np.argmax(excess))
         if len(scanners) - len(left_out) < 3 or excess[worst] <= 1.0:
             return track, left_out
-        left_out[scanners[worst].name] = np.stack(
-            [track.corrections[worst], track.correction_sigma[worst]]
-        )
+        suggested = (track.corrections[worst], track.correction_sigma[worst])
+        left_out[scanners[worst].name] = np.stack(suggested)
         rows = sets.rows.copy()
         rows[:, worst] = -1
         sets = replace(sets, rows=rows)

@@ -190,11 +190,10 @@ class MapProblem(NamedTuple):
         ]
         values = np.linalg.eigvalsh(np.array(of_readings) / np.outer(scale, scale))
         poses[:, 2] = wrap_angle(poses[:, 2])
-        rms, is_open = np.sqrt(squares / np.maximum(used, 1)), values < 1.0 / weak_sigma_m**2
-        covariance, of_mounts = found.covariance, np.array(by_mounts).T
-        return MapFit(
-            poses, covariance, found.map_sigma_m, used, rms, is_open.sum(axis=1), of_mounts
-        )
+        rms = np.sqrt(squares / np.maximum(used, 1))
+        is_open = np.sum(values < 1.0 / weak_sigma_m**2, axis=1)
+        covariance, by_mount = found.covariance, np.array(by_mounts).T
+        return MapFit(poses, covariance, found.map_sigma_m, used, rms, is_open, by_mount)
 
     def likely_pose(
         self, aligned: FloatArray, narrowing_m: Sequence[float]
@@ -264,10 +263,8 @@ class MapProblem(NamedTuple):
             near = squared < _GATE_SIGMA**2
             found.append([v[near] for v in (*rows, np.column_stack([normal, turn]))])
         columns = [np.concatenate(column) for column in zip(*found)]
-        if len(columns[0]) < _LEAST_READINGS:
-            raise GeometryError(
-                f"{len(columns[0])} readings lie on the map: expected {_LEAST_READINGS} or more"
-            )
+        if (used := len(columns[0])) < _LEAST_READINGS:
+            raise GeometryError(f"{used} readings on the map: expected {_LEAST_READINGS} or more")
         return _OnWalls(cost, *columns)
 
     def _solved(self, on: _OnWalls, poses: FloatArray, map_sigma_m: float | None) -> _Solution:

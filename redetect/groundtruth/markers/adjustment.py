@@ -233,9 +233,8 @@ def adjust_bundle(
         used = kept
         # A body without used points is not moved.
         free = bundle.free.copy()
-        free[bundle.shared :] &= np.isin(
-            np.arange(len(bundle.world_from_body)), bundle.seen.body[used]
-        )
+        bodies = np.arange(len(bundle.world_from_body))
+        free[bundle.shared :] &= np.isin(bodies, bundle.seen.body[used])
         bundle = replace(bundle, free=free)
         bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)
     return _result(bundle, used)
@@ -271,13 +270,11 @@ class _Adjustment(NamedTuple):
     loss: solver.Loss
 
     def cost(self, at: Bundle) -> float:
-        residuals = (
-            solver.whitening(at.seen.covariances) @ (at.seen.pixels - at.pixels())[..., None]
-        )
+        off = at.seen.pixels - at.pixels()
+        residuals = (solver.whitening(at.seen.covariances) @ off[..., None])[..., 0]
         priors = [solver.whitening(p.covariance) @ at.prior_error(p) for p in at.priors]
-        return solver.robust_cost(
-            [(residuals[..., 0], self.loss), *((prior[None], _PLAIN) for prior in priors)]
-        )
+        parts = [(residuals, self.loss), *((prior[None], _PLAIN) for prior in priors)]
+        return solver.robust_cost(parts)
 
     def linear(self, at: Bundle) -> solver.Linear:
         return linearised(at, self.loss)

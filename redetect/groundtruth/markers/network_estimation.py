@@ -202,9 +202,8 @@ def _bundle(
         free[second] = double.offset is None or bool(np.any(double.covariance))
         if free[second] and double.offset is not None:
             # Exactly known poses among uncertain ones get a prior of a micrometre.
-            priors = (
-                adjustment.PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),
-            )
+            covariance = double.covariance + 1e-12 * np.eye(6)
+            priors = (adjustment.PosePrior(second, double.offset, covariance),)
     bundle = adjustment.Bundle(
         tuple(setup.cameras[name] for name in names),
         len(order),

@@ -118,7 +118,7 @@ def chained_poses(
     for number in order[1:].tolist():
         parent = int(parents[number])
         known = relative.get((parent, number))
-        poses[number] = poses[parent] @ (
-            se3.inverse(relative[number, parent]) if known is None else known
-        )
+        if known is None:
+            known = se3.inverse(relative[number, parent])
+        poses[number] = poses[parent] @ known
     return poses

@@ -145,15 +145,11 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
         "iterative": cv2.SOLVEPNP_ITERATIVE,
         "ippe": cv2.SOLVEPNP_IPPE_SQUARE,
     }
-    contiguous = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
+    both = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
     try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            *contiguous, np.eye(3), None, flags=flags[solver]
-        )
-        poses = [
-            se3.transform(cv2.Rodrigues(rotation)[0], translation.ravel())
-            for rotation, translation in zip(rotations, translations)
-        ]
+        found = cv2.solvePnPGeneric(*both, np.eye(3), None, flags=flags[solver])
+        turns_and_shifts = zip(*found[1:3])
+        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in turns_and_shifts]
     except cv2.error as error:
         raise GeometryError(f"{solver} found no pose: {error.err}") from None
     return [pose for pose in poses if np.all(np.isfinite(pose))]
@@ -303,9 +299,8 @@ def _consensus(problem: refinement.PoseProblem) -> tuple[BoolArray, refinement.R
     found: dict[bytes, tuple[BoolArray, refinement.RefinedPose]] = {}
     # A larger marker is the better hypothesis.
     extents = [problem.extent_px(view) for view in range(count)]
-    hypotheses = (
-        (view, start) for view in np.argsort(extents)[::-1] for start in view_poses(problem, view)
-    )
+    order = np.argsort(extents)[::-1]
+    hypotheses = ((view, start) for view in order for start in view_poses(problem, view))
     for view, start in hypotheses:
         explained = _explained(problem, np.arange(count) == view, start)
         if explained is None:

@@ -278,9 +278,8 @@ def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> Cha
                 f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
                 "is not positive definite: expected one, or a corner floor above 0"
             )
-    return ChainPoints(
-        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
-    )
+    body = np.zeros(len(cameras), np.int64)
+    return ChainPoints(cameras, body, parts, points, pixels, covariances)
 
 
 def pose_problem(

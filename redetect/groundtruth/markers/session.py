@@ -129,11 +129,9 @@ def write_network(
     overwrite: bool = False,
 ) -> None:
     """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
+    rows = zip(network.names, network.calibrations, network.world_from_camera)
     entries = {
-        name: {"calibration": calibration, **pose_entries(pose)}
-        for name, calibration, pose in zip(
-            network.names, network.calibrations, network.world_from_camera
-        )
+        name: {"calibration": calibration, **pose_entries(pose)} for name, calibration, pose in rows
     }
     content = {**_with_covariance("cameras", entries, network.covariance), **(extra or {})}
     write_json(path, content, overwrite=overwrite)
@@ -182,11 +180,9 @@ def _joint_covariance(
     if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
         raise content.wrong("covariance", f"an object with {key} and matrix")
     order, names = [str(name) for name in joint[key]], list(entries)
-    if sorted(order) != sorted(names):
-        raise GroundTruthError(
-            f"{content.place}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
-        )
     place = f"{content.place}: covariance"
+    if sorted(order) != sorted(names):
+        raise GroundTruthError(f"{place}: {key} are {excerpt(order)}: expected {excerpt(names)}")
     matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])

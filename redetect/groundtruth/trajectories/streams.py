@@ -48,10 +48,9 @@ class PlanarPoses:
                 f"poses of shapes {self.times_s.shape} and {self.poses.shape}: "
                 "expected (N,) times and (N, 3) poses"
             )
-        if self.covariances is not None and self.covariances.shape != (count, 3, 3):
-            raise GroundTruthError(
-                f"covariances of shape {self.covariances.shape}: expected ({count}, 3, 3)"
-            )
+        shape = (count, 3, 3) if self.covariances is None else self.covariances.shape
+        if shape != (count, 3, 3):
+            raise GroundTruthError(f"covariances of shape {shape}: expected ({count}, 3, 3)")
         for name, values in (
             ("times", self.times_s),
             ("poses", self.poses),

@@ -170,9 +170,8 @@ def score_relations(
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
     known = known_before & known_after
-    return relative_score(
-        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
-    )
+    mine = between(before[known], after[known])
+    return relative_score(relations.from_to[known], mine, int((~known).sum()))
 
 
 def score_steps(

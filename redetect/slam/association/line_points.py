@@ -249,9 +249,8 @@ def lines_by_points(
     def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
         """Least squares over poses, discs and points, repeated without outliers."""
         count = len(points)
-        used = (labels >= 0) & (
-            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= _PATH_ROWS
-        )
+        rows = np.bincount(labels + 1, minlength=count + 1)[labels + 1]
+        used = (labels >= 0) & (rows >= _PATH_ROWS)
         for _ in range(3):
             solution = solve_path(
                 *(scaled, circle_labels, np.where(used, labels, count), path),

@@ -282,9 +282,8 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
         apart = (gap >= search.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
         if search.attached_frames and np.any(~apart & (gap >= search.attached_frames)):
             continue
-        near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (
-            search.most_shift_m + extents[:k] + extents[k]
-        )
+        reach = search.most_shift_m + extents[:k] + extents[k]
+        near = np.linalg.norm(centres[:k] - centres[k], axis=1) < reach
         near[np.arange(k) % search.earlier_step != 0] = False
         for i in np.flatnonzero(near & apart):
             fixed, moved = stretches[i].without(later), later.without(stretches[i])

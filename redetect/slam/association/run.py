@@ -259,9 +259,8 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
             run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
             some = (frames, at.labels, at.xy, len(recording))
-            found = loops.find_matches(
-                loops.stretches_of(*some, length=length, most=loops.MOST_COMPARED), search
-            )
+            compared = loops.stretches_of(*some, length=length, most=loops.MOST_COMPARED)
+            found = loops.find_matches(compared, search)
             found = consistent_matches(found, matches, at.path, recording.step_covariance)
             at, found = _with_matches(run, at, found)
             stretches = loops.stretches_of(frames, at.labels, at.xy, len(recording), length=length)

@@ -116,9 +116,8 @@ class EkfSlam(frames.Filter):
         of_lines = of_lines[placed]
         points, by_numbers = self.line_points(of_lines)
         line_xy = points[:, :2] / points[:, 2:]
-        by_points = np.concatenate(
-            [np.tile(np.eye(2), (len(points), 1, 1)), -line_xy[..., None]], 2
-        )
+        by_xy = np.tile(np.eye(2), (len(points), 1, 1))
+        by_points = np.concatenate([by_xy, -line_xy[..., None]], axis=2)
         by_lines = by_points @ by_numbers / points[:, 2, None, None]
         jacobian = block_diag(np.eye(of_discs.size), *by_lines)
         joint = jacobian @ self.block(np.append(of_discs.ravel(), of_lines.ravel())) @ jacobian.T

@@ -132,9 +132,8 @@ def _fit(
     weighting: Weighting,
 ) -> _Fit:
     """The map with these identifiers; discs start at the median of their rows' positions."""
-    graph = graph_of_recording(
-        replace(recording, circles=replace(recording.circles, ids=ids)), camera
-    )
+    circles = replace(recording.circles, ids=ids)
+    graph = graph_of_recording(replace(recording, circles=circles), camera)
     places = apply(start.poses[graph.disc_pose], graph.disc_xy)
     order = np.argsort(graph.disc_index, kind="stable")
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])

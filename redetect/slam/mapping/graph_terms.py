@@ -117,9 +117,8 @@ def linearise(
     loss = Loss(weighting.loss, weighting.loss_scale)
     by_first, by_second = models.between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     step = 3 * np.arange(len(graph.steps), dtype=np.int64)
-    by_pose, by_disc, by_mounting = (
-        graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
-    )
+    _, *derivatives = _disc_rows(graph, estimate, weighting)
+    by_pose, by_disc, by_mounting = (graph.disc_whitening @ by for by in derivatives)
     unknown = weighting.unknown_mounting
     by_shared = by_mounting[:, :, unknown] if unknown else None
     if by_tilt:
@@ -178,9 +177,8 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
     if len(graph.line_pose) == 0:
         return np.zeros(0)
     pose, share = _members(graph)
-    bearing = models.bearing_of_vertical(
-        estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
-    )
+    line_xy = estimate.line_xy[graph.member_line]
+    bearing = models.bearing_of_vertical(estimate.poses[pose], line_xy, graph.camera_xy)
     off = wrap_angle(bearing - graph.bearing_rad[graph.member_row])
     mean = np.bincount(graph.member_row, share * off, minlength=len(graph.line_pose))
     return np.asarray(mean / graph.bearing_sigma_rad)

@@ -64,9 +64,8 @@ def chi_squared(
 ) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
-    odometry, discs, lines = (
-        float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)
-    )
+    parts = (error.odometry, error.discs, error.lines)
+    odometry, discs, lines = (float(np.sum(part**2)) for part in parts)
     total = odometry + discs + lines
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
@@ -389,9 +388,7 @@ def _check_usable(
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
     if weighting.calibrate and camera is not None:
         if len(recording.lines):
-            raise SlamError(
-                f"{name}: bearings do not determine the camera's mounting: expected discs alone"
-            )
+            raise SlamError(f"{name}: bearings do not determine the mounting: expected discs alone")
         check_rows_fit_camera(camera, recording.circles.xy)
 
 
