@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
+from math import inf
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -19,7 +20,14 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import MapProblem, StillScan, still_scan
+from redetect.groundtruth.lasers.walls import (
+    BULGE_M,
+    MapProblem,
+    StillScan,
+    WallCurves,
+    still_scan,
+    wall_curves,
+)
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 
@@ -40,6 +48,8 @@ _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 _MUCH_WORSE = 0.1
 # Walls farther than this from what scanners see, by their measured poses, are ignored (m).
 _AROUND_M = 5.0
+# Neighbouring walls may be chords of a curve that leaves them by less than this (m).
+_MOST_BULGE_M = 0.1
 # A scanner's start on the map is found with standard deviations down to this (m).
 _COARSE_M = 0.02
 # Standard deviations of measured poses (m, rad): without a covariance, and the least.
@@ -119,20 +129,20 @@ def align_scanners(
             break
     steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole = _whole_to_map(stills, steps["together"], measured, building, narrowing)
+    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
     starts, others = [], []
     for one, still, pose, prior in zip(scanners, stills, whole, priors):
         coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
         try:
-            lone = MapProblem([still], one.pose[None], prior, building)
+            lone = MapProblem([still], one.pose[None], prior, building, curves)
             start, other = lone.likely_pose(pose, coarse)
         except GeometryError as error:
             raise GeometryError(f"scanner {one.name}: {error}") from None
         starts.append(start)
         others.append(other)
-    problem = MapProblem(stills, measured, block_diag(*priors), building)
+    problem = MapProblem(stills, measured, block_diag(*priors), building, curves)
     fit = problem.fit(np.stack(starts), narrowing, _WEAK_M)
     steps["each to the map"] = fit.poses
     covariance = fit.covariance + block_diag(*others)
@@ -244,17 +254,26 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
 def _whole_to_map(
     stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
     narrowing_m: list[float],
-) -> FloatArray:  # fmt: skip
-    """Align all scanners, as one rigid body, with the map, from their measured poses."""
+) -> tuple[FloatArray, WallCurves]:  # fmt: skip
+    """Align all scanners, as one rigid body, with the map, from their measured poses.
+
+    Also says which walls are chords of curves: whether coarse ones are, the readings decide.
+    """
     if len(poses) > 1:
         body = fitted(poses[:, :2], measured[:, :2])
     else:
         body = compose(measured[0], invert(poses[0]))
     prior = np.eye(3) / _UNKNOWN_SIGMA**2
-    problem = MapProblem(stills, body[None], prior, building, mounts=poses)
-    with suppress(GeometryError):  # then each scanner's start is searched around its measured pose
-        body = problem.fit(body[None], narrowing_m, _WEAK_M).poses[0]
-    return compose(np.broadcast_to(body, poses.shape), poses)
+    start, least = body[None], inf
+    fine, coarse = (wall_curves(building, bulge_m) for bulge_m in (BULGE_M, _MOST_BULGE_M))
+    curves = fine
+    for tried in (fine, coarse):
+        problem = MapProblem(stills, start, prior, building, tried, poses)
+        with suppress(GeometryError):  # then each scanner is searched around its measured pose
+            found, _, cost = problem.narrowed(start, narrowing_m)
+            if cost < least:
+                body, curves, least = found[0], tried, cost
+    return compose(np.broadcast_to(body, poses.shape), poses), curves
 
 
 def icp_by_step(
