@@ -11,12 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, picture_name, png_of
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
+from detect.sources.image_files import demand_pictures, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
@@ -44,7 +45,7 @@ def perform(options: Draw) -> int:
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
     if options.output is not None:
-        options.output.mkdir(parents=True, exist_ok=True)
+        demand_pictures(run.frames, options.output, overwrite=options.force)
     force, path = options.force, options.video
     with nullcontext() if path is None else mp4(path, options.fps, overwrite=force) as video:
         drawn, failures = draw_run(run, rows, options.output, video=video, overwrite=force)

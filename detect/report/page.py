@@ -12,7 +12,7 @@ import numpy as np
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
-from detect.drawing.frame import draw_rows, picture_name, processed
+from detect.drawing.frame import draw_rows, processed
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import Report, RowFiles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.cli import main
-from detect.drawing.frame import draw_rows, line_curves, sigma_bars
+from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bars
 from detect.row_files import SeenRows, read_head
 from detect.seen import Sight
 from detect.settings import CircleSettings
@@ -217,6 +218,33 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert video.read_bytes() == b"mine"
     (small_run / "s.cam").unlink()
     assert_refused(["draw", run, "-o", out], small_run, "--camera", capsys)
+
+
+def test_no_picture_is_written_if_one_exists(
+    small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    drawn = tmp_path / "d"
+    drawn.mkdir()
+    (drawn / "s.0002.png").write_bytes(b"mine")
+    circles = ["circles", str(small_run), "--draw", str(drawn)]
+    assert_refused(circles, small_run, "s.0002.png: exists already", capsys)
+    assert main(circles[:2]) == 0
+    capsys.readouterr()
+    assert_refused(["draw", str(small_run), "-o", str(drawn)], small_run, "s.0002.png", capsys)
+    assert [path.name for path in drawn.iterdir()] == ["s.0002.png"]
+
+
+def test_labels_of_verticals_do_not_cover_each_other(published_camera: Camera) -> None:
+    image = np.full((288, 768), 90, np.uint8)
+    rows = [replace(vertical(published_camera, 0.02 * k, 0.01), ids=(k,)) for k in range(4)]
+
+    def orange(*rows: LineLandmark) -> int:
+        frame = Frame(STEP, rows)
+        seen = SeenRows(lines=frame, reference_lines=frame)
+        picture = draw_rows(image, Sight(published_camera), seen, SETTINGS).astype(int)
+        return int(np.sum((picture == SIGMA_COLOUR).all(axis=2)))
+
+    assert orange(*rows) >= 0.97 * sum(orange(row) for row in rows)
 
 
 def test_an_image_that_cannot_be_read_costs_its_frame(
