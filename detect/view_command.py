@@ -79,7 +79,10 @@ def perform(options: View) -> int:
                     coloured = np.ascontiguousarray(picture[:, :, ::-1])
                     recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()
-        recording.flush()
+        try:
+            recording.flush()
+        except RuntimeError as error:
+            raise DetectError(f"{options.output or 'the viewer'}: {error}") from None
         recording.disconnect()
         if options.output is not None:
             write_bytes(options.output, raw.read_bytes(), overwrite=options.force)

@@ -183,16 +183,19 @@ def _draw_label(
     extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
     wide, high = np.array(extent) + 2.0 * times
 
-    def free(corner: FloatArray) -> bool:
-        return not any(np.all((corner < b) & (a < corner + [wide, high])) for a, b in taken)
+    def box(u: float, v: float) -> FloatArray:
+        return np.array([[u, v], [u + wide, v + high]])
 
-    corners = [place - [share * wide, 0.5 * high] for place, share in places]
-    good = (c for c in corners if c[0] + wide <= canvas.shape[1] and free(c))
-    corner = next(good, corners[-1])
-    while not free(corner):
-        corner = corner + [0.0, high]
-    taken.append(np.stack([corner, corner + [wide, high]]))
-    draw_text(canvas, text, corner + [0.0, high - times], colour, size)
+    def free(one: FloatArray) -> bool:
+        return not any(np.all((one[0] < other[1]) & (other[0] < one[1])) for other in taken)
+
+    boxes = [box(u - share * wide, v - 0.5 * high) for (u, v), share in places]
+    good = (one for one in boxes if one[1, 0] <= canvas.shape[1] and free(one))
+    chosen = next(good, boxes[-1])
+    while not free(chosen):
+        chosen[:, 1] += high
+    taken.append(chosen)
+    draw_text(canvas, text, (chosen[0, 0], chosen[1, 1] - times), colour, size)
 
 
 def _draw_lines(

@@ -19,7 +19,7 @@ from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight, summed_steps
-from detect.sources.image_files import image_name
+from detect.sources.image_files import image_name, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect import __version__

@@ -187,6 +187,23 @@ def test_video_has_a_picture_per_frame(small_run: Path, tmp_path: Path) -> None:
     assert not reader.read()[0]
 
 
+def test_a_video_that_could_not_be_written_is_none(
+    small_run: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class FullDisk(cv2.VideoWriter):
+        """OpenCV's writer drops frames silently."""
+
+        def write(self, image: object) -> None:
+            pass
+
+    assert main(["circles", str(small_run)]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr(cv2, "VideoWriter", FullDisk)
+    draw = ["draw", str(small_run), "--video", str(tmp_path / "v.mp4")]
+    assert_refused(draw, small_run, "No space left on device", capsys)
+    assert not list(tmp_path.glob("*.mp4"))
+
+
 def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path) -> None:
     (small_run / "s.cam").unlink()
     corners = "100 50 1 0 1 160 50 1 0 1 160 110 1 0 1 100 110 1 0 1"
