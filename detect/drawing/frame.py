@@ -52,6 +52,8 @@ _SUBPIXEL_BITS = 4
 _FARTHEST_PX = 1e6
 # Text and strokes are enlarged in proportion to pictures of this width.
 _COLUMNS = 750
+# A label is moved down by at most this many of its heights.
+_LABELS_DOWN = 2
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
@@ -174,10 +176,11 @@ def _draw_label(
     canvas: ByteArray, text: str, places: Sequence[tuple[FloatArray, float]], colour: Colour,
     size: float, taken: list[FloatArray],
 ) -> None:  # fmt: skip
-    """Draw a label at the first place where it is on no other, or else moved down from the last.
+    """Draw a label at the first place where it is on no other, or a little below the last one.
 
-    A place is a point at half the label's height, and the share of its width to the left of it.
-    `taken` are the corners of the labels drawn before; those of this one are added.
+    A place is a point at half the label's height, and the share of its width to the left of it. If
+    none is free, the label is left out: further away, it would seem to be another one's. `taken`
+    are the corners of the labels drawn before; those of this one are added.
     """
     times = enlargement(canvas)
     extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
@@ -190,12 +193,12 @@ def _draw_label(
         return not any(np.all((one[0] < other[1]) & (other[0] < one[1])) for other in taken)
 
     boxes = [box(u - share * wide, v - 0.5 * high) for (u, v), share in places]
-    good = (one for one in boxes if one[1, 0] <= canvas.shape[1] and free(one))
-    chosen = next(good, boxes[-1])
-    while not free(chosen):
-        chosen[:, 1] += high
-    taken.append(chosen)
-    draw_text(canvas, text, (chosen[0, 0], chosen[1, 1] - times), colour, size)
+    boxes += [boxes[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
+    for chosen in boxes:
+        if 0.0 <= chosen[0, 0] <= chosen[1, 0] <= canvas.shape[1] and free(chosen):
+            taken.append(chosen)
+            draw_text(canvas, text, (chosen[0, 0], chosen[1, 1] - times), colour, size)
+            return
 
 
 def _draw_lines(
@@ -220,7 +223,8 @@ def _draw_lines(
             draw_curve(canvas, points, SIGMA_COLOUR)
         if text:
             below = curve[-1] + 2.5 * tick[1]
-            _draw_label(canvas, text, [(below, 0.5)], SIGMA_COLOUR, 0.3, taken)
+            places = [(below, 0.5), (below, 1.0), (below, 0.0)]
+            _draw_label(canvas, text, places, SIGMA_COLOUR, 0.3, taken)
 
 
 def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
