@@ -44,8 +44,9 @@ def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
 
 
 def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
-    """(N + 1, 3) poses from odometry alone: the start (3,), and the pose after each of the steps
-    (N, 3); theta is not wrapped.
+    """Poses from odometry alone: the start, and the pose after each step.
+
+    Takes `steps` (N, 3), `start` (3,); returns (N + 1, 3), theta not wrapped.
     """
     step = np.asarray(steps, dtype=np.float64).reshape(-1, 3)
     first = np.asarray(start, dtype=np.float64)
@@ -56,7 +57,10 @@ def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatAr
 
 
 def log_motion(a_from_b: ArrayLike) -> FloatArray:
-    """(..., 3) rates vx, vy, turn of the moving frame: the arc from a to b in unit time."""
+    """(..., 3) constant rates vx, vy, turn that lead from a to b within one unit of time.
+
+    They are rates of the moving frame, so that the path is an arc.
+    """
     pose = np.asarray(a_from_b, dtype=np.float64)
     half = 0.5 * wrap_angle(pose[..., 2])
     small = np.abs(half) < 1e-3

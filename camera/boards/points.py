@@ -113,9 +113,10 @@ def _reductions(image: GreyImage) -> Iterator[GreyImage]:
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
-    """Refine saddle points, each in its own small window without other features.
+    """Refine saddle points, each in a window without other features.
 
-    A larger window is affected by distortion and attracted by the next corner. NaN remain NaN.
+    Each corner has its own small window: a larger one is affected by distortion of the edges, and
+    attracted by the next corner if it contains that. NaN corners remain NaN.
     """
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
@@ -145,8 +146,9 @@ def _spacing(grid: NDArray[np.float32]) -> FloatArray:
 def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
     """Bring a (rows, columns, 2) grid of corners into the board's own order.
 
-    Seen from the print, right x down points into the image, and the square right below the first
-    corner is black; a board that looks the same turned begins in the image's upper left.
+    The board is seen from its printed side, so right x down points into the image; and the square
+    right below the first corner is black, as the one beyond it is. A board that looks the same
+    turned begins in the image's upper left.
     """
     grid = _from_the_front(grid)
     centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])

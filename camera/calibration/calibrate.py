@@ -44,7 +44,10 @@ _ASPECT_SIGMA = 0.003
 
 
 def largest_rms_px(width: int) -> float:
-    """Largest RMS residual of a good fit; it is larger for large images, which are softer."""
+    """Largest RMS residual of a good fit: points are accurate to some tenths of a pixel.
+
+    It is larger for large images, which are softer.
+    """
     return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
@@ -218,7 +221,10 @@ def aspect_of(calibration: Calibration) -> Aspect:
 def calibrate_freely(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
-    """As `calibrate`, with free scales if the views determine their ratio; else with a warning."""
+    """As `calibrate`, with scales independent of each other if the views determine their ratio.
+
+    Otherwise it is that of the settings, with a warning.
+    """
     try:
         free = calibrate(views, board, size, replace(settings, aspect=None))
     except CalibrationError:

@@ -132,7 +132,10 @@ def _fitted(
 
 
 def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:
-    """(V,) RMS residual of the best share of each view's points; infinite where one is NaN."""
+    """(V,) root of the mean squared distance of each view's points, the nearest share of them.
+
+    Infinite where one of these is NaN.
+    """
     squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
     ordered = squares[np.lexsort((squares, points.views))]
     of_views = np.split(ordered, np.cumsum(points.counts)[:-1])

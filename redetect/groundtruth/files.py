@@ -172,7 +172,10 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
 def write_json(
     path: str | os.PathLike[str], content: Mapping[str, Any], *, overwrite: bool = False
 ) -> None:
-    """Write a JSON object, a line per entry of its objects, whole or not at all; NaN is null."""
+    """Write a JSON object with a line per entry of its objects, whole or not at all.
+
+    Numbers that are not finite, which JSON does not have, are null.
+    """
     write_bytes(path, (_laid_out(content) + "\n").encode(), overwrite=overwrite)
 
 
@@ -193,7 +196,8 @@ def _laid_out(value: Any, indent: str = "") -> str:
 def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
     """The text of a file (UTF-8, perhaps with a byte order mark), packed (``.gz``) or not.
 
-    Larger files than `largest_bytes` are rejected; `expected` is what the text should contain.
+    `largest_bytes`: larger files are rejected. `expected`: the expected content, for the message
+    about a file that is not text.
     """
     content = read_content(path, largest_bytes, "file", GroundTruthError)
     try:

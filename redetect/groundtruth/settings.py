@@ -1,4 +1,7 @@
-"""Settings of all estimations, for the command line and library callers; nothing heavy imported."""
+"""Settings of all estimations, for the command line and library callers.
+
+Imports nothing heavy, so that `--help` is quick.
+"""
 
 from __future__ import annotations
 

@@ -106,7 +106,10 @@ def inverse_blocks(
 
 @kernel()
 def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
-    """Pattern of the Cholesky factor of a symmetric matrix, below the diagonal, by columns."""
+    """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns.
+
+    Within a column, rows are in any order.
+    """
     n = len(indptr) - 1
     first_child = np.full(n, -1, dtype=np.int64)
     next_child = np.full(n, -1, dtype=np.int64)

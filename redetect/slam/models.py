@@ -50,7 +50,10 @@ class OdometryNoise(Bounded, error=SlamError):
 
 
 def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
-    """Motion model f: (..., 3) poses after odometry steps (..., 3); theta is not wrapped."""
+    """Motion model f: the pose after an odometry step; theta is not wrapped.
+
+    Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
+    """
     before, moved = np.broadcast_arrays(pose, step)
     xy, theta = apply(before, moved[..., :2]), (before + moved)[..., 2:]
     return np.concatenate([xy, theta], axis=-1, dtype=np.float64)
@@ -65,7 +68,10 @@ def with_heading(matrices: FloatArray) -> FloatArray:
 
 
 def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (..., 3, 3) of `move` by the pose (J1) and by the step (J2), (..., 3) both."""
+    """Jacobians of `move` by the pose (J1) and by the step (J2).
+
+    Takes `pose, step` (..., 3); returns `by_pose, by_step` (..., 3, 3).
+    """
     before, moved = np.broadcast_arrays(pose, step)
     turn = rotation(before[..., 2])
     way = np.einsum("...ij,...j->...i", turn, moved[..., :2])
@@ -75,7 +81,10 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
 
 
 def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians (..., 3, 3) of `between` by the first (J3) and the second pose (J4), (..., 3)."""
+    """Jacobians of `between` by the first (J3) and by the second pose (J4).
+
+    Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
+    """
     before, _ = np.broadcast_arrays(first, second)
     step = between(first, second)
     by_second = with_heading(np.swapaxes(rotation(before[..., 2]), -1, -2))
@@ -85,8 +94,10 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
 
 
 def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
-    """Measurement model: (..., 2) discs' centres in the robot frame, by poses (..., 3) and centres
-    (..., 2) in the map.
+    """Measurement model of a disc: its centre in the robot frame.
+
+    Takes `pose` (..., 3) of the robot in the map, `disc_xy` (..., 2), the centre in the map;
+    returns (..., 2).
     """
     robot = np.asarray(pose, dtype=np.float64)
     offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
@@ -96,7 +107,10 @@ def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
 
 
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `disc_in_robot` by pose (J5) (..., 2, 3) and disc's centre (J6) (..., 2, 2)."""
+    """Jacobians of `disc_in_robot` by the pose (J5) and by the disc's centre (J6).
+
+    Returns `by_pose` (..., 2, 3), `by_disc` (..., 2, 2).
+    """
     seen = disc_in_robot(pose, disc_xy)
     turn = np.swapaxes(rotation(np.asarray(pose)[..., 2]), -1, -2)
     by_disc = np.array(np.broadcast_to(turn, (*seen.shape, 2)))
@@ -105,7 +119,10 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 
 
 def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
-    """(n, 2, 2) derivatives of apparent floor positions (n, 2) by a small tilt of the robot."""
+    """Derivative of apparent floor positions by a small tilt of the robot.
+
+    Takes `disc_xy` (n, 2); returns (n, 2, 2).
+    """
     x, y = disc_xy.T
     rows = (x * y / height_m, -height_m - x**2 / height_m)
     others = (height_m + y**2 / height_m, -x * y / height_m)
@@ -113,8 +130,10 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> Flo
 
 
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
-    """Measurement model: (...) bearings in [-pi, pi] of vertical lines (..., 2) in the map, for
-    poses (..., 3), seen from the camera's centre in the robot frame (2,).
+    """Measurement model of a vertical line: the bearing under which the camera sees it.
+
+    Takes `pose` (..., 3), `line_xy` (..., 2), both in the map, and `camera_xy` (2,), the camera's
+    centre in the robot frame; returns (...) in [-pi, pi].
     """
     seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
     return np.asarray(np.arctan2(seen[..., 0], -seen[..., 1]))
@@ -123,7 +142,10 @@ def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLik
 def bearing_jacobians(
     pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `bearing_of_vertical` by pose (..., 3) and line's position (..., 2)."""
+    """Jacobians of `bearing_of_vertical` by the pose and by the line's position (chain rule).
+
+    Returns `by_pose` (..., 3), `by_line` (..., 2).
+    """
     seen = disc_in_robot(pose, line_xy) - np.asarray(camera_xy, dtype=np.float64)
     squared = np.sum(seen**2, axis=-1)
     # d atan2(x, -y) = (-y dx + x dy) / (x^2 + y^2)

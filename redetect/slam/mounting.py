@@ -79,7 +79,10 @@ def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
 
 
 def mounted_camera(camera: Camera, mounting: FloatArray, covariance: FloatArray) -> Camera:
-    """The camera with a mounting (3, 4), and its covariance (6, 6) if the camera has one."""
+    """The camera as mounted, with the mounting's covariance if the camera has a covariance.
+
+    Takes `mounting` (3, 4), and the `covariance` (6, 6) of its change.
+    """
     mounted = with_pose(camera, mounting)
     stated = covariance_of(camera)
     if stated is None:

@@ -1,6 +1,7 @@
 """Pictures of maps and of errors along a path, as PNG files or in windows.
 
-Maps have X to the right and Y up. The same input gives the same bytes, whatever a user's settings.
+Maps are drawn in their own axes, X to the right and Y up, with equal scales. The same input gives
+the same bytes; a user's own matplotlib settings have no effect.
 """
 
 from __future__ import annotations
@@ -66,8 +67,10 @@ def picture(size: tuple[float, float], *, interactive: bool) -> Iterator[tuple[F
 
 
 def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Errors (N, 3) of a path with covariances against a `reference` (N, 3), their deviations
-    (N, 3), and normalised squares (N,), NaN where a pose is exact.
+    """Errors of a path's poses, their standard deviations, and the normalised error squared.
+
+    Takes a path with covariances and `reference` (N, 3); returns `error` (N, 3), `sigma` (N, 3),
+    `nees` (N,), NaN where a pose is given exactly.
     """
     assert path.covariance is not None
     error = path.poses - reference
@@ -138,8 +141,9 @@ def draw_map(
 def draw_errors(
     path: Path2D, reference: FloatArray, *, title: str = "", interactive: bool = False
 ) -> bytes:
-    """Draw errors of a path with covariances against a `reference` (N, 3) over the steps, and their
-    normalised square; returns a PNG's bytes.
+    """Draw position and heading error over the steps, and the normalised error squared.
+
+    Takes a path with covariances and `reference` (N, 3); returns a PNG's bytes.
     """
     error, sigma, nees = pose_errors(path, reference)
     step = np.arange(len(error))

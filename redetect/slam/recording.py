@@ -151,8 +151,9 @@ def first_poses(runs: Sequence[Recording]) -> IntArray:
 
 
 def joined(runs: Sequence[Recording]) -> Recording:
-    """Runs as one: a lost step leads from the end of each to the start of the next, a frame without
-    rows called `start`.
+    """Runs as one: a lost step leads from the end of each to the start of the next.
+
+    The frame after that step has no rows; it is called `start`.
     """
     if len(runs) == 1:
         return runs[0]
@@ -180,7 +181,10 @@ def joined(runs: Sequence[Recording]) -> Recording:
 def landmark_files(
     run: Path, *, circles: bool = True, lines: bool = False, stem: str | None = None
 ) -> list[Path]:
-    """The landmark files of a run folder, named `stem` (map, else detected); of a file, itself."""
+    """The landmark files of a run folder, of the requested kinds; for a file, itself.
+
+    Their name is `stem`, by default map, or else detected.
+    """
     if not run.is_dir():
         _demand_landmarks(run)
         return [run]

@@ -153,7 +153,11 @@ def _extended(
 
 
 def read_clock(path: str | os.PathLike[str]) -> ClockModel:
-    """Read a clock file of `groundtruth sync`; raises `GroundTruthError` if it is malformed."""
+    """Read a clock file that `groundtruth sync` wrote.
+
+    Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
+    message names it.
+    """
     rows = JsonObject.read(path).rows("segments")
     segments = tuple(map(_segment, rows))
     for row, (before, after) in zip(rows[1:], pairwise(segments)):
@@ -186,9 +190,10 @@ def _segment(row: JsonObject) -> ClockSegment:
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     """Put segments on the straight line through all of them, if that agrees with each.
 
-    A clock that is neither disciplined nor set has a constant rate over minutes, which segments
-    minutes apart determine much better than each alone. They are unchanged if fewer than two are
-    determined, a clock was set, or one line explains them with a probability below 0.001.
+    A clock that is neither disciplined nor set has a constant rate over minutes. Segments that are
+    minutes apart then determine its rate much better than each alone, and its offset somewhat
+    better. They are unchanged if fewer than two are determined, a clock was set, or one line does
+    not explain them: its squared error has a probability below one in a thousand.
     """
     determined = [segment for segment in segments if segment.status == "ok"]
     others = {segment.status for segment in segments} - {"ok", "no turns"}
@@ -237,7 +242,11 @@ class PtpdLog:
 
 
 def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
-    """Read a log of ptpd; raises `GroundTruthError` if it has no offset from the master."""
+    """Read a log of ptpd.
+
+    Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
+    the master.
+    """
     rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}
     content = read_content(path, _LARGEST_FILE_BYTES, "log of ptpd", GroundTruthError)

@@ -64,7 +64,8 @@ _STANDS_M, _MOVES_M = 0.01, 1.0
 def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     """Maximum likelihood estimate of odometry's random errors, near those given.
 
-    Without long gaps: the filter may be lost at their ends, whatever the noise.
+    Long gaps are excluded: a linearised filter may be lost at their ends, and then the likelihood
+    does not depend on the noise.
     """
     some = problem.shortened(_MOST_NODES_TO_LEARN_FROM).split(_LONGEST_GAP_TO_LEARN_FROM_S)
     given = noise_of(problem.settings)
@@ -120,7 +121,8 @@ def useful_terms(
     """(3,) mask of odometry's systematic errors whose estimates improve predictions over seconds.
 
     They are estimated from sample to sample. If these include odometry's own jitter, which measured
-    poses do not confirm, a spurious scale of turns results (regression dilution).
+    poses do not confirm, a spurious scale of turns results (regression dilution). Over seconds, and
+    over gaps, such an estimate makes predictions worse.
     """
     thin = problem.thinned(_SPACING_S)
     kept = deviations > 0.0

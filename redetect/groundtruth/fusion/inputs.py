@@ -45,7 +45,10 @@ def noise_of(settings: FuseSettings) -> FloatArray:
 
 
 def pauses_of(odometry: PlanarPoses) -> list[tuple[float, float]]:
-    """Pauses of odometry, as the times of the samples before and after each, which are distinct."""
+    """Pauses of odometry, as the times of the samples before and after each.
+
+    Only their total movement is known, not the path. No two samples may have the same time.
+    """
     times = odometry.times_s
     return [(float(times[i]), float(times[i + 1])) for i in np.flatnonzero(_paused(times))]
 
@@ -108,8 +111,9 @@ def gather(
 ) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
     """All measurements within the odometry's time, in order, with usable covariances.
 
-    Returns each measurement's stream, times (M,), poses (M, 3) and covariances (M, 3, 3), and by
-    stream the number of covariances that had to be increased.
+    Of several poses at one time in a stream, the last counts. Returns each measurement's stream,
+    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream the number of covariances that
+    had to be increased.
     """
     found = []
     repaired = {}

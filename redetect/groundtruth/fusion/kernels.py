@@ -156,7 +156,9 @@ def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
 def squared_innovation(
     innovation: FloatArray, s: FloatArray, s_inverse: FloatArray
 ) -> tuple[float, float]:
-    """Normalised square of an innovation of covariance `s`, and its determinant; inverts `s`."""
+    """Normalised square of an innovation with covariance `s`, whose inverse is filled in; and the
+    determinant of `s`.
+    """
     determinant = _invert_3x3(s, s_inverse)
     squared = 0.0
     for i in range(POSE):
@@ -356,9 +358,11 @@ def filter_forward(
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """States (N, d) and covariances (N, d, d) smoothed backward (Rauch, Tung, Striebel).
+    """Smooth a filter's history, from the last node to the first (Rauch, Tung, Striebel).
 
-    Across a restart of the filter, only odometry's systematic errors are propagated.
+    Across a restart of the filter, only odometry's systematic errors are propagated backward.
+
+    Returns `states`, `covariances` (N, d), (N, d, d).
     """
     expected = history.predicted_covariance[1:].copy()
     # States without variance do not change.

@@ -184,7 +184,10 @@ def _stationary(
 def _bridged(
     path: PlanarPoses, aligned: PlanarPoses, measured_s: FloatArray, errors: LocalisationErrors
 ) -> PlanarPoses:
-    """A path with gaps filled by an aligned localisation plus its errors given at both ends."""
+    """A path with gaps filled by an aligned localisation plus its errors given at both ends.
+
+    The localisation's covariances are those of its alignment.
+    """
     assert path.covariances is not None
     times, poses, covariances = path.times_s, path.poses.copy(), path.covariances.copy()
     there, _ = interpolate_poses(aligned, times)

@@ -157,7 +157,10 @@ class MovementProblem:
         return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) of the forward filter, given `slips` (N, 3)."""
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone.
+
+        `slips` (N, 3): variances of movements that are added for slips.
+        """
         history = kernels.empty_history(len(self.times_s))
         self.forward(self._variances(noise) + slips, history=history)
         return history.filtered, history.filtered_covariance
@@ -282,7 +285,10 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Odometry and measured poses on common nodes, from the first measurement to the last."""
+    """Combine odometry and measured poses with covariances on common nodes.
+
+    The nodes are from the first measurement within the odometry's time to the last.
+    """
     names, times, measured, covariances, repaired = inputs.gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]

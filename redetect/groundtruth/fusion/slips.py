@@ -111,7 +111,10 @@ def _stretches(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
-    """Begin and end of long runs of rejections, or restarts, after an accepted measurement."""
+    """Begin and end of long runs of rejections, after an accepted measurement.
+
+    The measurement at which the filter restarted belongs to the run.
+    """
     rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
     return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]
 

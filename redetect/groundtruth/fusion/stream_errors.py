@@ -69,7 +69,10 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
 
 def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
-    """Poses with covariances raised to their jitter, and the deviations' factor; 1 if right."""
+    """Poses with covariances raised to their jitter, and the factor of the deviations.
+
+    The factor is 1, and the poses are unchanged, if their covariances can be right.
+    """
     factor = jitter_ratio(poses)
     if factor <= _BELIEVED:
         return poses, 1.0
@@ -78,7 +81,9 @@ def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
 
 
 def read_common_covariance(stream: str | os.PathLike[str]) -> FloatArray:
-    """(3, 3) common covariance of a stream's poses, from the .json beside it; zeros without one."""
+    """(3, 3) covariance that is common to a stream's poses, from the .json that
+    `groundtruth laser` wrote beside it; zeros if there is none.
+    """
     path = Path(stream).with_suffix(".json")
     if path.is_file():
         content = JsonObject.read(path)
@@ -88,7 +93,10 @@ def read_common_covariance(stream: str | os.PathLike[str]) -> FloatArray:
 
 
 def without_common(poses: PlanarPoses, common: FloatArray) -> tuple[PlanarPoses, FloatArray]:
-    """Poses without the common part (3, 3) of their covariances; that part, 0 if negligible."""
+    """Poses without the common part (3, 3) of their covariances, and that part.
+
+    The part is zeros, and the poses are unchanged, if it is negligible.
+    """
     if poses.covariances is None or not len(poses):
         return poses, np.zeros((3, 3))
     variances = np.diagonal(poses.covariances, axis1=1, axis2=2)

@@ -160,7 +160,10 @@ def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
     jumps_left: int,
 ) -> list[ClockSegment]:  # fmt: skip
-    """One segment's clock, from `start_s`, too; several parts if the clock was set within it."""
+    """One segment's clock; several parts if the clock was set within it.
+
+    `start_s`: an offset from which the refinement by whole poses also starts.
+    """
     headings = np.unwrap(segment.poses[:, 2])
     # Means of ten, with less noise.
     means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
@@ -349,7 +352,10 @@ def _rounding(odometry: PlanarPoses) -> FloatArray:
 
 
 def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatArray) -> PlanarPoses:
-    """Measured poses with odometry's jitter and rounding in their covariances: of each sample."""
+    """Measured poses with odometry's own jitter and rounding added to their covariances.
+
+    A localisation jitters from sample to sample, and this error does not accumulate.
+    """
     covariances = measured.covariances
     if covariances is None:
         covariances = np.diag([0.0, 0.0, roughness(np.unwrap(measured.poses[:, 2])) ** 2])
@@ -364,7 +370,8 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
 def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     """Means of up to five samples, since single ones are noisier than interpolated ones.
 
-    With a constant phase of both streams that would look like a better or worse fit of the clock.
+    If samples have a constant phase relative to the measured poses, that difference would look like
+    a better or worse fit of the clock.
     """
     # Relative to the first one, since sums of times since 1970 lose digits.
     begin_s = odometry.times_s[0]

@@ -111,7 +111,10 @@ class ScanSets:
 def fixed_scanners(
     scanners: Sequence[Scanner], empties: Sequence[Scans], covariance: FloatArray | None = None
 ) -> FixedScanners:
-    """Scanners with their background for the kernels; by default with independent poses."""
+    """Arrange scanners, and the background from their scans of the empty area, for the kernels.
+
+    `covariance` (3 scanners, 3 scanners): of their poses, jointly; by default they are independent.
+    """
     if covariance is None:
         covariance = block_diag(*(scanner.covariance for scanner in scanners))
     if not scanners:
@@ -173,7 +176,9 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
 def load_session(
     folder: Path, calibration: Path
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
-    """Read fixed scanners, with their measured noise, robot and scans, and learn the background.
+    """Read fixed scanners, robot and scans, and learn the background.
+
+    Scanners whose readings of the empty area scatter far more than stated get that noise.
 
     Raises `GroundTruthError` if a file is missing or does not fit the others.
     """
@@ -218,8 +223,9 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
 def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
     """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
 
-    By the outline, a robot may be at `pose` or at `compose(pose, symmetry)`. s is 1 for a box, 3
-    for a square. No point of the turned outline is farther from it than the tolerance.
+    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
+    0 for an outline without symmetries, 1 for a box, 3 for a square. No point of the turned outline
+    is farther from the outline than the tolerance.
     """
     along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
     points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)

@@ -63,8 +63,9 @@ class Scan:
 def scan_normals(points: FloatArray, radius_m: float, reach: int, spread: float) -> FloatArray:
     """Normals (n, 2) of lines through a scan's points in the order of the beams; zeros if none.
 
-    Neighbours are those of the `reach` points before and after that steps of at most `radius_m`
-    lead to: a line if there are three, with an extent across of at most `spread` times that along.
+    The neighbours of a point are those of the `reach` points before and after that can be reached
+    by steps no longer than `radius_m`. They form a line if there are three or more points, and
+    their extent across it is at most `spread` times that along it.
     """
     at = np.arange(len(points))
     jumps = np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > radius_m)
@@ -142,7 +143,10 @@ def face_normals(faces: FloatArray) -> FloatArray:
 def nearest_on_segments(
     points: FloatArray, segments: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Nearest points (n, 2) on segments (k, 4), their (first) segments, and squared distances."""
+    """Nearest points on (k, 4) segments x1, y1, x2, y2: (n, 2), their segments, squared distances.
+
+    If two segments are equally near, the first is used.
+    """
     count = points.shape[0]
     nearest = np.empty((count, 2))
     index = np.full(count, -1, dtype=np.int64)
@@ -167,7 +171,10 @@ def nearest_on_segments(
 
 @kernel()
 def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatArray:
-    """Pose (3,) with the least squared distances between the used pairs: the closed form."""
+    """Pose (3,) with the least sum of squared distances between the used pairs of points.
+
+    The closed form, in the plane, of the fit by singular values (Arun, Huang, Blostein 1987).
+    """
     # Plain loops: NumPy's sums and parts of arrays take seconds to compile.
     n, px, py, qx, qy = 0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(used)):
@@ -206,7 +213,10 @@ def fit_outline(
     points: FloatArray, faces: FloatArray, start: FloatArray, gate_m: float, kept: float,
     threshold_m: float, most_steps: int,
 ) -> tuple[FloatArray, float, int]:  # fmt: skip
-    """Trimmed ICP of segments to points: the segments' pose, rms error, number of pairs used."""
+    """Trimmed ICP of segments to points: pose, root mean square error, number of pairs used.
+
+    The pose moves the segments onto the points.
+    """
     pose = start.copy()
     before = np.inf
     step = 0

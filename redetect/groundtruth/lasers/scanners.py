@@ -88,7 +88,11 @@ class Scanner:
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
-        """(..., readings, 2) points in the scanner's frame (m), NaN without a hit; ranges in mm."""
+        """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
+        millimetres.
+
+        NaN if nothing was hit.
+        """
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
         angles = self.angles_rad
         return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
@@ -150,7 +154,11 @@ def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Pat
 
 
 def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
-    """The scanners of a ``scanners.json``, in order; `GroundTruthError` if it is malformed."""
+    """Read a ``scanners.json``: the scanners, in the file's order.
+
+    Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
+    scanners have the same name.
+    """
     return _scanners(JsonObject.read(path))
 
 
@@ -167,7 +175,10 @@ def write_scanners(
 
 
 def read_robot(path: str | os.PathLike[str]) -> Robot:
-    """Read a ``robot.json``; raises `GroundTruthError` if it is malformed."""
+    """Read a ``robot.json``.
+
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
+    """
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
     if len(outline) < 3:
@@ -213,7 +224,10 @@ def _scanner(entry: JsonObject) -> Scanner:
 
 @dataclass(frozen=True, eq=False)
 class Scans:
-    """Scans of one scanner over time; raises `GroundTruthError` if shapes or types disagree."""
+    """Scans of one scanner over time.
+
+    Raises `GroundTruthError` if shapes or types disagree or a time is not finite.
+    """
 
     times_s: FloatArray  # (N,): of scans' middle beams, as measured; some real logs step back
     ranges_mm: NDArray[np.uint16]  # (N, readings): in millimetres, 0 if nothing was returned
@@ -233,7 +247,10 @@ class Scans:
 
 
 def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
-    """The one file with a scanner's scans (see `_ENDINGS`); `GroundTruthError` if not one."""
+    """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
+
+    Raises `GroundTruthError` if there is none, or more than one.
+    """
     found = [path for end in _ENDINGS if (path := Path(folder) / (name + end)).is_file()]
     if len(found) != 1:
         what = "no scans" if not found else f"scans in {len(found)} files"

@@ -260,7 +260,8 @@ class Tracker:
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
-        First by the readings of some sets; if ambiguous, by the motion: robots drive forward.
+        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
+        motion: robots drive forward.
         """
         if len(self.body.symmetries) == 0:
             return "outline"
@@ -314,7 +315,10 @@ class Tracker:
         return ahead
 
     def _scales(self, good: IntArray) -> FloatArray:
-        """Factors on covariances where residuals of half a second are larger than the noise."""
+        """Factors on the covariances if residuals are larger than the scanners' noise.
+
+        From the residuals of half a second, since one set's are too few.
+        """
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
         total, squared = (
             convolve1d(values, np.ones(37), mode="constant")
@@ -348,7 +352,8 @@ def track_by_lasers(
 ) -> LaserTrack:
     """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`).
 
-    If the readings are outside or inside of the outline on all sides, its faces are moved.
+    If the readings are outside or inside of the outline on all sides, it was drawn too small or too
+    large: then its faces are moved, as `outline_moved_m` says.
     """
     settings = LaserSettings() if settings is None else settings
     allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0

@@ -179,8 +179,9 @@ class _Solution(NamedTuple):
 class MapProblem(NamedTuple):
     """Scanners at rest on a map whose walls may be off.
 
-    The offsets of each wall's two ends, along its normal, are unknowns of the same adjustment, with
-    a standard deviation that is estimated as well. All scanners see the same walls.
+    Readings of a wall share its error: the offsets of each wall's two ends, along its normal, are
+    unknowns of the same adjustment, with a standard deviation that is estimated as well. All
+    scanners are fitted together, since they see the same walls.
     """
 
     scans: Sequence[StillScan]  # One of each scanner

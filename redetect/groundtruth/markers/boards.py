@@ -86,7 +86,8 @@ class BoardsFile:
 def read_boards(path: Path) -> BoardsFile:
     """Read a ``boards.json``, or the one in a folder, and the calibrations of its cameras.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file is malformed.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
+    missing or impossible.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
     content = JsonObject.read(path)
@@ -120,7 +121,8 @@ def calibration_of(camera: str) -> str:
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """Find the corners of the board in an image.
 
-    Raises `GroundTruthError` if it cannot be read, is of another size, or shows no board.
+    Raises `GroundTruthError` if the image cannot be read, its size differs from the calibration's,
+    or no board is found.
     """
     try:
         grey = read_grey(image.image)

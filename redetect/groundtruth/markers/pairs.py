@@ -60,7 +60,10 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
 
 
 def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
-    """The transform with which the most times agree, given the `pair_estimates` of each time."""
+    """The transform with which the most times agree.
+
+    `times`: from `pair_estimates`, one for each time at which both markers are seen.
+    """
     poses = np.concatenate([time.poses for time in times])
     covariances = np.concatenate([time.covariances for time in times])
     costs = np.concatenate([time.costs - time.costs.min() for time in times])

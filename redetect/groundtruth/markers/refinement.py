@@ -190,7 +190,10 @@ def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
 def predicted_errors(
     problem: PoseProblem, pose: FloatArray, pose_covariance: FloatArray
 ) -> FloatArray:
-    """(V,) normalised errors of all views at a pose estimated without them; infinite if unseen."""
+    """(V,) normalised errors of all views at a pose that was estimated without them.
+
+    Infinite where a view cannot be seen from there.
+    """
     errors = np.full(problem.views, np.inf)
     for view in range(problem.views):
         alone = problem.only(np.arange(problem.views) == view)

@@ -65,7 +65,10 @@ def marker_corners(width_m: float) -> FloatArray:
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read a ``rig.json``, its markers by identifier; `GroundTruthError` if it is malformed."""
+    """Read a ``rig.json``; its markers are returned in the order of their identifiers.
+
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
+    """
     content = JsonObject.read(path)
     dictionary = content.text("dictionary", "its name")
     markers = content.objects("markers")
@@ -85,7 +88,8 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 def read_network(path: str | os.PathLike[str]) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file is malformed.
+    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
+    missing or impossible.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))
@@ -208,7 +212,10 @@ class View:
 
 
 def find_runs(session: Path) -> list[Path]:
-    """The run folders of a session with detected markers; `GroundTruthError` if there are none."""
+    """The run folders of a session that contain detected markers.
+
+    Raises `GroundTruthError` if there are none.
+    """
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())
@@ -221,7 +228,11 @@ def find_runs(session: Path) -> list[Path]:
 
 
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
-    """The markers in a run folder's images, in order, and these images' times or numbers."""
+    """The markers found in a run's images, in the file's order, and the images' times.
+
+    The run folder contains ``detected.markers`` and ``<name>.times``. Frames are numbered instead
+    if not `timed`.
+    """
     times_path = run / f"{run.resolve().name}.times"
     times = read_times(times_path) if timed else {}
     frames = []
@@ -252,7 +263,10 @@ def read_network_frames(runs: Sequence[Path], network: Network) -> list[MarkerFr
 def group_by_time(
     frames: Sequence[MarkerFrame], tolerance_s: float
 ) -> list[tuple[MarkerFrame, ...]]:
-    """Groups of images of different cameras within the tolerance of the first, in order of time."""
+    """Groups of images of different cameras, in order of time.
+
+    A group's images are within the tolerance of its first; each camera occurs at most once.
+    """
     groups: list[list[MarkerFrame]] = []
     for frame in sorted(frames, key=lambda frame: (frame.time_s, frame.camera)):
         near = bool(groups) and frame.time_s - groups[-1][0].time_s <= tolerance_s

@@ -89,7 +89,10 @@ class Track:
 
 
 def excess_of(pose: RefinedPose) -> float:
-    """Factor by which a pose's covariance is too small for its residuals; 1 if by chance."""
+    """Factor by which a pose's covariance is too small for its residuals.
+
+    It is 1 unless they are larger than chance makes one in a thousand.
+    """
     freedom = pose.degrees_of_freedom
     if freedom < 1 or pose.cost <= chdtri(freedom, _CHANCE):
         return 1.0
@@ -99,7 +102,11 @@ def excess_of(pose: RefinedPose) -> float:
 def track_by_markers(
     groups: Iterable[tuple[MarkerFrame, ...]], rig: Rig, network: Network, settings: PoseSettings
 ) -> Track:
-    """The robot's poses from the markers in images, those of one time in a group."""
+    """Compute the robot's poses from the markers found in a session's images.
+
+    `groups` are the images of each time (`redetect.groundtruth.markers.session.group_by_time`),
+    their cameras' indices those of `network`.
+    """
     tracked: list[TrackedTime] = []
     unknown = 0
     for group in groups:

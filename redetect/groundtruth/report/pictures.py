@@ -1,4 +1,8 @@
-"""Figures of the report (SVG), and pictures that accompany results (PNG), reproducible."""
+"""Figures of the report, and pictures that accompany results.
+
+The former (SVG) are the map with paths and ellipses, and errors over time; the latter (PNG) are a
+rig, the scanners' alignment, and errors at reference poses.
+"""
 
 from __future__ import annotations
 
@@ -133,7 +137,9 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
 def _area(
     tracks: Sequence[Track], building: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Corners of the drawn area (paths, or else the building), and inches on the page per m."""
+    """Corners of the drawn area: the paths with a margin, or else the whole building; and inches
+    on the page per metre.
+    """
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places:
         places = [np.array([[0.0, 0.0]]) if building is None else building.reshape(-1, 2)]
@@ -223,7 +229,10 @@ def draw_walls(axes: Axes, building: FloatArray) -> None:
 
 
 def draw_rig(estimate: RigEstimate) -> bytes:
-    """Draw a rig and its markers' pairwise estimates from three sides; returns a PNG's bytes."""
+    """Draw a rig from three sides; returns a PNG's bytes, the same for the same input.
+
+    Pairwise estimates are drawn as the position of one marker relative to the other.
+    """
     rig = estimate.rig
     agreeing, differing = _clouds(estimate)
     with figure_file((13.5, 5.0), "png") as (figure, content):
@@ -311,7 +320,10 @@ def draw_alignment(
 
 
 def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
-    """Draw errors, at least one, their `score` and bounds by covariances; returns a PNG's bytes."""
+    """Draw errors, at least one, with bounds from their covariances; returns a PNG's bytes.
+
+    `score`: of these errors. The same input gives the same bytes.
+    """
     with figure_file((13.5, 6.4), "png") as (figure, content):
         linear, angular = figure.subplots(2, 1)
         names = [str(reference.index) for reference in errors.references]
@@ -361,7 +373,11 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
 
 
 def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
-    """Draw the scans on board on the map, by each set of poses; returns a PNG's bytes."""
+    """Draw the scans on board on the map, for each set of poses; returns a PNG's bytes.
+
+    The sets are the reference poses from distances alone, those refined by scans, and the ground
+    truth. The same input gives the same bytes.
+    """
     kept = [i for i, r in enumerate(errors.references) if r.still is not None]
     refined = np.stack([errors.references[i].pose for i in kept])
     distances = np.stack([errors.references[i].distances.pose for i in kept])

@@ -80,9 +80,10 @@ class PlanarPoses:
 
 
 def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
-    """Keep only the last of all poses with the same time, as of buffers that are read occasionally.
+    """Keep only the last of all poses with the same time.
 
-    The robot moved between them, but its speed cannot be computed.
+    If time stamps are coarser than samples, as with buffers that are read occasionally, several
+    poses have the same time. The robot moved between them, but its speed cannot be computed.
     """
     last = np.append(np.diff(poses.times_s) > 0.0, True)[: len(poses)]
     return poses if np.all(last) else poses.only(last)
@@ -92,7 +93,8 @@ def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
     All rows have 4, or all have 13, numbers separated by commas or blanks; blank lines and `#`
-    comments are skipped. Raises `GroundTruthError` with file and line if a row is malformed.
+    comments, which the real files do not have, are skipped. Raises `GroundTruthError` if the file
+    cannot be read or a row is malformed; the message names file and line.
     """
     rows: list[list[float]] = []
     allowed: tuple[int, ...] = (_POSE_COLUMNS, _COVARIANCE_COLUMNS)

@@ -240,8 +240,9 @@ def refine_mounts(
 ) -> RefinedMounts | None:
     """Mounts of the scanners on board for which readings fit the walls at all reference poses.
 
-    Least squares over the mounts and all poses; only the poses from distances tie the mounts to the
-    robot's frame. None if fewer than three poses have both distances and scans.
+    Least squares over the mounts and all poses. Only the poses from distances, with their
+    covariances, tie the mounts to the robot's frame; the measured mounts are not a prior.
+    None if fewer than three poses have both distances and scans.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
     used = [

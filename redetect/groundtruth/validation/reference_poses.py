@@ -72,7 +72,10 @@ class Distance:
 
 
 def read_survey(path: str | os.PathLike[str]) -> Survey:
-    """Read a ``fiducials.json``; raises `GroundTruthError` if it is malformed."""
+    """Read a ``fiducials.json``.
+
+    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
+    """
     content = JsonObject.read(path)
     content.demand_version()
     fiducials, robot_points = (_points(content, key) for key in ("fiducials", "robot_points"))
@@ -80,9 +83,10 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
 
 
 def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
-    """Read a ``distances.csv`` between the survey's points, in the file's order.
+    """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
-    Raises `GroundTruthError` if a row is malformed or names an unknown point.
+    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names an unknown
+    point.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):
@@ -177,7 +181,9 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
 
 
 def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """(..., K) measured minus expected distances (m) of poses (..., 3); derivatives by these."""
+    """Measured minus expected distances (..., K) (m) of poses (..., 3), and their derivatives by
+    the poses (..., K, 3).
+    """
     arm = measured.levers @ np.swapaxes(rotation(pose[..., 2]), -1, -2)
     apart = pose[..., None, :2] + arm - measured.fiducials
     length = np.hypot(apart[..., 0], apart[..., 1])
@@ -280,8 +286,9 @@ def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> lis
 def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> SurveyedFiducials:
     """Estimate the positions of fiducials from the distances between them, by least squares.
 
-    They are aligned rigidly with the drawing; the standard deviations are those of a free network
-    (of least trace). Raises `GroundTruthError` if the distances leave more undetermined.
+    Distances do not determine a rigid motion: the positions are aligned with the drawing, and the
+    standard deviations are those of a free network (of least trace). Raises `GroundTruthError` if
+    the distances leave more than that undetermined.
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])

@@ -95,7 +95,10 @@ class PoseScore(ErrorFigures):
 
 
 def score_poses(poses: PlanarPoses, truth: PlanarPoses, unmatched: int = 0) -> PoseScore:
-    """Errors of poses whose truth, perhaps with covariances, is known at the same times."""
+    """Errors of poses whose truth is known at the same times.
+
+    If the truth has covariances, the normalised error includes them. `unmatched` is passed on.
+    """
     normalised = normalised_errors(poses, truth)
     normalised = normalised[np.isfinite(normalised)]
     return PoseScore(
@@ -151,7 +154,8 @@ class RelativeScore(ErrorFigures):
 def read_relations(path: str | os.PathLike[str]) -> Relations:
     """Read relations: rows t_i, t_j, x, y, z, roll, pitch, yaw separated by blanks or commas.
 
-    Only x, y and yaw are used. Raises `GroundTruthError` with file and line if one is malformed.
+    Only x, y and yaw are used, as poses are on a floor. Raises `GroundTruthError` if the file
+    cannot be read or a row is malformed; the message names file and line.
     """
     rows = read_table(path, "t_i,t_j,x,y,z,roll,pitch,yaw")
     if not rows:
@@ -163,9 +167,10 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
 def score_relations(
     poses: PlanarPoses, relations: Relations, largest_gap_s: float = np.inf
 ) -> RelativeScore:
-    """Compare poses, interpolated at the relations' times (not in longer gaps), with these.
+    """Compare poses, interpolated at the relations' times, with known relations.
 
-    Raises `GroundTruthError` if no relation has poses at both its times.
+    Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
+    has poses at both its times.
     """
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)

@@ -74,7 +74,10 @@ def compatible(
 
 @cache
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
-    """(most_pairs + 1,) chi-squared quantiles for 0, 1, 2, ... pairs; not to be modified."""
+    """Chi-squared quantiles for the squared distances of 0, 1, 2, ... pairs.
+
+    Returns (most_pairs + 1,), not to be modified.
+    """
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
     gates = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
@@ -119,7 +122,10 @@ def _append(
 def individual_distances(
     innovations: FloatArray, predicted: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """(n, m) squared Mahalanobis distances of rows from landmarks; infinite where undefined."""
+    """Squared Mahalanobis distance of each row from each landmark (n, m).
+
+    Infinite if a covariance is not positive definite or an innovation is not finite.
+    """
     n, m, width = innovations.shape
     every = np.arange(m)
     covariance = predicted.reshape(m, width, m, width)[every, :, every, :] + noise[:, None]

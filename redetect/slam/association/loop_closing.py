@@ -138,7 +138,10 @@ def merge_labels(
 
 
 def in_order(labels: IntArray) -> IntArray:
-    """Renumber labels (n,) from 0 without gaps, in the order of their first rows; -1 stays."""
+    """Renumber labels from 0 without gaps, in the order of their first rows; -1 stays.
+
+    Takes `labels` (n,); returns (n,).
+    """
     names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     first[names < 0] = -1
     rank = np.empty(len(first), dtype=np.int64)

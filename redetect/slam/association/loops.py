@@ -312,7 +312,10 @@ class Motion(NamedTuple):
 def motion_onto(
     moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray | None = None
 ) -> Motion:
-    """The motion under which most landmarks (n, 2) fall on others; not one near `besides` (3,)."""
+    """The motion under which most landmarks (n, 2) fall on those of another constellation.
+
+    With `besides` (3,), the best one that is not near this pose.
+    """
     centre = moved.sum(axis=0) / max(len(moved), 1)
     others = np.zeros((0, 3))
     if besides is not None:
@@ -325,7 +328,11 @@ def motion_onto(
 def refined_motion(
     place: FloatArray, target: FloatArray, pose: FloatArray, least_agreeing: int
 ) -> tuple[FloatArray, IntArray] | None:
-    """The least-squares pose, from one nearby, of agreeing landmarks, and their `mutual_pairs`."""
+    """The pose that aligns landmarks with those they agree with, by least squares, and the pairs.
+
+    From a pose nearby; None if too few agree. Pairs are (k, 2), as from `mutual_pairs`: the
+    target's first.
+    """
     for _ in range(5):
         pairs = mutual_pairs(target, apply(pose, place), REACH_M)
         if len(pairs) < least_agreeing:

@@ -30,7 +30,10 @@ class AssociationScore:
 
 
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:
-    """Score labels (n,); a row with several IDs has the one that most rows of its label have."""
+    """Score labels (n,).
+
+    A row with several IDs counts as the one among them that most rows of its label have.
+    """
     known = np.array([len(listed) > 0 for listed in ids], dtype=np.bool_)
     given = np.asarray(labels, dtype=np.int64)[known]
     unlabelled = given < 0

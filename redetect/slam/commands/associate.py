@@ -85,8 +85,9 @@ def perform(options: Associate) -> int:
 
 
 def score_run(recording: Recording, found: RunAssociation) -> Scores:
-    """Scores against the IDs in the file: ``scores["circles"]["local"]`` and so on, ``map`` after
-    the map level, of kinds with any ID.
+    """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
+
+    Kinds are those with any ID in the file; stages ``local`` and, after the map level, ``map``.
     """
     discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
     scores: Scores = {}

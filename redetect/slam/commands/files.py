@@ -70,9 +70,10 @@ def recording_of(flags: RunFlags) -> Recording:
 
 
 def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
-    """The calibration of a run, by default ``<run>.cam``, or the only ``.cam`` in its folder.
+    """Read the calibration that belongs to a run, a folder or a file in one.
 
-    Raises `SlamError` if there is none, `camera.CameraError` if it is ambiguous.
+    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
+    there is none, `camera.CameraError` if it is ambiguous.
     """
     if camera is not None:
         return camera if isinstance(camera, Camera) else read_camera(camera)

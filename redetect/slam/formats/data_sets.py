@@ -61,8 +61,9 @@ def _names(times: FloatArray) -> tuple[str, ...]:
 def discs_of_ranges(
     range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) positions, and covariances (n, 2, 2), of landmarks in the robot frame, measured by
-    range and bearing (n,).
+    """Landmarks measured by range and bearing, as positions in the robot frame.
+
+    Takes `range_m, bearing_rad` (n,); returns `xy` (n, 2), `covariance` (n, 2, 2).
     """
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
@@ -126,7 +127,10 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
 
 
 def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
-    """A robot's log, with landmarks as discs of given sigmas; steps have no covariance."""
+    """A robot's log, with landmarks as discs; steps have no covariance.
+
+    Takes the standard deviations of ranges and bearings.
+    """
     velocity, seen = _log(odometry, "time v omega"), _seen_by_robot(odometry)
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     steps = _velocity_steps(velocity, seen.times)

@@ -1,8 +1,9 @@
 """A run as comma-separated tables for GTSAM, MRPT and the like.
 
-``odometry.csv`` has each step with two covariances: in the axes before the step, as of MRPT's
-Gaussian poses, and at its end (``end_``), as of GTSAM's BetweenFactorPose2 and g2o's EDGE_SE2.
-``discs.csv`` and ``bearings.csv`` have the measurements, with steps counted from 1.
+``odometry.csv`` has each step with two covariances: in the axes before the step, as in the data
+set's rows and MRPT's Gaussian poses, and in the axes at its end (``end_``), as for the errors of
+GTSAM's BetweenFactorPose2 and g2o's EDGE_SE2. ``discs.csv`` and ``bearings.csv`` have the
+measurements, with steps counted from 1. Numbers have full precision; comments begin with ``#``.
 """
 
 from __future__ import annotations

@@ -166,7 +166,10 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
 
 
 def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
-    """(2 M, 2 M) joint covariance of all discs, then lines, at a minimum (m^2); see `marginals`."""
+    """Joint covariance of all landmarks at a minimum of `solve`; see `marginals`.
+
+    Returns (2 M, 2 M): discs, then lines (m^2).
+    """
     layout = layout_of(graph)
     landmarks = np.arange(layout.first_disc, layout.size)
     with _determined("covariances"):

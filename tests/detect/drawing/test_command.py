@@ -193,8 +193,8 @@ def test_a_video_that_could_not_be_written_is_none(
     class FullDisk(cv2.VideoWriter):
         """OpenCV's writer drops frames silently."""
 
-        def write(self, image: object) -> None:
-            pass
+        def write(self, image: object) -> bool:
+            return True
 
     assert main(["circles", str(small_run)]) == 0
     capsys.readouterr()
