@@ -31,7 +31,11 @@ _LONGEST_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class FileHead:
-    """The known parts of the head of a file of rows; missing settings have their defaults."""
+    """The known parts of the head of a file of rows.
+
+    Settings that it does not contain have their defaults; a DetectError is raised if one has an
+    impossible value.
+    """
 
     comments: tuple[str, ...] = ()  # its lines without comment signs
     settings: tuple[tuple[str, str], ...] = ()  # names and values, as written
@@ -118,7 +122,11 @@ class RunRows:
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
-    """Index the files of a run's rows; DetectError without any, LandmarkFileError if bad."""
+    """Find the files of a run's rows, and index them.
+
+    Raises DetectError if there are none, or given reference rows do not exist, and
+    redetect.landmarks.LandmarkFileError if one is malformed.
+    """
     usual = {
         kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
         for kind in KINDS

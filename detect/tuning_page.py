@@ -1,8 +1,9 @@
 """A page for tuning: an image of a run, its discs with the current settings, and explanations.
 
-``detect tune RUN --serve`` serves one browser on the same machine, by the standard library. It
-listens on the loopback interface only, and answers only requests with the token of the page's
-address and this machine's name as host: other users, and other pages in the browser, get no access.
+``detect tune RUN --serve`` starts a server of the standard library for one browser on the same
+machine. It listens on the loopback interface only, and answers only requests with the token of the
+page's address and this machine's name as host: other users, and other pages in the browser, get no
+access. Detections are the same as those of all other commands.
 """
 
 from __future__ import annotations

@@ -59,7 +59,10 @@ class VoteTable(NamedTuple):
 
 
 def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
-    """Compute the cells of all centres; a TableError if the camera is not above the floor."""
+    """Compute the cells from the nearest to the farthest centre.
+
+    A camera that is not above the floor raises a TableError.
+    """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
     foot, radius = np.array(camera.centre[:2]), shape.radius_m

@@ -298,7 +298,10 @@ def match_runs(
     sight: Sight | None = None,
     unlisted: Iterable[Frame] | None = None,
 ) -> dict[str, Any]:
-    """Match the rows of images that are in both of two runs: the fields of a `Comparison`."""
+    """Match the rows of two runs, image by image: the fields of a `Comparison`.
+
+    Images are in the order of the reference; those in only one run are ignored.
+    """
     images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
@@ -384,7 +387,10 @@ def pair_discs(
     options: CompareOptions,
     view: Sight | None = None,
 ) -> Association:
-    """Pair discs of a frame: in the image, if there is a view and no gate on the floor."""
+    """Pair discs of one frame one to one: as many as possible, with least squared distances.
+
+    They are paired in the image if there is a view, unless the options demand the floor.
+    """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and options.gate_m is None:
         seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
@@ -399,7 +405,10 @@ def pair_discs(
 def pair_lines(
     reference: Sequence[LineLandmark], detected: Sequence[LineLandmark], options: CompareOptions
 ) -> Association:
-    """Pair lines of a frame by bearing, within the tolerance or some sigmas of the detected row."""
+    """Pair lines of one frame one to one by bearing, with least squared differences.
+
+    The gate is the larger of the tolerance and a multiple of the detected row's sigma.
+    """
     difference = _turns(reference, detected)
     gate = np.maximum(
         np.radians(options.tolerance_deg), numbers(detected, "sigma") * options.sigmas

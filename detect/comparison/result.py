@@ -71,7 +71,8 @@ class FloorDifference:
 class DistanceBin:
     """Discs at a range of forward distances (m), open at an end that is None.
 
-    Differences are as written, and levelled alike; the latter are None if all rows are.
+    Differences are those of matched discs on the floor, as the rows are and levelled alike; the
+    latter are None if all rows are levelled alike already.
     """
 
     from_m: float | None
@@ -209,7 +210,11 @@ class Comparison(Table, ABC):
         return f"The stated covariances are too {size}{exact}: {figure}."
 
     def figures(self) -> dict[str, Any]:
-        """All figures by name, for JSON, metres and degrees: the same names in the same order."""
+        """All figures by name, for JSON: always the same names in the same order.
+
+        Lengths are in metres, angles in degrees. The worst frames are listed, and frames that are
+        in only one file.
+        """
         figures = {f.name: getattr(self, f.name) for f in fields(self)}
         figures |= {
             "frames": len(self.frames),
@@ -316,7 +321,10 @@ def quantile(values: FloatArray, q: float = 0.5) -> float | None:
 
 
 def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
-    """Mean squared normalised error (N, n) where covariances are valid, chi-square's 95 %."""
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
+
+    Errors whose covariance (N, n, n) is not positive definite are left out.
+    """
     usable = is_positive_definite(covariance)
     left_out = int((~usable).sum())
     dof = offset[usable].size

@@ -63,7 +63,8 @@ def draw_run(
 ) -> tuple[int, list[str]]:  # fmt: skip
     """Draw rows into the images of a run, to PNG files in a folder, and to a video.
 
-    With a `plan`, tracks and rejected markers, too. Returns the number, and why others have none.
+    With the plan of their detection, verticals are drawn as tracks, and markers with the rejected
+    candidates. Returns the number of pictures, and the reasons why frames have none.
     """
     drawn, failures = 0, list[str]()
     sight = rows.sight(run.camera) if isinstance(run, Run) else None

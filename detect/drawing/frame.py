@@ -105,16 +105,20 @@ def _scaled(points: FloatArray, scale: int) -> FloatArray:
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
-    """(N, P, 2) pixels of lines from top to bottom; `ends` (N, 4) are normalised coordinates."""
+    """Distorted curves of lines: (N, P, 2) pixels from top to bottom.
+
+    `ends` (N, 4) are xtop, ytop, xbottom, ybottom in undistorted normalised coordinates.
+    """
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     return camera.distort((1.0 - share) * ends[:, None, :2] + share * ends[:, None, 2:])
 
 
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Error bars of one standard deviation of bearings, where lines cross the level horizon.
+    """Error bars of one standard deviation of the bearing, at the lines' crossings of the horizon.
 
-    Lines that end before it are extended. `ends`: (N, 4), as for `line_curves`; `sigma_rad`: (N,).
-    Returns (N, 2, 2) pixels; NaN for lines that do not cross it in front of the camera.
+    The horizon is that of the level robot; lines that end before it are extended. `ends`: (N, 4),
+    as for `line_curves`; `sigma_rad`: (N,). Returns (N, 2, 2) pixels; NaN for lines that do not
+    cross the horizon in front of the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))
@@ -242,7 +246,10 @@ def _count(what: str, match: FrameMatch, compared: bool) -> str:
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
-    """A grey image as (H, W, 3) blue, green, red to draw into; unseen pixels are dark red."""
+    """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
+
+    Pixels without a direction in the camera's calibration are dark red.
+    """
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if camera is not None and camera.seen_share < 1.0:
         unseen = _unseen(camera)
@@ -280,7 +287,10 @@ def draw_text(
     canvas: ByteArray, text: str, at: ArrayLike, colour: Colour, size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:  # fmt: skip
-    """Draw ASCII text, its base line from u, v plus `shift`, unless that is far outside."""
+    """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
+
+    `shift` moves the text, by more in wide pictures.
+    """
     place = np.asarray(at, dtype=np.float64)
     if np.all(np.abs(place) < _FARTHEST_PX):
         times = enlargement(canvas)

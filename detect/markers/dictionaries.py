@@ -146,7 +146,10 @@ class Templates:
 
 @functools.lru_cache(maxsize=16)
 def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
-    """Templates of a dictionary's markers, of some IDs or all; DetectError if one is unknown."""
+    """Templates of a dictionary's markers: of the given IDs, or of all if there are none.
+
+    Raises DetectError if there is no such dictionary or marker.
+    """
     dictionary = marker_dictionary(name)
     if ids:
         dictionary = dictionary.only(ids)
@@ -192,7 +195,10 @@ def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float3
 
 
 def _decoys(varied: BoolArray, patterns: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Patterns of frames, bars and panes, and which markers are within two cells of one."""
+    """Patterns of frames, bars and panes, and a mask of the markers less than two cells from one.
+
+    Decoys that near a marker's pattern are omitted, since it could never be found.
+    """
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     j, i = np.indices((len(rows), len(columns)))
     inner = [np.zeros(i.shape, bool)]

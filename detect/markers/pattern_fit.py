@@ -80,7 +80,10 @@ def fit_marker(
     *,
     first_look: bool = False,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern by Gauss-Newton from its edges; None if there is none."""
+    """Fit a marker of a known pattern by the Gauss-Newton method, starting from its edges.
+
+    None if there is no such marker nearby.
+    """
     most_pixels, steps = _FIRST_LOOK if first_look else _WHOLE_FIT
     corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
@@ -154,7 +157,8 @@ def _solved(
 ) -> tuple[FloatArray, Linearised, FloatArray] | None:
     """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
-    Weak priors: even light, a round blur close to its first estimate, a straight tone curve.
+    Weak priors: light changes little over a marker, the blur is nearly isotropic and close to its
+    initial estimate, the tone curve is nearly straight.
     """
     corners = start.corners
     blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)

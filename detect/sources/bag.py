@@ -139,7 +139,8 @@ def _cause(error: Exception) -> str:
 def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     """The pixels of a `sensor_msgs/Image`: grey values, or blue, green, red and perhaps opacity.
 
-    Luminance of Bayer and YUV 4:2:2. FrameError for other encodings, or if data are missing.
+    For Bayer patterns and YUV 4:2:2 they are the luminance. Raises FrameError for other encodings,
+    or if there is less data than the message states.
     """
     encoding, height, width = message.encoding, message.height, message.width
     bayer = _BAYER.fullmatch(encoding)

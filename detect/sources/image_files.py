@@ -1,4 +1,7 @@
-"""Image files as a source, and the image of each step, which is never outside the run."""
+"""Image files as a source, and the image of each step, which is never outside the run.
+
+Only the names of the images are kept in memory.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +55,8 @@ def last_part(prefix: str) -> str:
 class ImageNames:
     """Names of a folder's image files that match a pattern, in natural order: numbers by value.
 
-    Hidden files (``._`` and a name: metadata) are skipped unless the pattern begins with a dot.
+    Hidden files are skipped unless the pattern begins with a dot: some systems store metadata in
+    files whose names are ``._`` followed by the image's name.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
@@ -146,7 +150,8 @@ class RunFrames(Frames):
 class ImageFiles(Source):
     """Images in natural order of their names.
 
-    Calibration, times (``<folder>.times``) and results are in the folder of the run.
+    Calibration and times (by default ``<folder>.times``) are in the run's folder, and results are
+    written there: the folder of the images, or the one above ``images/``.
     """
 
     ships_images = False

@@ -73,7 +73,10 @@ class Source(Frames):
     has_times = True  # whether the times of the images are known
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The calibration beside or in the source, if any; if `posed`, one above the floor."""
+        """The calibration beside the source, or contained in it; None if there is none.
+
+        Several are an error; if `posed`, a calibration without a pose above the floor is ignored.
+        """
         return None if self.beside is None else camera_in(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
@@ -155,7 +158,8 @@ def read_image(
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    Only of the given `size`. FrameError, naming `name`, if it is no image, or truncated.
+    An image with another width and height than `size` is not decoded. Raises FrameError, with
+    `name` for the image, if the content is not an image, or is truncated.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")

@@ -64,7 +64,10 @@ def open_source(
     *,
     posed: bool = False,
 ) -> ImageRun:
-    """Open a source as `open_run` does; without a calibration, posed if `posed`, it is no `Run`."""
+    """Open a source with or without a calibration; without one the result is not a `Run`.
+
+    Parameters and errors as for `open_run`. If `posed`, a calibration without a pose is ignored.
+    """
     options = options or SourceOptions()
     source = _source(name, options)
     if isinstance(camera, Path):

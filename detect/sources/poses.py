@@ -47,7 +47,10 @@ _END_SLACK_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """A pose, X forward, Y left (m, rad), and its covariance since the start; 0 if unknown."""
+    """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
+
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
+    """
 
     time_s: float
     x: float
@@ -67,8 +70,9 @@ class PoseStream(NamedTuple):
 def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     """The STEP row of a robot's movement from one pose to another.
 
-    Covariances of poses are assumed to grow along the path, by that of each independent movement.
-    Without a positive definite one, that of the step is zero, which means unknown.
+    The covariances of poses are assumed to grow with the path: that of the later pose is that of
+    the earlier one, propagated, plus that of the movement, independent of it. If that is missing
+    or singular, the covariance of the step is zero, which means unknown.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
@@ -237,7 +241,8 @@ def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
 class FramesAlongPoses(Frames):
     """The frames of a source with known poses of the robot over time.
 
-    Poses are interpolated. Images without one are not part of the run; the first step is zero.
+    The pose of an image is interpolated between those before and after it. Images without a pose at
+    their time are not part of the run; the first one's step is zero.
     """
 
     def __init__(self, source: Source, stream: PoseStream) -> None:
