@@ -128,7 +128,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     code = PROGRAM.main(arguments)
     if code == EXIT_INTERRUPTED and arguments is None:
-        # Otherwise, Python dies of an interrupt that passed through some library's `exec`.
+        # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
+        # it was caught.
         atexit._run_exitfuncs()
         os._exit(code)
     return code

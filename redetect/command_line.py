@@ -130,7 +130,8 @@ class Program:
 
     name: str
     description: str  # for its `--help`
-    #: Dataclasses of flags, called as their commands, and the module whose `perform` executes each.
+    #: Dataclasses of flags, one for each command, whose name is that of the class in lower case,
+    #: and the module whose `perform` executes it.
     performed_by: Mapping[type, str]
     expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
 

@@ -17,8 +17,9 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW = 2, 9
 _FEWEST_POINTS = 8
-# Longer sides (px) to which an image is reduced, one after the other, to search a checkerboard: the
-# time grows faster than the image, and squares of a few pixels suffice.
+# Lengths of the longer side (px) to which an image is reduced, one after the other, to search a
+# checkerboard. The time of OpenCV's search grows faster than the image, especially without a board,
+# and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
 
@@ -173,7 +174,8 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
     flag = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     size = (board.columns, board.rows)
     pictures = image, 255 - image
-    # Clustering tolerates perspective, the plain search clutter; in the negative, light is dark.
+    # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
+    # ground are dark ones in the negative.
     for heights in zip(*map(both_heights, pictures)):
         for picture, (searched, in_image) in zip(pictures, heights):
             for extra in (0, cv2.CALIB_CB_CLUSTERING):

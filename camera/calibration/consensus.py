@@ -43,7 +43,8 @@ class Consensus:
     estimate: Estimate  #: With the poses of all views
     #: (V,) RMS residual of each view; infinite where the camera sees its board in no pose
     rms_px: FloatArray
-    #: (V,) whether residuals of a view, but single points', are not far above those of the fit
+    #: (V,) whether the residuals of a view, all but those of single points, are not far above those
+    #: of the views that it was fitted to
     agree: BoolArray
 
 

@@ -218,7 +218,8 @@ class FreeLens(NamedTuple):
 class CalibrationSettings:
     """Settings of a calibration; None means automatic, as for the flags of `camera calibrate`."""
 
-    #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line; None if both are free
+    #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
+    #: are free
     aspect: float | None = 1.0
     #: Number of free radial coefficients: 0 to 5 of the rational function, 0 to 3 of a polynomial
     coefficients: int | None = None

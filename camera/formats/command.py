@@ -14,7 +14,8 @@ from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded, demand_place, write_bytes
 
-#: The models of each format, the simplest first, and their coefficients: some lack k3.
+#: The models of each format, the simplest first, and their number of coefficients: some formats
+#: lack k3.
 MODELS: dict[str, dict[Model, int]] = {
     "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
     "ros": {"radtan": 5, "rational": 8, "fisheye": 4},

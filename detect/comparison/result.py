@@ -37,7 +37,8 @@ class FrameMatch(NamedTuple):
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that match something that does not count
-    #: Over all pairs: distance on the floor, levelled alike (m), or difference in bearing (deg)
+    #: Over all pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
+    #: (deg).
     largest_error: float | None
 
 

@@ -33,7 +33,8 @@ _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
 _SIMPLE_MASKS = (0x027, 0x14E, 0x109, 0x0DB)
 _OPENCV_PREFIX = "DICT_"
 
-#: A random pattern is in strong, and in weak, dictionaries with probability 2 to minus these.
+#: A random pattern is in the dictionary with probability 2 to the power of minus this: for strong
+#: dictionaries, and for weak ones.
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)

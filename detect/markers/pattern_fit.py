@@ -38,7 +38,8 @@ _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
 #: If squared residuals in the margin are this many times those inside, the fit excludes it and
 #: this depth inside the marker: blurs, at most a share of a cell's size.
 _SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 2.0, 2.0, 0.5
-#: Largest motion of a corner from the edges' intersection (px or cells), and its share in a step.
+#: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
+#: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 #: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
 #: and of the tone curve's curvature; the largest of the latter.
@@ -52,7 +53,8 @@ _OUTLIER = 3.0
 _LEAST_NOISE = 0.3
 #: Least number of pixels in excess of the number of parameters.
 _SPARE_PIXELS = 12
-#: Approximate largest number of pixels in a fit, and its steps: coarse, to decide, and whole.
+#: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
+#: decide whether it may be that marker.
 _FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
 
 

@@ -25,7 +25,8 @@ Axes = Literal["robotics", "dataset"]
 #: Meaning of the axes.
 MEANING: dict[str, str] = {"robotics": "X forward, Y left", "dataset": "X left, Y backward"}
 
-# Indices and signs of the old coordinates; for the conversion back, the first two signs differ.
+# Indices and signs of the old coordinates that become the new first, second and third; for the
+# conversion back, the signs of the first two differ.
 _ORDER = np.array([1, 0, 2])
 _SIGNS = np.array([-1.0, 1.0, 1.0])
 

@@ -20,8 +20,10 @@ from redetect.plane import between, log_motion
 #: Noise of a robot at rest, without which covariances would be singular.
 CREEP_M2_PER_S = (1e-4) ** 2
 CREEP_RAD2_PER_S = (1e-4) ** 2
-# The turn scale applies to distinct turns only, larger than this (rad) within a second before and
-# after: if random errors of odometry counted, it would be biased towards -1 (regression dilution).
+# The turn scale applies to distinct turns only: more than this (rad) from a second before to a
+# second after, some four standard deviations of wheels at 1 m/s. Smaller ones may be random errors
+# of odometry, which measured headings contradict, so that the scale would be biased towards -1
+# (regression dilution).
 _DISTINCT_OVER_S = 1.0
 _DISTINCT_RAD = 0.06
 # Odometry pauses if samples are farther apart than both, in seconds and in usual intervals.

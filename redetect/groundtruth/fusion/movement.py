@@ -88,8 +88,9 @@ class MovementProblem:
     """Odometry and measured poses on common nodes, independent of odometry's random errors."""
 
     times_s: FloatArray  # (N,): the nodes
-    # (N, 4): odometry's movement to each node: distances forward and to the left (m) and turn (rad)
-    # of the robot's turning frame; and the turn again if it is a distinct one, else 0.
+    # (N, 4): odometry's movement to each node: distance forward, distance to the left (m) and turn
+    # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
+    # one, else 0.
     controls: FloatArray
     unseen: FloatArray  # (N, 2): more distance (m) and turn (rad) that pauses may hide
     measured: kernels.MeasuredPoses

@@ -105,7 +105,8 @@ class Tracker:
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""
         pose, motion = np.zeros(3), np.zeros(3)
-        # Times of the last set, pose, pose determined in all directions, and search.
+        # Times of the last set, the last pose, the last one determined in all directions, and the
+        # last search.
         before_s = posed_s = determined_s = searched_s = -math.inf
         segment, begun, tracked = -1, 0, False
         for i, t in enumerate(self.sets.times_s.tolist()):
