@@ -98,7 +98,10 @@ def radial_factor_derivative(
 
 @lru_cache(maxsize=256)
 def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
-    """r_max, up to which g(r) grows (first pole of f or zero of g'); past it the image folds."""
+    """r_max, up to which g(r) grows: the first pole of f or zero of g'.
+
+    Past it the image folds back on itself and the projection is undefined.
+    """
     a2, a3, b1, b2, b3 = coef
     k1, k2, k3 = polynomial
     # Coefficients of powers of r, the lowest first; NumPy's classes for them take much longer.
@@ -134,7 +137,10 @@ def _first_positive_root(polynomial: ArrayLike) -> float:
 def inverse_table(
     coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
 ) -> tuple[FloatArray, FloatArray]:
-    """Distorted radii, growing up to the fold or `RADIUS_LIMIT`, and the undistorted ones there."""
+    """Distorted radii, growing, and the undistorted radii that are seen there.
+
+    16384 of each, from 0 to the fold or `RADIUS_LIMIT`; read only.
+    """
     limit = min(fold_radius(coef, polynomial), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, np.arctan(limit), _TABLE_NODES))
     radius[-1] = limit
@@ -250,7 +256,10 @@ def _least_determinant(
 
 
 def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) -> FloatArray:
-    """Undistorted normalised coordinates of distorted ones, by `kernels.straightened_point`."""
+    """Undistorted normalised coordinates of distorted ones, all terms undone.
+
+    Newton's method from the radial inverse (`camera.kernels.straightened_point`).
+    """
     from camera.kernels import straighten_points
 
     seen = np.ascontiguousarray(distorted, dtype=np.float64).reshape(-1, 2)

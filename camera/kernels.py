@@ -1,4 +1,7 @@
-"""Compiled projection of points and its inverse, as `camera.model` and `distortion` define them."""
+"""Compiled projection of single points and its inverse, for tables that need millions of them.
+
+`camera.model` and `camera.distortion` are the definitions; tests compare both.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,10 @@ def camera_numbers(camera: Camera) -> FloatArray:
 
 
 def published_camera_numbers(camera: Camera) -> FloatArray:
-    """`camera_numbers` of the data set's detector: the rotation's transpose for its inverse."""
+    """`camera_numbers` of the data set's own detector.
+
+    It uses the transpose of the rotation, which the file gives in few digits, not the inverse.
+    """
     numbers = camera_numbers(camera)
     numbers[10:19] = camera.rotation.T.ravel()
     return numbers

@@ -132,7 +132,8 @@ class Camera:
     def camera_from_robot(self) -> FloatArray:
         """(3, 3) inverse of `rotation`.
 
-        Not quite the transpose, as files give few digits: pixels come back from the floor.
+        Files give rotations in few digits, so this is not exactly the transpose; with it, what goes
+        from pixel to floor comes back to the same pixel.
         """
         return _read_only(np.asarray(np.linalg.inv(self.rotation), dtype=np.float64))
 
@@ -194,7 +195,10 @@ class Camera:
     # -- camera frame <-> pixels ------------------------------------------------------------
 
     def distort(self, normalised: ArrayLike) -> FloatArray:
-        """(..., 2) pixels of (..., 2) undistorted normalised coordinates; NaN past the fold."""
+        """(..., 2) pixels of (..., 2) undistorted normalised coordinates px/pz, py/pz.
+
+        Both NaN past the distortion's fold.
+        """
         (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
         factor = distortion.radial_factor(radius, self.coef, self.polynomial)
         pixels = scale * xy * factor[..., None]
@@ -210,7 +214,10 @@ class Camera:
         return np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2) undistorted normalised coordinates of (..., 2) pixels; NaN past the fold."""
+        """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
+
+        Pixels need not be inside the image; both are NaN where nothing is seen (past the fold).
+        """
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
             return distortion.straightened(seen, self.coef, self.brown, self.r_max)
@@ -220,7 +227,10 @@ class Camera:
         return np.asarray(seen / factor[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
-        """(..., 2) pixels of (..., 3) points in the camera frame (m); NaN behind, past the fold."""
+        """(..., 2) pixels of (..., 3) points in the camera frame (m).
+
+        Both NaN for points not in front of the camera or past the distortion's fold.
+        """
         return self.distort(_normalised(points_camera)[0])
 
     def pixel_grid(self) -> FloatArray:
@@ -229,7 +239,10 @@ class Camera:
         return np.stack([u, v], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 3) directions (x, y, 1), camera frame, of (..., 2) pixels; NaN past the fold."""
+        """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
+
+        All NaN past the fold.
+        """
         xy = self.undistort(pixels)
         ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
         return np.concatenate([xy, ones], axis=-1)
@@ -255,7 +268,10 @@ class Camera:
         return self.unproject(pixels) @ self.rotation.T
 
     def floor_from_pixel(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2) floor positions X, Y (m) that (..., 2) pixels see; NaN if they see none."""
+        """(..., 2) places X, Y in the robot frame (m) where rays of (..., 2) pixels meet the floor.
+
+        NaN where the ray does not come down to the floor.
+        """
         direction = self.directions_robot(pixels)
         down = np.where(direction[..., 2] * self.centre[2] < 0.0, direction[..., 2], np.nan)
         along = -self.centre[2] / down
@@ -270,7 +286,10 @@ class Camera:
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
-        """(..., 2, 3) d(u, v) / d(point) of `project`, pixels per metre; NaN where undefined."""
+        """(..., 2, 3) derivatives of (u, v) of `project` by the (..., 3) points, analytic.
+
+        Pixels per metre; NaN where the projection is undefined.
+        """
         xy, depth = _normalised(points_camera)
         perspective = np.zeros((*depth.shape, 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
@@ -279,11 +298,18 @@ class Camera:
         return np.asarray(self.distort_jacobian(xy) @ perspective)
 
     def floor_jacobian(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2, 2) d(X, Y) / d(u, v) at (..., 2) pixels, m per px; NaN if they see no floor."""
+        """(..., 2, 2) derivatives of the floor's (X, Y) by (u, v) at (..., 2) pixels, analytic.
+
+        Metres per pixel; NaN where the pixel does not see the floor.
+        """
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.camera_from_robot)
 
     def floor_jacobian_published(self, pixels: ArrayLike) -> FloatArray:
-        """`floor_jacobian` of the data set's detector: the transpose for the inverse rotation."""
+        """d(floor X, Y) / d(u, v) as the data set's own detector has it.
+
+        Its projection turns by the transpose of `rotation`, which differs from the inverse in the
+        last digits that the file has. Shapes as in `floor_jacobian`.
+        """
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.rotation.T)
 
     def _floor_jacobian(self, floor_xy: FloatArray, camera_from_robot: FloatArray) -> FloatArray:
@@ -294,7 +320,10 @@ class Camera:
 
 
 def _normalised(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """(..., 2) normalised coordinates of points in the camera frame, (...) depths; NaN behind."""
+    """(..., 2) normalised coordinates of points in the camera frame, and (...) depths (m).
+
+    NaN for points not in front of the camera.
+    """
     p = np.asarray(points_camera, dtype=np.float64)
     depth = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
     with np.errstate(over="ignore"):  # a point all but beside the camera

@@ -71,7 +71,10 @@ def check_one_to_one(camera: Camera) -> None:
 
 
 def seen_share(camera: Camera) -> float:
-    """Share of the image's pixels with a direction: less than 1 if the distortion folds in it."""
+    """Share of the image's pixels with a direction: 1 if the distortion folds outside the image.
+
+    Fits with few coefficients often fold in the corners, where there was no board.
+    """
     if _first_unseen(camera) is None:
         return 1.0
     middles = (np.arange(_PLACES) + 0.5) / _PLACES
@@ -80,7 +83,10 @@ def seen_share(camera: Camera) -> float:
 
 
 def _first_unseen(camera: Camera) -> FloatArray | None:
-    """The first pixel along the border that sees nothing; without one, all of the image is seen."""
+    """The first pixel along the border that sees nothing.
+
+    What a lens sees has no holes: it contains an image whose border it contains.
+    """
     border = border_pixels(camera.width, camera.height, _PLACES)
     seen = _is_seen(camera, border)
     return None if seen.all() else border[np.argmin(seen)]

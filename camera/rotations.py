@@ -26,7 +26,10 @@ def cross_matrices(vectors: FloatArray) -> FloatArray:
 
 
 def left_jacobian(vectors: FloatArray) -> FloatArray:
-    """(..., 3, 3) left Jacobians J: to first order, exp([v + d]x) = exp([J d]x) exp([v]x)."""
+    """(..., 3, 3) left Jacobians J of rotations, of (..., 3) rotation vectors.
+
+    To first order in d, ``exp([v + d]x) = exp([J d]x) exp([v]x)``.
+    """
     angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
     # (1 - cos a)/a^2 and (a - sin a)/a^3, both defined at a = 0.
     versine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2

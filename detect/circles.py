@@ -22,7 +22,7 @@ from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import JUDGED, Judgement, judge
+from detect.discs.judgement import JUDGED, JudgedCandidates, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
@@ -55,10 +55,10 @@ _numbers = lru_cache(maxsize=4)(camera_numbers)
 class CircleDetections(ByContent):
     """The discs found in one image, in scan order of their pixels."""
 
-    pixels: IntArray  #: (N, 2) pixel (u, v) of each local maximum of the quality
+    pixels: IntArray  #: (N, 2) pixels (u, v) of the centres; the published detector's maxima
     floor_xy: FloatArray  #: (N, 2) position in the robot frame, metres
     covariance: FloatArray  #: (N, 2, 2) of the position, square metres
-    quality: FloatArray  #: (N,) Otsu's quality at the pixel, 0 to 1
+    quality: FloatArray  #: (N,) Otsu's quality, 0 to 1: of the rim; the published one of the pixel
     evidence: FloatArray  #: (N,) log-odds that it is a disc; NaN where nothing was fitted
     #: Pitch and roll (rad) that turned the positions level, if any did
     levelled_by: tuple[float, float] | None = None
@@ -110,13 +110,46 @@ def detect_circles(
     image = plain_image(image, (camera.height, camera.width))
     if isinstance(table, DiscTable):
         return _by_quality(image, camera, table, settings)
+    return _by_rims(image, camera, table, settings)
+
+
+def _by_rims(
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
+) -> CircleDetections:
+    """The default detector: finds discs by their rims and locates them by fits."""
+    image, camera, table, left = within_margins(image, camera, table, settings)
+    scene = scene_of(image, camera, table, settings)
+    discs, log_odds = judged_discs(scene, table, settings)
+    floor_xy, fitted = place_discs(scene, discs, working_space()[0])
+    seen_at = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
+    # If the centre is outside the image, too little of the disc is visible to locate it.
+    in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
+    order = np.flatnonzero(in_sight)
+    order = order[np.lexsort((seen_at[order, 0], seen_at[order, 1]))]
+    floor_xy = floor_xy[order]
+    return CircleDetections(
+        pixels=seen_at[order].astype(np.int64) + np.array([left, 0]),
+        floor_xy=floor_xy,
+        covariance=refined_covariance(
+            camera, floor_xy, fitted[order], settings.systematic_px, settings.tilt_sigma_rad
+        ),
+        quality=discs.quality[order],
+        evidence=log_odds[order],
+    )
+
+
+def within_margins(
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
+) -> tuple[GreyImage, Camera, VoteTable, int]:
+    """The image without blank columns at its sides, its camera and table; the columns at the left.
+
+    Parameters as for `detect_circles`.
+    """
     left, right = blank_margins(image)
-    if not (left or right):
-        return _by_rims(image, camera, table, settings)
-    camera, table = _between_margins(camera, left, right, vote_shape(settings))
-    image = np.ascontiguousarray(image[:, left : left + camera.width])
-    found = _by_rims(image, camera, table, settings)
-    return replace(found, pixels=found.pixels + np.array([left, 0]))
+    if left or right:
+        camera, table = _between_margins(camera, left, right, vote_shape(settings))
+        image = np.ascontiguousarray(image[:, left : left + camera.width])
+    return image, camera, table, left
 
 
 @lru_cache(maxsize=8)
@@ -129,37 +162,20 @@ def _between_margins(
     return camera, cached_vote_table(camera, shape)
 
 
-def _by_rims(
-    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
-) -> CircleDetections:
-    """The default detector: finds discs by their rims and locates them by fits."""
-    noise = estimate_noise(image, _NOISE_ROWS)
-    discs, log_odds = judged_discs(image, camera, table, settings, noise)
-    scene = scene_of(image, camera, table, settings, noise)
-    floor_xy, fitted = place_discs(scene, discs, working_space()[0])
-    seen_at = np.rint(project_floor_points(_numbers(camera), floor_xy))
-    # If the centre is outside the image, too little of the disc is visible to locate it.
-    in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
-    order = np.flatnonzero(in_sight)
-    order = order[np.lexsort((seen_at[order, 0], seen_at[order, 1]))]
-    floor_xy = floor_xy[order]
-    return CircleDetections(
-        pixels=seen_at[order].astype(np.int64),
-        floor_xy=floor_xy,
-        covariance=refined_covariance(
-            camera, floor_xy, fitted[order], settings.systematic_px, settings.tilt_sigma_rad
-        ),
-        quality=discs.quality[order],
-        evidence=log_odds[order],
-    )
+def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:
+    """An image with what all stages need; parameters as for `detect_circles`."""
+    # Optics blur equally in all directions. Where pixels are not square, as in single fields of
+    # interlaced frames, the same blur spans fewer pixels along v.
+    ratio = camera.scale_y / camera.scale_x
+    noise = max(estimate_noise(image, _NOISE_ROWS), _ROUNDING_NOISE)
+    return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 
 def judged_discs(
-    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
-) -> tuple[Judgement, FloatArray]:
-    """The candidates that are discs, and their log-odds; parameters as for `candidates_of`."""
-    candidates = candidates_of(image, table, settings, noise)
-    judgement = judged(image, camera, settings, candidates, noise)
+    scene: Scene, table: VoteTable, settings: CircleSettings
+) -> tuple[JudgedCandidates, FloatArray]:
+    """The candidates that are discs, and their log-odds."""
+    judgement = judged(scene, settings, candidates_of(scene, table, settings))
     log_odds = adjusted_log_odds(judgement, settings)
     taken = np.flatnonzero(log_odds >= settings.evidence)
     best_first = np.argsort(-log_odds[taken], kind="stable")
@@ -168,29 +184,24 @@ def judged_discs(
     return judgement.where(best), log_odds[best]
 
 
-def candidates_of(
-    image: GreyImage, table: VoteTable, settings: CircleSettings, noise: float
-) -> HoughCandidates:
-    """Centres for which edges vote; parameters as for `detect_circles`, plus the noise."""
-    usual = min(max(steep_gradient(image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
-    edge = max(usual, _EDGE_NOISE * settings.noise_floor * max(noise, _LEAST_NOISE))
-    return hough_candidates(image, table, settings.radius_m, _SIGNS[settings.polarity], edge)
+def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> HoughCandidates:
+    """Centres for which edges vote."""
+    usual = min(max(steep_gradient(scene.image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
+    edge = max(usual, _EDGE_NOISE * settings.noise_floor * max(scene.noise, _LEAST_NOISE))
+    return hough_candidates(scene.image, table, scene.radius, _SIGNS[settings.polarity], edge)
 
 
 def judged(
-    image: GreyImage, camera: Camera, settings: CircleSettings, candidates: HoughCandidates,
-    noise: float, networks: Networks | None = None,
-) -> Judgement:  # fmt: skip
-    """Classify candidates (see `detect.discs.judgement`); parameters as for `candidates_of`.
-
-    `networks` defaults to the trained ones.
-    """
-    weakest = settings.noise_floor * max(noise, _LEAST_NOISE)
+    scene: Scene, settings: CircleSettings, candidates: HoughCandidates,
+    networks: Networks | None = None,
+) -> JudgedCandidates:  # fmt: skip
+    """Classify candidates (`detect.discs.judgement`), by default with the trained networks."""
+    weakest = settings.noise_floor * max(scene.noise, _LEAST_NOISE)
     step, networks = max(weakest, _LEAST_STEP), networks or trained_networks()
-    return judge(image, candidates, settings.radius_m, step, _numbers(camera), networks)
+    return judge(scene.image, candidates, scene.radius, step, scene.camera_numbers, networks)
 
 
-def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
+def adjusted_log_odds(judgement: JudgedCandidates, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
     rims = np.flatnonzero(judgement.fate == JUDGED)
     step, log_odds = judgement.step[rims], judgement.log_odds[rims]
@@ -201,16 +212,6 @@ def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatAr
     adjusted = np.full(len(judgement.fate), -np.inf)
     adjusted[rims] = log_odds - penalty
     return adjusted
-
-
-def scene_of(
-    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings, noise: float
-) -> Scene:
-    """The input of the fits in an image; parameters as for `detect_circles`."""
-    # Optics blur equally in all directions. Where pixels are not square, as in single fields of
-    # interlaced frames, the same blur spans fewer pixels along v.
-    ratio, noise = camera.scale_y / camera.scale_x, max(noise, _ROUNDING_NOISE)
-    return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 
 def _by_quality(

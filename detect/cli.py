@@ -68,9 +68,11 @@ class DetectProgram(Program):
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
         """Parse a command line; exits after `--help` and on errors."""
         arguments = [*_in_present_spelling(arguments)]
-        if arguments:
-            joined = re.sub("--radius-m[=\0]auto", "--find-radius", "\0".join(arguments))
-            arguments = joined.split("\0")
+        radius = ArgumentParser(add_help=False, allow_abbrev=False)
+        radius.add_argument("--radius-m", dest="given", nargs="?", action="append", default=[])
+        found, rest = radius.parse_known_args(arguments)
+        if "auto" in found.given and arguments[0] in ("circles", "all"):
+            arguments = [*rest, "--find-radius"]
         deciding = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--preset", "--settings"):
             deciding.add_argument(flag, nargs="?", default="", const="")
@@ -126,7 +128,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     code = PROGRAM.main(arguments)
     if code == EXIT_INTERRUPTED and arguments is None:
-        # Otherwise, Python dies of an interrupt that passed through some library's `exec`.
+        # Otherwise, Python dies of an interrupt that passed through some library's `exec`, even if
+        # it was caught.
         atexit._run_exitfuncs()
         os._exit(code)
     return code

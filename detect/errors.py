@@ -9,7 +9,10 @@ EXIT_FRAMES_FAILED = 3
 
 
 class DetectError(OneLineError, ValueError):
-    """A run or setting that cannot be processed; the message states what was expected."""
+    """A run or setting that cannot be processed.
+
+    The message names the file or the setting, its value and what was expected.
+    """
 
 
 class FrameError(OneLineError, ValueError):

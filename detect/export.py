@@ -102,7 +102,10 @@ def _times(command: Export) -> dict[str, float] | None:
 def read_tables(
     path: Path, times: Mapping[str, float] | None, rate_hz: float | None
 ) -> dict[TableName, list[Row]]:
-    """The tables of a file, that of its name first, perhaps empty, with the times of frames."""
+    """The tables of a landmark or tilt file; the first is implied by its name, and may be empty.
+
+    The times of frames are from `times`, by prefix, or from the frame rate, if known.
+    """
     named = _TABLES.get(path.suffix)
     tables: dict[TableName, list[Row]] = {} if named is None else {named: []}
     image, time_s = "", None

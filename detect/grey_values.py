@@ -29,7 +29,8 @@ _ROWS_APART = 4
 def plain_image(image: GreyImage, shape: tuple[int, int] | None = None) -> GreyImage:
     """The image in the form for which kernels are compiled: row by row, and writeable.
 
-    Copied if necessary; FrameError if it is not (H, W) uint8, or not of a calibration's `shape`.
+    It is copied if it is not; for a read-only one, Numba would compile every kernel once more.
+    Raises `FrameError` if it is not (H, W) uint8, or not of a calibration's `shape`.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise FrameError(
@@ -108,7 +109,8 @@ def steep_gradient(image: GreyImage, most_rows: int) -> float:
 def blank_margins(image: GreyImage) -> tuple[int, int]:
     """Number of blank columns at the left and right of an image (H, W).
 
-    In digitized video, lines often begin late; a disc that is cut there does not end there.
+    In digitized video, lines often begin late: the first columns have a constant grey value, with a
+    sharp edge to the image. A disc that is cut there must not be mistaken for one that ends there.
     """
     rows = image[::_ROWS_APART]
     return _blank(rows), _blank(rows[:, ::-1])

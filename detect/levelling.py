@@ -40,7 +40,10 @@ _tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
 
 def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> CircleDetections:
-    """The discs corrected for the tilt of their frame, without those above the level horizon."""
+    """The same discs, their positions and covariances corrected for the tilt of their frame.
+
+    Discs above the horizon of the levelled camera are dropped.
+    """
     floor_xy, covariance, down = level_discs(
         camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
     )
@@ -49,7 +52,10 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
-    """Discs of a leaning camera at the floor positions of the camera as calibrated, if any."""
+    """Convert discs of a leaning camera to the floor positions of the camera as calibrated.
+
+    Discs above the horizon of the latter are dropped.
+    """
     pixels = leaning.project_floor(found.floor_xy)
     floor_xy = camera.floor_from_pixel(pixels)
     jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
@@ -74,8 +80,9 @@ def level_discs(
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
     Positions are those of the calibrated camera on a level robot. Pitch and roll (rad) and their
-    covariances are given for each, (N, 2) and (N, 2, 2), or once for all; they add to the
-    propagated covariances. NaN, and false in the mask, if the levelled ray misses the floor.
+    covariances are given for each position, (N, 2) and (N, 2, 2), or once for all. The returned
+    covariances are the propagated ones of the positions plus those due to the tilt. If the levelled
+    ray does not meet the floor, numbers are NaN and the mask is false.
     """
     steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])[:, None]
     level_xy, *ends = level_seen(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
@@ -113,7 +120,10 @@ def common_covariance(
 
 
 def common_tilt_variance(camera: Camera) -> FloatArray | None:
-    """(2,) variances of a pitch and roll common to all frames, rad^2; None if they are unknown."""
+    """(2,) variances of pitch and roll from verticals that are common to all frames, rad^2.
+
+    None if the camera has no covariance.
+    """
     covariance = covariance_of(camera)
     if covariance is None:
         return None

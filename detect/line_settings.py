@@ -30,7 +30,7 @@ _WIDTH = Bounds("a number above 1, at most 10", lambda x: 1.0 < x <= 10.0)
 
 @dataclass(frozen=True)
 class LineSettings:
-    """Parameters of the detector of verticals. The defaults are the all-round preset.
+    """Parameters of the detector of verticals.
 
     Lengths along a line are in pixel widths, so that they apply to full frames and to single
     fields, whose rows are twice as high; parameters of the filter are in rows. Parameters named

@@ -157,7 +157,11 @@ def mounting_of_run(
 
 
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
-    """The camera as it is mounted; in a stated covariance, pitch, roll and height are new."""
+    """The camera as it is mounted, turned about the robot's origin on the floor.
+
+    If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
+    mounting's; the rest stays.
+    """
     turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
     pitch, roll = mounting.tilt_rad

@@ -40,8 +40,9 @@ class SourceOptions(Bounded, error=DetectError):
     """Options of a source besides its name."""
 
     #: Source of the steps, if not the image source itself: a TUM trajectory (.tum; rows t x y z qx
-    #: qy qz qw, X forward), wheel encoder counts (.ticks; rows t left right), a file of STEP rows
-    #: of image files, a nav_msgs/Odometry topic of the bag (/odom), or none.
+    #: qy qz qw, X forward), wheel encoder counts (.ticks; rows t left right), velocities
+    #: (.velocities; rows t v omega sigma_v sigma_omega), a file of STEP rows of image files, a
+    #: nav_msgs/Odometry topic of the bag (/odom), or none.
     odometry: str = ""
     wheel_base_m: NotNegative = 0.0  #: Distance between the two wheels, for .ticks.
     metres_per_tick: NotNegative = 0.0  #: Distance that a wheel travels per tick.

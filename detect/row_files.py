@@ -12,13 +12,17 @@ from types import MappingProxyType
 from camera import Camera
 from detect.errors import DetectError
 from detect.options import RowFiles
-from detect.runs.outputs import LEVEL, LEVELLED
-from detect.runs.plan import FramesByImage
+from detect.runs.plan import FramesByImage, tilts_by_image
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import word_value
+from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun
-from redetect.landmarks import Frame, FrameTilt, read_tilts
+from redetect.landmarks import Frame, FrameTilt
+
+#: Phrases in the head of files whose positions are levelled, or corrected for the tilt.
+LEVEL = "level robot frame"
+LEVELLED = "corrected for the tilt of the frames that have one"
 
 KINDS = ("circles", "lines", "markers", "tilt")
 # The head is the part before the first row; real ones are much shorter.
@@ -27,7 +31,11 @@ _LONGEST_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class FileHead:
-    """The known parts of the head of a file of rows; missing settings have their defaults."""
+    """The known parts of the head of a file of rows.
+
+    Settings that it does not contain have their defaults; a DetectError is raised if one has an
+    impossible value.
+    """
 
     comments: tuple[str, ...] = ()  # its lines without comment signs
     settings: tuple[tuple[str, str], ...] = ()  # names and values, as written
@@ -95,7 +103,7 @@ class RunRows:
             unlisted = reference["circles"].parent / "unlisted.circles"
             files |= {"unlisted": unlisted} if unlisted.is_file() else {}
         self._frames = {kind: FramesByImage(path) for kind, path in files.items()}
-        self._tilts = read_tilts(detected["tilt"]) if "tilt" in detected else {}
+        self._tilts = tilts_by_image(detected["tilt"]) if "tilt" in detected else {}
 
     @cached_property
     def circle_settings(self) -> CircleSettings:
@@ -105,7 +113,7 @@ class RunRows:
     def of(self, prefix: str) -> SeenRows:
         """The rows of an image, by the prefix of its STEP."""
         frames = {kind: source.get(prefix) for kind, source in self._frames.items()}
-        return SeenRows(**frames, tilt=self._tilts.get(prefix))
+        return SeenRows(**frames, tilt=self._tilts.get(image_name(prefix)))
 
     def sight(self, camera: Camera) -> Sight:
         """The projection of discs into the images of a camera."""
@@ -114,7 +122,11 @@ class RunRows:
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
-    """Index the files of a run's rows; DetectError without any, LandmarkFileError if bad."""
+    """Find the files of a run's rows, and index them.
+
+    Raises DetectError if there are none, or given reference rows do not exist, and
+    redetect.landmarks.LandmarkFileError if one is malformed.
+    """
     usual = {
         kind: run.output(kind) if options.rows is None else options.rows / f"detected.{kind}"
         for kind in KINDS

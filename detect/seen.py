@@ -1,4 +1,7 @@
-"""Maps rows of discs back into the image: undoes the levelling, then projects; plain NumPy."""
+"""Maps rows of discs back into the image: undoes the levelling, then projects through the lens.
+
+Plain NumPy, so that comparing files does not load the compiler.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,8 @@ def image_positions(
 ) -> FloatArray:
     """(..., 2) pixels of positions (..., 2) on the floor (m); NaN where not visible.
 
-    `levelled_by` are the pitch and roll (rad) of that, and the camera is `raised_m` higher.
+    `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
+    `raised_m` higher than calibrated.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
@@ -44,9 +48,10 @@ def image_positions(
 def level_seen(
     camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
-    """Level the floor positions (..., 2) (m) that the calibrated camera measures.
+    """Level the floor positions (m) that the calibrated camera measures.
 
-    Pitch and roll (..., 2) (rad) are broadcast. NaN where the levelled ray misses the floor.
+    Positions (..., 2) were computed without the tilt; pitch and roll (..., 2) (rad) are given once
+    for all or broadcast against them. NaN where the levelled ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_matrix(levelled_by)
@@ -64,7 +69,10 @@ def level_matrix(levelled_by: ArrayLike) -> FloatArray:
 
 
 def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
-    """The camera raised, then leaning by pitch and roll (rad); without its covariance."""
+    """The camera mounted higher, then leaning by pitch and roll (rad).
+
+    These level directions, about the robot's origin on the floor. The covariance is dropped.
+    """
     turn = level_matrix(lean)
     centre = camera.centre + np.array([0.0, 0.0, raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ centre])
@@ -129,7 +137,10 @@ class Sight:
         return np.where(np.isfinite(xy), xy, reference_xy)
 
     def gates(self, reference_xy: FloatArray) -> FloatArray:
-        """(N, 2) half sizes of imaged discs, px, at least `LEAST_GATE_PX`; more without a tilt."""
+        """(N, 2) half widths and heights of imaged discs, at least `LEAST_GATE_PX`, pixels.
+
+        Wider where the tilt between the reference and the detected rows is unknown.
+        """
         edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
         seen = np.isfinite(edge)
         low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)

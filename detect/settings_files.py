@@ -1,7 +1,8 @@
 """Reads and writes settings of detectors, to repeat a run or to change it.
 
-Like the JSON file beside every result (`detected.log.json`), a file has an object for each kind,
-``circles``, ``lines``, ``markers``, under ``settings``; missing ones have their defaults.
+The JSON file beside every result (`detected.log.json`) contains its settings under ``settings``,
+one object for each kind: ``circles``, ``lines``, ``markers``. Settings files have the same form
+without other content; missing kinds and settings have their defaults.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -67,8 +68,11 @@ def checked_settings(name: str, values: Any, kind: type[Settings]) -> Settings:
 
 
 def setting_value(kind: type, name: str, value: Any) -> Any:
-    """A setting's value from JSON; DetectError if it is unknown or has another type."""
-    hints = get_type_hints(kind)
+    """Convert a JSON value to that of a setting, a field of a dataclass.
+
+    Raises DetectError if there is no such field, or the value has another type.
+    """
+    hints = {each.name: get_type_hints(kind)[each.name] for each in fields(kind)}
     if name not in hints:
         raise DetectError(
             f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"
@@ -99,7 +103,10 @@ def _of_type(hint: Any, value: Any) -> Any:
 
 
 def word_value(kind: type, name: str, word: str) -> Any:
-    """A setting's value from a word; DetectError if it is unknown or that fails."""
+    """Convert a word of a command line or of a file's head to the value of a setting.
+
+    Raises DetectError if that fails, or there is no such setting.
+    """
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
     for number in (float, int):  # a float setting accepts whole numbers
         with suppress(ValueError):

@@ -1,6 +1,7 @@
 """Messages and progress of long work on the terminal.
 
-Compiling and tables are announced through the logger ``redetect``, by commands on stderr.
+Compilation of kernels and computation of tables are announced through the logger ``redetect``,
+which other programs can configure; the command line shows it on stderr.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def show_announcements() -> None:
 @cache
 def say_compiling() -> None:
     """Announce, once, that kernels are compiled."""
-    _log.info("compiling kernels, once: about a minute")
+    _log.info("compiling kernels, once: about half a minute")
 
 
 def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
@@ -63,7 +64,8 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields a function to call after every frame.
 
-    That raises lost interrupts. The bar appears with the first frame, after workers' messages.
+    That function raises an interrupt that was lost. The bar appears with the first frame, since
+    workers may print messages until then.
     """
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted

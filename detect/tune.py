@@ -66,8 +66,10 @@ def perform(options: Tune) -> int:
     output = run.output("tune") if options.output is None else options.output
     frames = SomeFrames(run.frames, every=options.every)
     if options.serve:
-        from detect.tuning_page import TuningSession, serve  # nothing else needs a server
+        # Nothing else needs a server.
+        from detect.tuning_page import LABELS_NAME, SETTINGS_NAME, TuningSession, serve
 
+        demand_free([output / SETTINGS_NAME, output / LABELS_NAME], overwrite=options.force)
         return serve(TuningSession(run, list(frames), base, output, options.force), options.port)
 
     names = "table.json", "curve.png"
@@ -149,7 +151,8 @@ def parameter_values(name: str, text: str) -> tuple[Any, ...]:
 def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
     """All combinations of the values of parameters, written as for `parameter_values`.
 
-    In the order of `varied`, the last varies fastest. DetectError if there are none or too many.
+    Each has the names and values in the order of `varied`; the last varies fastest. Raises
+    DetectError if nothing is varied, or there are too many, and as `parameter_values` does.
     """
     if not varied:
         raise DetectError(
@@ -218,7 +221,10 @@ def marked(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
-    """(M,) settings on the Pareto front, by increasing recall; NaN rates are undefined."""
+    """(M,) indices of the settings on the Pareto front of recall and precision.
+
+    By increasing recall; of equals the first. Recalls and precisions (N,) are NaN if undefined.
+    """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     known = np.flatnonzero(np.isfinite(r) & np.isfinite(p))
     # By decreasing recall, then precision: points no better than those before are dominated.
@@ -230,9 +236,10 @@ def pareto_front(recall: ArrayLike, precision: ArrayLike) -> NDArray[np.intp]:
 def knee(recall: ArrayLike, precision: ArrayLike) -> int | None:
     """The setting at the knee of the curve of precision over recall; None without any.
 
-    That is the point of the front farthest beyond the chord between its ends, axes scaled to its
-    extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a Haystack, 2011). If none is
-    beyond, the one with the largest harmonic mean of recall and precision is used.
+    That is the point of the front farthest beyond the chord between the front's ends, both axes
+    scaled to the front's extent (Satopää, Albrecht, Irwin, Raghavan: Finding a "Kneedle" in a
+    Haystack, 2011). If no point is beyond the chord, there is no knee, and the point with the
+    largest harmonic mean of recall and precision is used instead.
     """
     r, p = np.asarray(recall, np.float64), np.asarray(precision, np.float64)
     front = pareto_front(r, p)

@@ -36,7 +36,10 @@ class TableError(OneLineError, ValueError):
 
 @dataclass(frozen=True)
 class DiscShape:
-    """Samples around a centre, nearest and farthest centres; bounds: `CircleSettings`."""
+    """Samples around a centre, and the nearest and farthest centres.
+
+    The bounds are those of the detector's settings (`detect.settings.CircleSettings`).
+    """
 
     inner_radius_m: float = 0.06  #: Radius of the inner outline on the floor, metres.
     outer_radius_m: float = 0.14  #: Radius of the outer one.
@@ -45,7 +48,8 @@ class DiscShape:
     border_px: int = 12  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: float = 0.05
-    #: Least number of sample pairs inside the image; 0: samples are counted singly.
+    #: Least number of sample pairs (an inner and an outer one) inside the image; 0: samples are
+    #: counted singly.
     least_pairs: int = 0
     #: Samples of a pair on the same pixel are moved inwards and outwards by the length on the floor
     #: of this many image rows.
@@ -56,7 +60,10 @@ class DiscShape:
 
 
 class CentreGroups(NamedTuple):
-    """Neighbouring centres in a row, within `GROUP_COLUMNS`, with samples at equal offsets."""
+    """Neighbouring centres with some samples at the same offset from each centre.
+
+    A group's centres are in one row, within `GROUP_COLUMNS` of each other.
+    """
 
     first: NDArray[np.int32]  # (G,) the first centre of each group
     #: (G,) bit mask of the columns of its centres, counted from the first
@@ -124,7 +131,11 @@ def demand_above_floor(camera: Camera) -> None:
 
 
 def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
-    """Compute the outlines' pixels around tested centres; TableError if not above the floor."""
+    """Compute the outlines' pixels around the tested centres.
+
+    A camera that sees no usable floor (looking up, say) gets a table without centres; a camera that
+    is not above the floor raises a TableError.
+    """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
     down, paired = size_down(floor_xy), shape.least_pairs > 0
@@ -251,7 +262,10 @@ def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> B
 
 
 def _strided(columns: IntArray, step: FloatArray) -> list[int]:
-    """Indices of columns at least the step of the one before, or twice their own, apart."""
+    """Indices of columns that are at least the previous one's step apart.
+
+    If steps grow fast along a row, with a very wide lens, twice a column's own step is sufficient.
+    """
     kept: list[int] = []
     last, following = 0, 0
     for k, (column, apart) in enumerate(zip(columns.tolist(), step.tolist())):

@@ -65,7 +65,8 @@ class VerticalTable:
 def build_vertical_table(camera: Camera) -> VerticalTable:
     """Compute the anchor and the verticals through it, for a calibrated camera in any pose.
 
-    There are none in columns without anchor, or more than 45 deg past the horizon.
+    Columns whose anchor lies outside the image have no vertical; a camera that looks more than 45
+    deg past the horizon gets a table without verticals.
     """
     height, width = camera.height, camera.width
     normalised = camera.undistort(camera.pixel_grid())
@@ -164,7 +165,8 @@ def trace_verticals(
 ) -> None:
     """Follow (N,) verticals from the anchor up and down, row by row, through a camera.
 
-    Results: (H, N) `column`, `elevation` (rad); NaN where not visible continuously from there.
+    Results are (H, N) `column` and `elevation` (rad) of each vertical in each row; NaN where it is
+    not visible, or not continuously from the anchor on.
     """
     column[:] = elevation[:] = math.nan
     for n in range(len(bearing)):
@@ -189,7 +191,10 @@ def trace_verticals(
 def _crossing(
     numbers: FloatArray, bearing: float, row: float, angle: float
 ) -> tuple[float, float, float]:
-    """Column and elevation where a vertical crosses a row, its rows per radian; NaN if nowhere."""
+    """Column and elevation at which a vertical crosses a row, and its rows per radian there.
+
+    By Newton's method from an elevation nearby; NaN if there is no crossing.
+    """
     for _ in range(_NEWTON_STEPS):
         u, v = _seen(numbers, bearing, angle)
         slope = (_seen(numbers, bearing, angle + _STEP_RAD)[1] - v) / _STEP_RAD

@@ -21,7 +21,8 @@ from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 _CELL_RADII, _CELL_PX = 0.25, 0.8
 #: Resolution of the lookup from distance ahead to row of cells, steps per radius.
 _STEPS_PER_RADIUS = 16.0
-#: If all discs are this wide (px), columns are paired; if this high, every second row votes, etc.
+#: If every disc is this wide (pixels), columns are added in pairs; if it is this high, every second
+#: row votes, and so on.
 _WIDE_PX, _HIGH_PX = 9.0, 6.0
 
 
@@ -59,7 +60,10 @@ class VoteTable(NamedTuple):
 
 
 def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
-    """Compute the cells of all centres; a TableError if the camera is not above the floor."""
+    """Compute the cells from the nearest to the farthest centre.
+
+    A camera that is not above the floor raises a TableError.
+    """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
     foot, radius = np.array(camera.centre[:2]), shape.radius_m

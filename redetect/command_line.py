@@ -130,7 +130,8 @@ class Program:
 
     name: str
     description: str  # for its `--help`
-    #: Dataclasses of flags, called as their commands, and the module whose `perform` executes each.
+    #: Dataclasses of flags, one for each command, whose name is that of the class in lower case,
+    #: and the module whose `perform` executes it.
     performed_by: Mapping[type, str]
     expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
 
@@ -181,8 +182,8 @@ class Program:
             end_with(no_such(f"{self.name}: no command", first, self.commands))
         kind = self.commands[first]
         shown = self._brief(kind) if asked and _HELP_ALL not in asked else kind
-        known = {type(each): {"default": each} for each in defaults}
-        return _parsed_as(shown, known.get(shown, {}), f"{self.name} {first}", words[1:])
+        known = {type(each): {"default": _with_values_of(each, shown)} for each in defaults}
+        return _parsed_as(shown, known.get(kind, {}), f"{self.name} {first}", words[1:])
 
     def carry_out(self, command: Any) -> int:
         """Execute a command; returns the exit code."""
@@ -196,6 +197,18 @@ class Program:
             text, section, parameters = cleandoc(kind.__doc__ or "").partition("\n\nParameters\n")
             short.__doc__ = f"{text}\n\nMore flags are shown by {_HELP_ALL}.{section}{parameters}"
         return short
+
+
+def _with_values_of(values: Any, kind: Any) -> Any:
+    """The values of a dataclass's instance in one of its subclasses without expert flags."""
+    if not issubclass(kind, type(values)) or kind is type(values):
+        return values
+    hints, own = (
+        get_type_hints(kind),
+        {each.name: getattr(values, each.name) for each in fields(kind)},
+    )
+    nested = {name: hints[name] for name, value in own.items() if is_dataclass(value)}
+    return kind(**own | {name: _with_values_of(own[name], inner) for name, inner in nested.items()})
 
 
 def all_but(kind: type, *names: str) -> frozenset[str]:

@@ -65,7 +65,10 @@ def _hands_over(frame: FrameType) -> bool:
 
 @contextmanager
 def interrupts_call(note: Handler) -> Iterator[None]:
-    """Have interrupts call something in a block (main thread only), but not in kernels."""
+    """Have interrupts call something during a block, but not in kernels.
+
+    Outside the main thread it does nothing.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -43,7 +43,10 @@ _INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board as its flags describe it; a CalibrationError if it is impossible."""
+    """A printed board, as its flags describe it (`camera.options.BoardFlags`).
+
+    Raises CalibrationError if such a board is impossible.
+    """
 
     kind: BoardKind
     columns: int

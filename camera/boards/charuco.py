@@ -1,8 +1,9 @@
 """Corners of a ChArUco board: OpenCV reads the markers, and each corner is measured on its edges.
 
-Markers fill most of the white squares, so that a window around a corner has their edges, too, which
-bias it. Instead, two strips along its own edges are measured, as wide as the white margin. Corners
-whose markers were not read (small, oblique or cut off) are searched where neighbours predict them.
+The markers fill most of the white squares. A window around a corner thus contains marker edges,
+which bias the corner. Instead, two strips along the corner's own edges are measured, as wide as the
+white margin between edge and marker. Corners whose markers were not read (small, oblique or cut off
+by the image's border) are searched at positions predicted from their neighbours.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ _FEWEST_FOUND = 4
 
 
 def find_charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    """Indices, ascending, of a ChArUco board's points in an image, and their (K, 2) pixels."""
+    """Which of a ChArUco board's points are in an image, ascending, and their (K, 2) pixels.
+
+    K may be 0. A dictionary that is unknown, or too small for the board, is refused.
+    """
     rows, columns = board.rows - 1, board.columns - 1
     grid = np.full((rows, columns, 2), np.nan)
     indices, pixels = _interpolated(image, board)

@@ -17,8 +17,9 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 _WINDOW = 0.3
 _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW = 2, 9
 _FEWEST_POINTS = 8
-# Longer sides (px) to which an image is reduced, one after the other, to search a checkerboard: the
-# time grows faster than the image, and squares of a few pixels suffice.
+# Lengths of the longer side (px) to which an image is reduced, one after the other, to search a
+# checkerboard. The time of OpenCV's search grows faster than the image, especially without a board,
+# and squares of a few pixels suffice.
 _SEARCHED_PX = (1280, 2048)
 
 
@@ -113,9 +114,10 @@ def _reductions(image: GreyImage) -> Iterator[GreyImage]:
 
 
 def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> FloatArray:
-    """Refine saddle points, each in its own small window without other features.
+    """Refine saddle points, each in a window without other features.
 
-    A larger window is affected by distortion and attracted by the next corner. NaN remain NaN.
+    Each corner has its own small window: a larger one is affected by distortion of the edges, and
+    attracted by the next corner if it contains that. NaN corners remain NaN.
     """
     half = np.clip(
         np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
@@ -145,8 +147,9 @@ def _spacing(grid: NDArray[np.float32]) -> FloatArray:
 def _in_order(image: GreyImage, grid: FloatArray) -> FloatArray:
     """Bring a (rows, columns, 2) grid of corners into the board's own order.
 
-    Seen from the print, right x down points into the image, and the square right below the first
-    corner is black; a board that looks the same turned begins in the image's upper left.
+    The board is seen from its printed side, so right x down points into the image; and the square
+    right below the first corner is black, as the one beyond it is. A board that looks the same
+    turned begins in the image's upper left.
     """
     grid = _from_the_front(grid)
     centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
@@ -171,7 +174,8 @@ def _circles(image: GreyImage, board: Board) -> FloatArray:
     flag = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     size = (board.columns, board.rows)
     pictures = image, 255 - image
-    # Clustering tolerates perspective, the plain search clutter; in the negative, light is dark.
+    # Clustering tolerates more perspective, the plain search more clutter; light circles on a dark
+    # ground are dark ones in the negative.
     for heights in zip(*map(both_heights, pictures)):
         for picture, (searched, in_image) in zip(pictures, heights):
             for extra in (0, cv2.CALIB_CB_CLUSTERING):

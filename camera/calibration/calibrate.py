@@ -44,7 +44,10 @@ _ASPECT_SIGMA = 0.003
 
 
 def largest_rms_px(width: int) -> float:
-    """Largest RMS residual of a good fit; it is larger for large images, which are softer."""
+    """Largest RMS residual of a good fit: points are accurate to some tenths of a pixel.
+
+    It is larger for large images, which are softer.
+    """
     return max(_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS * width)
 
 
@@ -135,7 +138,8 @@ class Calibration:
     names: tuple[str, ...]  #: The views' names
     outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
-    #: RMS reprojection error in held-out views (px), by the free coefficients that were tried
+    #: RMS reprojection error (u and v together) in held-out views, by the sets of free coefficients
+    #: that were tried
     holdout_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 
@@ -218,7 +222,10 @@ def aspect_of(calibration: Calibration) -> Aspect:
 def calibrate_freely(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
-    """As `calibrate`, with free scales if the views determine their ratio; else with a warning."""
+    """As `calibrate`, with scales independent of each other if the views determine their ratio.
+
+    Otherwise it is that of the settings, with a warning.
+    """
     try:
         free = calibrate(views, board, size, replace(settings, aspect=None))
     except CalibrationError:

@@ -37,8 +37,9 @@ _WORTH = 4.0
 # With fewer coefficients than the lens has, a fold can bar the way to a fit of more: those are also
 # fitted from the fullest fit, if their residuals are this many times as large as its.
 _STUCK, _CAN_BE_STUCK = 3.0, 2
-# The two tangential terms must lower it by this many variances and differ from 0 by the next: small
-# systematic errors of a board's points can look like decentering.
+# The two tangential terms must lower it by `_TANGENTIAL_WORTH` variances and differ from 0 by
+# `_TANGENTIAL_SIGNIFICANCE` variances: small systematic errors of a board's points can look like
+# decentering.
 _TANGENTIAL_WORTH = 20.0
 _TANGENTIAL_SIGNIFICANCE = 50.0
 # The same for the polynomial, compared with a rational function with as many coefficients.

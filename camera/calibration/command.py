@@ -122,7 +122,8 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     """The board with the number of corners in the pictures, if that contradicts the given one.
 
-    A larger board contains the given one; a smaller one counts if that is in no picture.
+    A larger board contains the given one. A smaller one may be part of a poorly visible board: it
+    counts if the given one is in none of the pictures examined.
     """
     given = max(board.columns, board.rows), min(board.columns, board.rows)
     votes: Counter[tuple[int, int]] = Counter()

@@ -43,7 +43,8 @@ class Consensus:
     estimate: Estimate  #: With the poses of all views
     #: (V,) RMS residual of each view; infinite where the camera sees its board in no pose
     rms_px: FloatArray
-    #: (V,) whether residuals of a view, but single points', are not far above those of the fit
+    #: (V,) whether the residuals of a view, all but those of single points, are not far above those
+    #: of the views that it was fitted to
     agree: BoolArray
 
 
@@ -132,7 +133,10 @@ def _fitted(
 
 
 def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:
-    """(V,) RMS residual of the best share of each view's points; infinite where one is NaN."""
+    """(V,) root of the mean squared distance of each view's points, the nearest share of them.
+
+    Infinite where one of these is NaN.
+    """
     squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
     ordered = squares[np.lexsort((squares, points.views))]
     of_views = np.split(ordered, np.cumsum(points.counts)[:-1])

@@ -86,7 +86,10 @@ def place_on_floor(
     intrinsics_covariance: FloatArray | None = None,
     radius_m: float = 0.0,
 ) -> FloorPose:
-    """The pose from pixels (N, 2) of floor points (N, 2), with the lens's (14, 14) covariance."""
+    """The camera's pose from points on the floor.
+
+    Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
+    """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor, (camera.width, camera.height))
     points = Points(floor, pixels, np.zeros(len(floor), np.int64), camera.width, camera.height)
@@ -147,7 +150,8 @@ def placed_camera(
 def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, FloatArray, float]:
     """Points on the floor of a .csv file, or of a picture of the board.
 
-    Their pixels (N, 2), places (N, 2) (robot X, Y, m), and the radius of circles (m), else 0.
+    Returns `pixels` (N, 2), places `floor_xy` (N, 2) (robot X, Y in m), and the radius of the
+    circles seen there (m), 0 for points.
     """
     path = options.floor
     if path.suffix.lower() == ".csv":

@@ -26,7 +26,8 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpe
 def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
     """Names and grey images of photographs, folders of them, and videos, one after the other.
 
-    At most `most` images, and frames of each video, evenly spaced; a file named twice counts once.
+    At most `most` images are used, and at most `most` frames of each video, evenly spaced. A file
+    that is named twice is used once.
     """
     if most < 1:
         raise CalibrationError(f"--max-images {most}: expected 1 or more")

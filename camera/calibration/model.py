@@ -107,7 +107,8 @@ def project_points(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of points in the camera frame and their derivatives.
 
-    From `intrinsics` (14,) and points (N, 3): (N, 2), by intrinsics (N, 2, 14), by point (N, 2, 3).
+    Takes `intrinsics` (14,), `points_camera` (N, 3); returns `pixels` (N, 2), `by_intrinsics` (N,
+    2, 14), `by_point` (N, 2, 3).
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
     coef, brown = lens_of(intrinsics)
@@ -141,7 +142,10 @@ def is_possible(intrinsics: FloatArray, width: int, height: int) -> bool:
 
 
 def has_pole(intrinsics: FloatArray, width: int, height: int) -> bool:
-    """Whether a possible lens has a pole in the image or near it: beyond, nothing is resolved."""
+    """Whether a possible lens has a pole in the image, or near it.
+
+    All of the image beyond a pole would be seen at nearly one radius.
+    """
     size = width, height
     # Before a pole the image grows far beyond its border, before a fold by 1.5 %.
     return not _is_within(intrinsics, *size, share=1.0 - _POLE_MARGIN, margin=0.0) and _is_within(
@@ -214,7 +218,8 @@ class FreeLens(NamedTuple):
 class CalibrationSettings:
     """Settings of a calibration; None means automatic, as for the flags of `camera calibrate`."""
 
-    #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line; None if both are free
+    #: scaleY / scaleX: 1 for square pixels, 0.5 for every second line of them; None if both scales
+    #: are free
     aspect: float | None = 1.0
     #: Number of free radial coefficients: 0 to 5 of the rational function, 0 to 3 of a polynomial
     coefficients: int | None = None

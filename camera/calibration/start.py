@@ -28,7 +28,8 @@ _LOOSE = 1e-4
 def first_estimate(points: Points, aspect: float | None) -> Estimate:
     """The best of some focal lengths, with at most one coefficient, or those of a fisheye lens.
 
-    `aspect` may be None. Contradicting views may get poses from which points are not seen.
+    `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with). Views that contradict the
+    others may be left with a pose from which their points are not seen.
     """
     chosen = np.unique(np.linspace(0, len(points.counts) - 1, _FEW_VIEWS).round().astype(np.int64))
     few = points.of(chosen)

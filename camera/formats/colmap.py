@@ -1,7 +1,8 @@
 """COLMAP's cameras.txt, and ``pycolmap.Camera``.
 
 COLMAP counts pixels from the image's corner: the top left pixel's centre is (0.5, 0.5). So the
-principal point is shifted by half a pixel. For programs that use pycolmap, no file is needed.
+principal point is shifted by half a pixel in either direction. For programs that use pycolmap,
+`camera_from_pycolmap` and `pycolmap_from_camera` need no file.
 """
 
 from __future__ import annotations

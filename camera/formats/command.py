@@ -14,7 +14,8 @@ from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded, demand_place, write_bytes
 
-#: The models of each format, the simplest first, and their coefficients: some lack k3.
+#: The models of each format, the simplest first, and their number of coefficients: some formats
+#: lack k3.
 MODELS: dict[str, dict[Model, int]] = {
     "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
     "ros": {"radtan": 5, "rational": 8, "fisheye": 4},
@@ -152,7 +153,10 @@ def format_of(camera: AnyCamera, to_format: Format) -> str:
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
-    """Convert to the first model that contains the camera or is within the limit, or nearest."""
+    """Convert to a model of a format that represents the camera exactly, if there is one.
+
+    Otherwise to the first one within the limit, or the closest one.
+    """
     if to_format == "cam":
         pose = read_camera(options.pose_from) if options.pose_from is not None else None
         return conversion.convert_to_camera(source, options.rows, pose)

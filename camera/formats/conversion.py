@@ -44,7 +44,8 @@ class Converted:
     """A converted camera."""
 
     camera: AnyCamera
-    # Largest distance of a ray's pixels in source and target, over the image (target's pixels)
+    # Largest distance, over the image, between the pixels of a ray in the source and in the target
+    # (target's pixels).
     deviation_px: float
     at: tuple[float, float]  # the target's pixel where it is largest
 
@@ -276,7 +277,10 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
 
 
 def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) pixels of the target, denser at the border, and rays that the source sees there."""
+    """(N, 2) pixels of the target, denser towards the border, where models part; and their rays.
+
+    Rays are undistorted normalised coordinates of what the source sees there.
+    """
     bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
     axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
     width, height = target_size(source, rows)

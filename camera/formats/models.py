@@ -47,7 +47,10 @@ _ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
 
 @dataclass(frozen=True)
 class ForeignCamera:
-    """A camera in another program's model; a ConversionError if a number is impossible."""
+    """A camera in another program's model.
+
+    A ConversionError is raised if a number is not finite, or a size or focal length not positive.
+    """
 
     model: Model  #: `radtan`, `rational` or `fisheye`
     #: Size of the image, pixels
@@ -142,7 +145,10 @@ class Projected(NamedTuple):
 
 
 def projected(model: Model, parameters: FloatArray, normalised: FloatArray) -> Projected:
-    """Project coordinates (N, 2) by OpenCV; parameters (P,): fx, fy, cx, cy, coefficients."""
+    """Project undistorted normalised coordinates (N, 2), by OpenCV.
+
+    `parameters` (P,) are fx, fy, cx, cy and the coefficients of the model.
+    """
     fx, fy, cx, cy = parameters[:4]
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     points = np.column_stack([normalised, np.ones(len(normalised))])[:, None]

@@ -54,6 +54,8 @@ _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
 # Files have six digits: a smaller sigma is meaningless.
 LEAST_SIGMA_RAD = 1e-12
 
+#: Deviation from whole pixels that rounding positions to six digits causes.
+_WHOLE_PX = 0.01
 #: Of discs that are compared on the floor, where nothing else is said (m).
 FLOOR_GATE_M = 0.10
 # Breaks ties between pairs of lines, so that the result does not depend on the file's order.
@@ -176,8 +178,16 @@ def compare_frames(
         reference_levelled=sum(wanted[m.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.name].levelled_by is not None for m in matches),
         reference_level=sight is not None and sight.reference_level,
+        reference_whole_pixels=_at_whole_pixels(matches),
         pairs=pairs,
     )
+
+
+def _at_whole_pixels(matches: Iterable[FrameMatch]) -> bool:
+    """Whether all matched reference rows are at whole pixels, like those of the data set."""
+    seen = [m.view.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.view]
+    px = np.concatenate([np.zeros((0, 2)), *seen])
+    return len(px) > 0 and bool(np.abs(px - np.rint(px)).max() < _WHOLE_PX)
 
 
 def _image_cost(matches: Iterable[FrameMatch]) -> float:
@@ -288,7 +298,10 @@ def match_runs(
     sight: Sight | None = None,
     unlisted: Iterable[Frame] | None = None,
 ) -> dict[str, Any]:
-    """Match the rows of images that are in both of two runs: the fields of a `Comparison`."""
+    """Match the rows of two runs, image by image: the fields of a `Comparison`.
+
+    Images are in the order of the reference; those in only one run are ignored.
+    """
     images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
@@ -374,7 +387,10 @@ def pair_discs(
     options: CompareOptions,
     view: Sight | None = None,
 ) -> Association:
-    """Pair discs of a frame: in the image, if there is a view and no gate on the floor."""
+    """Pair discs of one frame one to one: as many as possible, with least squared distances.
+
+    They are paired in the image if there is a view, unless the options demand the floor.
+    """
     first, second = circle_arrays(reference), circle_arrays(detected)
     if view is not None and options.gate_m is None:
         seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
@@ -389,7 +405,10 @@ def pair_discs(
 def pair_lines(
     reference: Sequence[LineLandmark], detected: Sequence[LineLandmark], options: CompareOptions
 ) -> Association:
-    """Pair lines of a frame by bearing, within the tolerance or some sigmas of the detected row."""
+    """Pair lines of one frame one to one by bearing, with least squared differences.
+
+    The gate is the larger of the tolerance and a multiple of the detected row's sigma.
+    """
     difference = _turns(reference, detected)
     gate = np.maximum(
         np.radians(options.tolerance_deg), numbers(detected, "sigma") * options.sigmas

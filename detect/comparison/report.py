@@ -81,7 +81,10 @@ class FigureTable(NamedTuple):
 
 
 def comparison_tables(comparison: Comparison) -> Group:
-    """Sentences, all figures, those over distance, and the worst frames, for a rich console."""
+    """Format a comparison for a rich console, which omits colour if there is no terminal.
+
+    It has sentences, all figures, those over distance (of discs), and the worst frames.
+    """
     summary = Table(box=None, show_header=False, pad_edge=False)
     summary.add_column(style="bold", no_wrap=True)
     summary.add_column(overflow="fold")

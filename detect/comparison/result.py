@@ -37,7 +37,8 @@ class FrameMatch(NamedTuple):
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that match something that does not count
-    #: Over all pairs: distance on the floor, levelled alike (m), or difference in bearing (deg)
+    #: Over all pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
+    #: (deg).
     largest_error: float | None
 
 
@@ -71,7 +72,8 @@ class FloorDifference:
 class DistanceBin:
     """Discs at a range of forward distances (m), open at an end that is None.
 
-    Differences are as written, and levelled alike; the latter are None if all rows are.
+    Differences are those of matched discs on the floor, as the rows are and levelled alike; the
+    latter are None if all rows are levelled alike already.
     """
 
     from_m: float | None
@@ -186,7 +188,7 @@ class Comparison(Table, ABC):
             extra += f" {aside} on {self.what} that the reference does not list{with_ids}."
         if not self.matched:
             return found, extra, "There are no errors: no rows match."
-        return found, extra, self._errors(), _agreement(self.normalised_error)
+        return found, extra, self._errors(), self._agreement()
 
     def _beyond(self) -> str:
         """More on extra rows if look-alikes are not known."""
@@ -196,8 +198,24 @@ class Comparison(Table, ABC):
     def _errors(self) -> str:
         """A sentence on the errors."""
 
+    def _agreement(self) -> str:
+        """A sentence on whether errors agree with the covariances."""
+        error = self.normalised_error.per_dof
+        if error is None:
+            return "There are no errors to compare with the stated covariances."
+        figure = f"the mean squared normalised error is {error:.2f}"
+        if 0.67 <= error <= 1.5:
+            return f"The errors agree with the stated covariances: {figure}."
+        size = "small" if error > 1.5 else "large"
+        exact = " if the reference has no errors of its own" if error > 1.5 else ""
+        return f"The stated covariances are too {size}{exact}: {figure}."
+
     def figures(self) -> dict[str, Any]:
-        """All figures by name, for JSON, metres and degrees: the same names in the same order."""
+        """All figures by name, for JSON: always the same names in the same order.
+
+        Lengths are in metres, angles in degrees. The worst frames are listed, and frames that are
+        in only one file.
+        """
         figures = {f.name: getattr(self, f.name) for f in fields(self)}
         figures |= {
             "frames": len(self.frames),
@@ -241,6 +259,7 @@ class DiscComparison(Comparison):
     reference_levelled: int  # number of reference frames with rows levelled by a tilt
     detected_levelled: int
     reference_level: bool  # whether its other rows are level, too, as stated or by the images
+    reference_whole_pixels: bool  # whether its rows are at whole pixels, as published ones are
     pairs: DiscPairs = field(repr=False)
 
     def _beyond(self) -> str:
@@ -258,6 +277,16 @@ class DiscComparison(Comparison):
         if self.reference_level and not self.detected_levelled:
             errors += " They are not corrected for the robot's tilt, which `detect all` does."
         return errors
+
+    def _agreement(self) -> str:
+        error = self.normalised_error.per_dof
+        if not self.reference_whole_pixels or error is None or error <= 1.5:
+            return super()._agreement()
+        return (
+            "The reference's rows are at whole pixels: errors of about a pixel are its own, and do "
+            f"not tell whether the stated covariances are right (the mean squared normalised error "
+            f"is {error:.2f})."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,25 +316,16 @@ def number(value: float | None, decimals: int) -> str:
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
 
 
-def _agreement(error: NormalisedError) -> str:
-    """A sentence on whether errors agree with the covariances."""
-    if error.per_dof is None:
-        return "There are no errors to compare with the stated covariances."
-    figure = f"the mean squared normalised error is {error.per_dof:.2f}"
-    if 0.67 <= error.per_dof <= 1.5:
-        return f"The errors agree with the stated covariances: {figure}."
-    size = "small" if error.per_dof > 1.5 else "large"
-    exact = " if the reference has no errors of its own" if error.per_dof > 1.5 else ""
-    return f"The stated covariances are too {size}{exact}: {figure}."
-
-
 def quantile(values: FloatArray, q: float = 0.5) -> float | None:
     """Quantile of `values`, interpolated linearly; by default the median."""
     return float(np.quantile(values, q)) if len(values) else None
 
 
 def normalised_error(offset: FloatArray, covariance: FloatArray) -> NormalisedError:
-    """Mean squared normalised error (N, n) where covariances are valid, chi-square's 95 %."""
+    """Mean of squared normalised errors (N, n), with the central 95 % of chi-square.
+
+    Errors whose covariance (N, n, n) is not positive definite are left out.
+    """
     usable = is_positive_definite(covariance)
     left_out = int((~usable).sum())
     dof = offset[usable].size

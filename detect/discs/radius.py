@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from detect.circles import detect_circles, judged_discs, vote_shape
-from detect.grey_values import estimate_noise
+from detect.circles import detect_circles, judged_discs, scene_of, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from redetect.array_types import GreyImage
@@ -70,7 +69,9 @@ def find_radius(
     shift = 0.0
     if 0 < best < count:
         before, here, after = evidence[best - 1 : best + 2]
-        shift = 0.5 * (after - before) / (2.0 * here - before - after)
+        bend = 2.0 * here - before - after
+        # Neighbours with more evidence have too few discs.
+        shift = float(np.clip(0.5 * (after - before) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0
     radius_m = float(radii[best] * FACTOR**shift)
     # If the camera's tilt is not as calibrated, discs look some percent larger or smaller.
     sigma_m = 0.5 * radius_m * math.log(FACTOR)
@@ -85,6 +86,7 @@ def ratio_of_radii(
     None for fewer than `LEAST_DISCS` discs.
     """
     table = build_vote_table(camera, vote_shape(settings))
-    seen = [judged_discs(each, camera, table, settings, estimate_noise(each)) for each in images]
+    scenes = (scene_of(image, camera, table, settings) for image in images)
+    seen = [judged_discs(scene, table, settings) for scene in scenes]
     radii = np.concatenate([np.empty(0), *(discs.radius for discs, _ in seen)])
     return float(np.median(radii)) / settings.radius_m if len(radii) >= LEAST_DISCS else None

@@ -23,18 +23,21 @@ from detect.circles import (
     candidates_of,
     detect_circles,
     judged,
+    scene_of,
     vote_shape,
+    within_margins,
 )
-from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, Judgement
+from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, JudgedCandidates
 from detect.discs.radius import FACTOR, find_radius
-from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
 from redetect.messages import counted
 from redetect.tables import Table
 
-Stage = Literal["disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc"]
+Stage = Literal[
+    "disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc", "outside"
+]
 
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
@@ -55,7 +58,7 @@ class Candidate(NamedTuple):
     votes: float  # of edges, relative to the mean at the same distance
     contrast: float  # grey levels inside minus outside; NaN if no rim was traced
     stage: Stage  # that rejected it; "disc" if it was found
-    value: float  # the number that decided
+    value: float  # the number that decided; NaN if there is none
     limit: float  # least value of it that passes; NaN if there is none
 
     @property
@@ -75,6 +78,7 @@ class Candidate(NamedTuple):
             "rim": f"{value} of its rim lie on a circle of this radius, {limit} expected",
             "evidence": f"evidence {value} is less than {limit} (--evidence)",
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
+            "outside": "its centre is outside the image: too little of it is visible to locate it",
         }[self.stage]
 
 
@@ -199,11 +203,13 @@ class _Scene:
         return detect_circles(self.image, self.camera, self.table, self.settings)
 
     @cached_property
-    def judgement(self) -> tuple[FloatArray, Judgement]:
+    def judgement(self) -> tuple[FloatArray, JudgedCandidates]:
         """Votes for the candidates of both polarities, and their classification."""
-        any_sign, noise = replace(self.settings, polarity="any"), estimate_noise(self.image)
-        candidates = candidates_of(self.image, self.table, any_sign, noise)
-        return candidates.score, judged(self.image, self.camera, any_sign, candidates, noise)
+        settings = replace(self.settings, polarity="any")
+        image, camera, table, _ = within_margins(self.image, self.camera, self.table, settings)
+        scene = scene_of(image, camera, table, settings)
+        candidates = candidates_of(scene, table, settings)
+        return candidates.score, judged(scene, settings, candidates)
 
     def count(self, at: tuple[float, float] | None) -> int:
         """Number of discs found, near a pixel if one is given."""
@@ -246,8 +252,10 @@ def _candidates(scene: _Scene) -> Iterator[Candidate]:
             value = float(evidence[k])
         else:
             away = np.hypot(*(found.floor_xy - judgement.floor_xy[k]).T).min(initial=math.inf)
-            stage = "beside a better disc"
             value, limit = float(away) / settings.radius_m, settings.separation
+            stage = "beside a better disc"
+            if value >= limit:
+                stage, value, limit = "outside", math.nan, math.nan
         (u, v), (x, y) = pixels[k].tolist(), judgement.floor_xy[k].tolist()
         yield Candidate(u, v, x, y, float(votes[k]), contrast, stage, value, limit)
 

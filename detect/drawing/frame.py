@@ -27,7 +27,6 @@ from detect.options import CompareOptions
 from detect.row_files import KINDS, SeenRows
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
-from detect.sources.image_files import image_name
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
@@ -52,6 +51,8 @@ _SUBPIXEL_BITS = 4
 _FARTHEST_PX = 1e6
 # Text and strokes are enlarged in proportion to pictures of this width.
 _COLUMNS = 750
+# A label is moved down by at most this many of its heights.
+_LABELS_DOWN = 2
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
@@ -69,20 +70,20 @@ def draw_rows(
     scale = 2 if image.shape[1] < _SMALL_PX else 1
     canvas = canvas_of(image, None if sight is None else sight.camera)
     canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
-    words = [title] if title else []
+    words, labels = [title] if title else [], list[FloatArray]()
     if not processed(rows):
         words.append("not processed")
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
         match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
-        _draw_lines(canvas, sight.camera, match, compared, scale)
+        _draw_lines(canvas, sight.camera, match, compared, scale, labels)
         words.append(_count("verticals", match, compared))
     if sight is not None and rows.circles is not None:
         discs = rows.reference_circles, rows.circles, rows.unlisted
         match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
         compared = rows.reference_circles is not None
-        _draw_discs(canvas, match, settings, compared, scale)
+        _draw_discs(canvas, match, settings, compared, scale, labels)
         words.append(_count("discs", match, compared))
     if rows.markers is not None:
         _draw_markers(canvas, rows.markers.markers, scale)
@@ -104,16 +105,20 @@ def _scaled(points: FloatArray, scale: int) -> FloatArray:
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
-    """(N, P, 2) pixels of lines from top to bottom; `ends` (N, 4) are normalised coordinates."""
+    """Distorted curves of lines: (N, P, 2) pixels from top to bottom.
+
+    `ends` (N, 4) are xtop, ytop, xbottom, ybottom in undistorted normalised coordinates.
+    """
     share = np.linspace(0.0, 1.0, _POINTS)[:, None]
     return camera.distort((1.0 - share) * ends[:, None, :2] + share * ends[:, None, 2:])
 
 
 def sigma_bars(camera: Camera, ends: FloatArray, sigma_rad: FloatArray) -> FloatArray:
-    """Error bars of one standard deviation of bearings, where lines cross the level horizon.
+    """Error bars of one standard deviation of the bearing, at the lines' crossings of the horizon.
 
-    Lines that end before it are extended. `ends`: (N, 4), as for `line_curves`; `sigma_rad`: (N,).
-    Returns (N, 2, 2) pixels; NaN for lines that do not cross it in front of the camera.
+    The horizon is that of the level robot; lines that end before it are extended. `ends`: (N, 4),
+    as for `line_curves`; `sigma_rad`: (N,). Returns (N, 2, 2) pixels; NaN for lines that do not
+    cross the horizon in front of the camera.
     """
     one = np.ones((len(ends), 1))
     top, bottom = (np.hstack([e, one]) @ camera.rotation.T for e in (ends[:, :2], ends[:, 2:]))
@@ -136,8 +141,9 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int
-) -> None:
+    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int,
+    taken: list[FloatArray],
+) -> None:  # fmt: skip
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
     view = match.view
     assert view is not None
@@ -156,35 +162,48 @@ def _draw_discs(
             outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
             rims.append(_scaled(outline, scale))
             draw_curve(canvas, rims[-1], colour, closed=True)
-    _draw_labels(canvas, [f"{row.quality:.2f}{text}" for row, text, _ in drawn], rims[2::3])
+    gap = np.array([3.0 * enlargement(canvas), 0.0])
+    for (row, text, _), rim in zip(drawn, rims[2::3]):
+        if np.all(np.abs(rim) < _FARTHEST_PX):
+            (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
+            middle = 0.5 * (top + bottom)
+            beside = [(np.array([right, middle]) + gap, 0.0), (np.array([left, middle]) - gap, 1.0)]
+            _draw_label(canvas, f"{row.quality:.2f}{text}", beside, _TEXT_COLOUR, 0.35, taken)
 
 
-def _draw_labels(canvas: ByteArray, texts: Sequence[str], rims: Sequence[FloatArray]) -> None:
-    """Labels to the right of rims, or else to the left, or else moved down until on no other."""
+def _draw_label(
+    canvas: ByteArray, text: str, places: Sequence[tuple[FloatArray, float]], colour: Colour,
+    size: float, taken: list[FloatArray],
+) -> None:  # fmt: skip
+    """Draw a label at the first place where it is on no other, or a little below the last one.
+
+    A place is a point at half the label's height, and the share of its width to the left of it. If
+    none is free, the label is left out: further away, it would seem to be another one's. `taken`
+    are the corners of the labels drawn before; those of this one are added.
+    """
     times = enlargement(canvas)
-    taken = np.zeros((0, 2))
+    extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
+    wide, high = np.array(extent) + 2.0 * times
 
-    def free(place: FloatArray) -> bool:
-        return not np.any(np.all(np.abs(taken - place) < size, axis=1))
+    def box(u: float, v: float) -> FloatArray:
+        return np.array([[u, v], [u + wide, v + high]])
 
-    for text, rim in zip(texts, rims):
-        if not np.all(np.abs(rim) < _FARTHEST_PX):
-            continue
-        wide, high = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * times, times)[0]
-        size = np.array([wide, high]) + 2.0 * times
-        (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
-        place = np.array([right + 3.0 * times, 0.5 * (top + bottom + high)])
-        if place[0] + wide > canvas.shape[1] or not free(place):
-            place[0] = left - 3.0 * times - wide
-        while not free(place):
-            place[1] += size[1]
-        taken = np.vstack([taken, place])
-        draw_text(canvas, text, place, _TEXT_COLOUR)
+    def free(one: FloatArray) -> bool:
+        return not any(np.all((one[0] < other[1]) & (other[0] < one[1])) for other in taken)
+
+    boxes = [box(u - share * wide, v - 0.5 * high) for (u, v), share in places]
+    boxes += [boxes[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
+    for chosen in boxes:
+        if 0.0 <= chosen[0, 0] <= chosen[1, 0] <= canvas.shape[1] and free(chosen):
+            taken.append(chosen)
+            draw_text(canvas, text, (chosen[0, 0], chosen[1, 1] - times), colour, size)
+            return
 
 
 def _draw_lines(
-    canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int
-) -> None:
+    canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int,
+    taken: list[FloatArray],
+) -> None:  # fmt: skip
     for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
@@ -201,7 +220,10 @@ def _draw_lines(
         draw_curve(canvas, curve, colour)
         for points in (bar, bar[0] + tick, bar[1] + tick):
             draw_curve(canvas, points, SIGMA_COLOUR)
-        draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
+        if text:
+            below = curve[-1] + 2.5 * tick[1]
+            places = [(below, 0.5), (below, 1.0), (below, 0.0)]
+            _draw_label(canvas, text, places, SIGMA_COLOUR, 0.3, taken)
 
 
 def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
@@ -224,18 +246,16 @@ def _count(what: str, match: FrameMatch, compared: bool) -> str:
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
-    """A grey image as (H, W, 3) blue, green, red to draw into; unseen pixels are dark red."""
+    """A grey image (H, W) as a picture to draw into, (H, W, 3) in OpenCV's order blue, green, red.
+
+    Pixels without a direction in the camera's calibration are dark red.
+    """
     canvas = np.repeat(image[:, :, None], 3, axis=2)
     if camera is not None and camera.seen_share < 1.0:
         unseen = _unseen(camera)
         canvas[unseen] //= 3
         canvas[unseen] += np.array([0, 0, 80], np.uint8)
     return canvas
-
-
-def picture_name(prefix: str) -> str:
-    """Name of an image's picture without its ending, which cannot lead out of a folder."""
-    return image_name(prefix) or "frame"
 
 
 def png_of(picture: ByteArray) -> bytes:
@@ -267,7 +287,10 @@ def draw_text(
     canvas: ByteArray, text: str, at: ArrayLike, colour: Colour, size: float = 0.35,
     shift: tuple[int, int] = (0, 0),
 ) -> None:  # fmt: skip
-    """Draw ASCII text, its base line from u, v plus `shift`, unless that is far outside."""
+    """Draw ASCII text with the left end of its base line at u, v, unless that is far outside.
+
+    `shift` moves the text, by more in wide pictures.
+    """
     place = np.asarray(at, dtype=np.float64)
     if np.all(np.abs(place) < _FARTHEST_PX):
         times = enlargement(canvas)

@@ -1,9 +1,11 @@
 """Phases 1 and 2: dark regions in brighter surroundings, and those that may be markers.
 
 The grayscale closing I2 of the image I1 with a disc fills all dark regions that the disc does not
-fit into; pixels where I1 is much darker than I2 are candidates. Their regions are filtered by area,
-number of holes, solidity and area ratio of the holes (RAWSEEDS deliverable D2.1 part 2). The disc
-is an octagon, composed of squares and crosses; large markers are searched in reduced images.
+fit into; pixels where I1 is much darker than I2 are candidates for (a part of) a marker. These
+regions are filtered by inexpensive measures, the cheapest first: area, number of holes, solidity,
+area ratio of the holes. RAWSEEDS deliverable D2.1 part 2. The disc is replaced by an octagon,
+composed of squares and crosses at a cost that grows slowly with its size, and large markers are
+searched in reduced images.
 """
 
 from __future__ import annotations
@@ -80,7 +82,8 @@ def candidate_regions(
 ) -> tuple[list[Region], Counter[str]]:
     """Regions of an image that may be markers, and counts of rejected regions by reason.
 
-    From fine to coarse layers and high to low thresholds; limits of holes are the dictionary's.
+    In order of fine to coarse layers and high to low thresholds; the smallest specks are not
+    counted. The limits of a region's holes depend on the white area of the dictionary's markers.
     """
     layers = _layers(image, settings)
     white = float(dictionary.patterns.sum(axis=(1, 2)).mean()) * dictionary.cell**2
@@ -138,7 +141,10 @@ def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Gre
 
 
 def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: float) -> GreyImage:
-    """1 where I1 is darker than its closing I2: 1 - I1/I2 > threshold, I2 - I1 > `gate`."""
+    """1 where an image is darker than its closing by the threshold and by `gate` grey levels.
+
+    The darkness of I1 under its closing I2 is 1 - I1/I2.
+    """
     levels = np.arange(256.0)
     # I1 < limit(I2), for integer grey levels; the limit itself is not dark.
     limit = np.minimum(levels * (1.0 - threshold), levels - gate)
@@ -150,7 +156,10 @@ def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: floa
 def _marker_regions(
     dark: GreyImage, scale: int, widest: float, white: float, settings: MarkerSettings
 ) -> Iterator[Region | str]:
-    """Dark regions that may be markers (share `white`, sides up to `widest`), or why not."""
+    """Dark regions of a layer that may be markers, and the reasons for rejecting the others.
+
+    `white` is the expected share of white area, `widest` the largest side of a region.
+    """
     least_px, most_px = _area_limits(settings, scale)
     most_white = min(settings.most_white * white, 0.9)
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -201,6 +210,9 @@ def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:
 
 
 def pixel_area(polygon: NDArray[np.int32]) -> float:
-    """Number of pixels inside and on a polygon (N, 2) of digital lines, by Pick's theorem."""
+    """Number of pixels inside and on a polygon (N, 2) through pixel centres, by Pick's theorem.
+
+    Oblique sides are counted as the digital lines that they represent.
+    """
     steps = np.abs(polygon - polygon[np.arange(len(polygon)) - 1]).max(axis=1)
     return float(cv2.contourArea(polygon) + 0.5 * steps.sum() + 1.0)

@@ -74,13 +74,15 @@ _LEAST_CORRELATION = 0.6
 _LEAST_LOG_ODDS = 15.0
 #: Least standard deviation of the whiteness of cells.
 _LEAST_CELL_SIGMA = 0.08
-#: Markers with a larger blur (in cells) are rejected: in dictionaries whose patterns hardly ever
-#: occur by chance, and in the others (see `Templates.weakness`).
+#: Markers whose cells are blurred by more than this (in cells) are rejected. The first number of
+#: each pair is for dictionaries whose patterns hardly ever occur by chance, the second for the
+#: others (see `Templates.weakness`).
 _LARGEST_BLUR_CELLS = (0.62, 0.6)
 #: The requirements on a fit increase from the first blur (in cells) to the second: many patterns
 #: fit blurred cells roughly, but only the right one fits them to within the noise.
 _STRICT_FROM, _STRICT_AT = 0.3, 0.6
-#: Largest misfit beyond the noise (contrasts), least mean agreement: for clear, and blurred cells.
+#: Largest misfit beyond the noise (in contrasts), and least mean agreement of the cells: for clear
+#: cells, and for blurred ones.
 _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
 _BLURRED_MISFIT = (0.06, 0.03)
 _BLURRED_AGREEMENT = (0.92, 0.95)

@@ -33,7 +33,8 @@ _SIMPLE_BITS, _SIMPLE_SIDE = 9, 6
 _SIMPLE_MASKS = (0x027, 0x14E, 0x109, 0x0DB)
 _OPENCV_PREFIX = "DICT_"
 
-#: A random pattern is in strong, and in weak, dictionaries with probability 2 to minus these.
+#: A random pattern is in the dictionary with probability 2 to the power of minus this: for strong
+#: dictionaries, and for weak ones.
 _STRONG_BITS, _WEAK_BITS = 24.0, 14.0
 #: Blurs for which templates are kept, in cells.
 _BLURS_CELLS = (0.2, 0.35, 0.5, 0.7, 1.0)
@@ -146,7 +147,10 @@ class Templates:
 
 @functools.lru_cache(maxsize=16)
 def templates_of(name: str, ids: tuple[int, ...]) -> Templates:
-    """Templates of a dictionary's markers, of some IDs or all; DetectError if one is unknown."""
+    """Templates of a dictionary's markers: of the given IDs, or of all if there are none.
+
+    Raises DetectError if there is no such dictionary or marker.
+    """
     dictionary = marker_dictionary(name)
     if ids:
         dictionary = dictionary.only(ids)
@@ -192,7 +196,10 @@ def _blurred(patterns: Float32Array, blur_cells: float, around: float) -> Float3
 
 
 def _decoys(varied: BoolArray, patterns: Float32Array) -> tuple[Float32Array, BoolArray]:
-    """Patterns of frames, bars and panes, and which markers are within two cells of one."""
+    """Patterns of frames, bars and panes, and a mask of the markers less than two cells from one.
+
+    Decoys that near a marker's pattern are omitted, since it could never be found.
+    """
     rows, columns = np.flatnonzero(varied.any(axis=1)), np.flatnonzero(varied.any(axis=0))
     j, i = np.indices((len(rows), len(columns)))
     inner = [np.zeros(i.shape, bool)]

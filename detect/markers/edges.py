@@ -146,7 +146,10 @@ def _edges_near(
 
 
 def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray | None:
-    """(R, S, 4) grey values between near straight positions (R, 4, 2); None if outside."""
+    """(R, S, 4) grey values between straight positions (R, 4, 2); None if outside the image.
+
+    They are so close to each other that distortion between them is negligible.
+    """
     ends = picture.bend(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
     height, width = picture.grey.shape
     inside = (ends >= -0.5) & (ends <= np.array([width, height])[:, None, None, None, None] - 0.5)
@@ -161,8 +164,9 @@ def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray
 def _steps(rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Positions of steps in rows (P, S, 4), in samples, and grey levels on both sides, all (P, 4).
 
-    A row is split where two means explain it best (Otsu); the levels are means of the outer halves
-    of both parts. The step is the centroid of the reduced slopes; NaN if the row never rises.
+    A row is split where two means explain it best (Otsu's criterion); the levels are the means of
+    the outer halves of both parts. The step is at the centroid of the slopes, each reduced by a
+    share of the steepest; NaN if the row never rises.
     """
     total = np.cumsum(rows, axis=1)
     before, after = total[:, :-1], total[:, -1:] - total[:, :-1]

@@ -64,7 +64,8 @@ class Picture:
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
     """An image (H, W) with its noise and the distortion of its lens.
 
-    FrameError if it is not 8-bit grey, of the camera's size, or has pixels without a direction.
+    Raises FrameError if the image is not an 8-bit grey image of the camera's size, or the
+    calibration has no direction for some of its pixels.
     """
     grey = plain_image(image, None if camera is None else (camera.height, camera.width))
     height, width = grey.shape
@@ -87,7 +88,10 @@ def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
 
 
 def rough_corners(hull: FloatArray) -> FloatArray | None:
-    """Four corners (4, 2), clockwise in the image, of a hull (N, 2); None if it has fewer."""
+    """Four corners (4, 2) of a region from its convex hull (N, 2); None if that has fewer.
+
+    Clockwise as seen in the image; the first is arbitrary.
+    """
     if len(hull) < 4:
         return None
     corners = hull[list(largest_quadrangle(hull))]
@@ -96,7 +100,10 @@ def rough_corners(hull: FloatArray) -> FloatArray | None:
 
 @kernel()
 def largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
-    """Indices of the largest quadrangle among points (N, 2), in order, over all diagonals."""
+    """Indices of the largest quadrangle among points (N, 2), in order.
+
+    For each diagonal, the highest triangles on both sides are combined.
+    """
     n = len(points)
     largest, best = -1.0, (0, 0, 0, 0)
     for i in range(n - 2):
@@ -132,7 +139,10 @@ def is_convex(corners: FloatArray) -> bool:
 
 
 def covered(quadrangle: FloatArray, others: FloatArray) -> bool:
-    """Whether a clockwise quadrangle contains the centre of one of (N, 4, 2), or vice versa."""
+    """Whether a quadrangle (4, 2) contains the centre of one of `others` (N, 4, 2), or vice versa.
+
+    All are clockwise and convex.
+    """
 
     def inside(corners: FloatArray, point: FloatArray) -> BoolArray:
         side, to = corners[..., _NEXT, :] - corners, point[..., None, :] - corners

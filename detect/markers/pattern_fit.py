@@ -38,7 +38,8 @@ _SEAM_BLURS, _SEAM_PX, _LEAST_SEAM_PX = 2.5, 0.5, 1.2
 #: If squared residuals in the margin are this many times those inside, the fit excludes it and
 #: this depth inside the marker: blurs, at most a share of a cell's size.
 _SEAM_RATIO, _DEPTH_BLURS, _DEPTH_CELLS = 2.0, 2.0, 0.5
-#: Largest motion of a corner from the edges' intersection (px or cells), and its share in a step.
+#: Largest motion of a corner from the intersection of edges (pixels or cells, the larger), and in
+#: one step, as a share of that.
 _REACH_PX, _REACH_CELLS, _STEP_REACHES = 1.5, 0.75, 0.35
 #: Prior standard deviations of the light's slope and curvature over half a marker, in contrasts,
 #: and of the tone curve's curvature; the largest of the latter.
@@ -52,7 +53,8 @@ _OUTLIER = 3.0
 _LEAST_NOISE = 0.3
 #: Least number of pixels in excess of the number of parameters.
 _SPARE_PIXELS = 12
-#: Approximate largest number of pixels in a fit, and its steps: coarse, to decide, and whole.
+#: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
+#: decide whether it may be that marker.
 _FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
 
 
@@ -80,7 +82,10 @@ def fit_marker(
     *,
     first_look: bool = False,
 ) -> PatternFit | None:
-    """Fit a marker of a known pattern by Gauss-Newton from its edges; None if there is none."""
+    """Fit a marker of a known pattern by the Gauss-Newton method, starting from its edges.
+
+    None if there is no such marker nearby.
+    """
     most_pixels, steps = _FIRST_LOOK if first_look else _WHOLE_FIT
     corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
@@ -154,7 +159,8 @@ def _solved(
 ) -> tuple[FloatArray, Linearised, FloatArray] | None:
     """Parameters, residuals and inverse normal matrix of the best fit, if there is one.
 
-    Weak priors: even light, a round blur close to its first estimate, a straight tone curve.
+    Weak priors: light changes little over a marker, the blur is nearly isotropic and close to its
+    initial estimate, the tone curve is nearly straight.
     """
     corners = start.corners
     blur_guess = min(max(start.blur_px**2, _LEAST_VARIANCE), _LARGEST_VARIANCE)

@@ -172,7 +172,10 @@ def blurred_blackness(at: Places, pattern: Pattern) -> FloatArray:
 def linearise(
     samples: Samples, pattern: Pattern, p: FloatArray, inverse: FloatArray, outlier: float
 ) -> Linearised:
-    """The model at all pixels, by p and the inverse homography; less weight beyond `outlier`."""
+    """The model with parameters p at all pixels; residuals beyond `outlier` are down-weighted.
+
+    `inverse` (3, 3) is that of the homography.
+    """
     u, v = samples.straight.T
     q = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
     x = (inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]) / q

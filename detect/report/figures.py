@@ -193,9 +193,10 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
 
 
 def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
-    """Map of the discs found and of the reference along the steps; forward is up, left is left.
+    """Map of the discs found and of the reference, along the path summed from the steps.
 
-    The caption ends with `unmatched`. None without discs; a note if some are too far away.
+    Forward at the start is up, left is left. The caption ends with `unmatched`, on discs without a
+    reference row. None if there are no discs; a note if some are too far away for a figure.
     """
     seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
     if not any(found.circles for found, _ in seen):
@@ -281,7 +282,11 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatA
 
 
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
-    """(M,) errors in units of usable covariances: two for each disc, one for each line."""
+    """(M,) errors in units of their covariances: standard normal if these are right.
+
+    Two independent components for each disc with a positive definite covariance; one for each line
+    with a positive sigma.
+    """
     if isinstance(comparison, LineComparison):
         usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD
         return comparison.pairs.error_rad[usable] / comparison.pairs.sigma_rad[usable]

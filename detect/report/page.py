@@ -12,14 +12,14 @@ import numpy as np
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
-from detect.drawing.frame import draw_rows, picture_name, processed
+from detect.drawing.frame import draw_rows, processed
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight, summed_steps
-from detect.sources.image_files import image_name
+from detect.sources.image_files import image_name, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect import __version__
@@ -49,7 +49,8 @@ _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file nam
 class ReportInputs:
     """A run's rows, and their comparison with the reference.
 
-    `names` are prefixes; `sight` is None without a calibration, comparisons without a reference.
+    `names` are the prefixes of the frames in order, `rows` the rows of each. `sight` is None
+    without a calibration, comparisons are None without reference rows.
     """
 
     run: ImageRun
@@ -62,7 +63,10 @@ class ReportInputs:
 
 
 def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
-    """Read and compare all rows of a run; DetectError or LandmarkFileError if one is bad."""
+    """Read and compare all rows of a run.
+
+    Raises DetectError or redetect.landmarks.LandmarkFileError if a file is missing or malformed.
+    """
     files = open_rows(run, options)
     names = tuple(frame.step.prefix for frame in run.frames)
     if not names:
@@ -266,7 +270,10 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
 
 
 def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:
-    """Tables of the worst frames; frames to show with the reasons, first that with most discs."""
+    """Tables of the worst frames, and the frames to be shown with the reasons.
+
+    The first one has most discs. Without a reference to rank them, the others are some frames.
+    """
     done = {name: seen for name, seen in zip(inputs.names, inputs.rows) if processed(seen)}
     named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []

@@ -4,40 +4,32 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from camera import Camera
-from detect.errors import DetectError, FrameError, WorkerError
+from detect.errors import DetectError, WorkerError
 from detect.line_settings import LineSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.row_files import KINDS, RunRows, read_head
+from detect.runs.hints import hints, some_images
 from detect.runs.outputs import frames_tilt_place, lean_sentence
-from detect.runs.plan import FramePlan, FramesByImage, Job, Known, MapByImage, RunSummary
+from detect.runs.plan import (
+    FramePlan,
+    FramesByImage,
+    Job,
+    Known,
+    MapByImage,
+    RunSummary,
+    tilts_by_image,
+)
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
-from detect.seen import leaning_camera
 from detect.settings import CircleSettings
-from detect.sources.interface import ImageRun, Run, read_image
+from detect.sources.image_files import demand_pictures
+from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
-from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
-from redetect.array_types import ByteArray
-from redetect.landmarks import read_tilts
 from redetect.messages import counted
-
-#: Approximate number of images from which the radius of the discs is estimated.
-_RADIUS_IMAGES = 12
-#: Runs of at least `_FEWEST_FRAMES` frames get a warning if few discs are found and the logarithms
-#: of the likely and the given radius differ by `_OTHER_RADIUS`.
-_FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
-#: Other settings are worth mentioning if they find this many times as many discs.
-_MANY = 3
-#: Number of images in which the discs' size is compared with their radius, and the difference of
-#: logarithms that is reported: .06 on run e, whose camera leans by 2.5 degrees.
-_COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
 
 
 def perform(command: DetectorFlags) -> int:
@@ -54,7 +46,7 @@ def perform(command: DetectorFlags) -> int:
     pictures = getattr(command, "draw", None)
     if pictures is not None:
         demand_recording(command.run)
-        pictures.mkdir(parents=True, exist_ok=True)
+        demand_pictures(job.run.frames, pictures, overwrite=command.force)
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:
@@ -64,7 +56,7 @@ def perform(command: DetectorFlags) -> int:
         plan = job.plan if getattr(command, "rejected", False) else None
         draw_run(job.run, RunRows(files), pictures, plan, overwrite=command.force)
     _print_results(job, summary)
-    for hint in _hints(job, summary):
+    for hint in hints(job, summary):
         print(hint, file=sys.stderr)
     if summary.images_without_step:
         print(f"{summary.images_without_step} {job.run.frames.why_left_out}")
@@ -90,7 +82,7 @@ def _circles(command: Circles, run: Run) -> Job:
     settings = _with_radius(command.detector, run) if command.find_radius else command.detector
     bare = command.tilt == Path("none")
     plan = FramePlan(run.camera, circles=settings, levelling="none" if bare else "frame")
-    tilts = None if bare or command.tilt is None else read_tilts(command.tilt)
+    tilts = None if bare or command.tilt is None else tilts_by_image(command.tilt)
     return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
 
 
@@ -136,7 +128,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     """The settings with the radius estimated from some of the images."""
     from detect.discs.radius import find_radius
 
-    images = list(_some_images(run))
+    images = list(some_images(run))
     found = find_radius(images, run.camera, settings)
     if found is None:
         raise DetectError(
@@ -149,16 +141,6 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
         file=sys.stderr,
     )
     return replace(settings, radius_m=round(found.radius_m, 4))
-
-
-def _some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
-    """Images spread over a run, if its length is known in advance."""
-    if run.frames.expected is None:
-        raise DetectError("--find-radius: expected recorded images, which can be read twice")
-    step = max(1, run.frames.expected // count)
-    for frame in SomeFrames(run.frames, step * count, step):
-        with suppress(FrameError):
-            yield read_image(frame, run.camera)
 
 
 def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:
@@ -241,93 +223,3 @@ def _other_frames(plan: FramePlan, summary: RunSummary) -> str:
     if sigma_deg == 0.0:
         return f"; the other {others} are assumed exactly level (see --tilt-sigma-deg)"
     return f"; the other {others} are assumed level within {sigma_deg:g} degrees"
-
-
-def _hints(job: Job, summary: RunSummary) -> Iterator[str]:
-    """Reasons why hardly anything was found, and what to try."""
-    plan, camera, found = job.plan, job.plan.camera, summary.found
-    if job.known != Known() and not summary.known:
-        yield (
-            "no image of this run is in the files of known tilts or IDs, or they have no rows: "
-            "were they made from other images?"
-        )
-    others = summary.rejected["no matching pattern"]
-    if plan.markers and not found["markers"] and others >= summary.frames:
-        yield (
-            f"{others} squares look like markers, but not of the dictionary "
-            f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
-        )
-    if camera is None:
-        return
-    if plan.lines is not None and not found["lines"]:
-        from lut import cached_vertical_table
-
-        if not cached_vertical_table(camera).usable.any():
-            yield (
-                "no verticals: according to the calibration, the camera looks too far above or "
-                "below the horizon, or lies on its side"
-            )
-    if camera.seen_share < 1.0:
-        yield (
-            "according to the calibration, the distortion is not invertible in all of the image: "
-            f"only {100 * camera.seen_share:.0f} % of the pixels are used"
-        )
-    seen = summary.frames - summary.failed
-    run, settings = job.run, plan.circles
-    if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
-        return
-    leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
-    if not found["discs"] or (found["discs"] < seen >= _FEWEST_FRAMES):
-        yield from _hints_on_discs(run, leaning, settings, summary)
-    elif seen >= _FEWEST_FRAMES:
-        from detect.discs.radius import ratio_of_radii
-
-        ratio = ratio_of_radii(list(_some_images(run, _COMPARED_IMAGES)), leaning, settings)
-        if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
-            yield (
-                f"the discs look {ratio:.2f} times as large as with a radius of "
-                f"{settings.radius_m:g} m: if that is right, the camera is not as high as "
-                "calibrated, or leans, and positions are wrong by as much; measure the discs and "
-                "its height"
-            )
-
-
-def _hints_on_discs(
-    run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
-) -> Iterator[str]:
-    """Why a run has less than one disc per frame; nothing if no other settings find more."""
-    from detect.discs.radius import find_radius
-    from detect.discs.unfound import why_none
-
-    images, number = list(_some_images(run)), summary.found["discs"]
-    in_images = f"in {len(images)} of the images"
-    discs = (
-        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in "
-        f"{counted(summary.frames, 'frame')}. "
-    )
-    if not number:
-        discs += f"{why_none(images, camera, settings)} "
-    if summary.frames < _FEWEST_FRAMES:
-        yield discs + (
-            "If discs are visible, try --radius-m auto, which estimates their radius, and check "
-            "the calibration against the images (`detect draw`)."
-        )
-        return
-    likely = find_radius(images, camera, replace(settings, polarity="any"))
-    if likely and likely.discs <= _MANY * len(images) * number / summary.frames:
-        likely = None  # not worth mentioning
-    if likely and abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
-        yield discs + (
-            f"Their radius seems to be {likely.radius_m:.3f} m: {likely.discs} of them are found "
-            f"{in_images}. Try --radius-m {likely.radius_m:.3f}; if they are not that "
-            f"{'small' if likely.radius_m < settings.radius_m else 'large'}, the camera has "
-            "another height or pitch, or the calibration is not its own (`detect draw` shows "
-            "outlines)."
-        )
-    elif likely and settings.polarity != "any":
-        yield discs + f"--polarity any finds {likely.discs} {in_images}."
-    elif _MANY * number < summary.frames:
-        yield discs + (
-            f"Other radii find no more {in_images}: is the calibration that of this camera "
-            "(`detect draw` shows outlines; are its rows full or half?), are discs visible?"
-        )

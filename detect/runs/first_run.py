@@ -28,7 +28,7 @@ def place_and_level_none(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
         return
     image = read_image(tasks[0].frame, camera, plan.working_folder)
     table = cached_vote_table(camera, vote_shape(settings))
-    scene = scene_of(image, camera, table, settings, noise=0.0)
+    scene = scene_of(image, camera, table, settings)
     place_discs(scene, NO_CANDIDATES, working_space()[0])
     if plan.levelling == "run":
         tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)

@@ -1,7 +1,6 @@
 """Processes one frame: image in; verticals, tilts, discs and markers out, and their rows.
 
-Workers import this module; a process that delegates the work needs neither the detectors nor the
-compiler, and does not load them.
+Workers import this module; a process that delegates the work does not need the detectors.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from detect.runs.plan import (
     KnownOfFrame,
     Lean,
     json_record,
+    pays,
     rows_of_failure,
     time_row,
 )
@@ -61,9 +61,6 @@ COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgE
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-#: Factor by which a search with the camera's lean must increase the evidence: all verticals of a
-#: building may lean.
-_MORE_EVIDENCE = 1.03
 #: Steps of the lean of a single frame, degrees.
 _FRAME_LEAN_DEG = 2.0
 #: Largest number of pixels that are decoded at once.
@@ -295,11 +292,6 @@ def _disc_rows(
         for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
             ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
-
-
-def pays(leaning: float, evidence: float) -> bool:
-    """Whether a search with the camera's lean finds clearly more evidence of discs."""
-    return leaning > _MORE_EVIDENCE * evidence
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:

@@ -28,6 +28,8 @@ from redetect.landmarks import (
 _Tilted = tuple[str, int, FrameTilt | None]
 #: Least lean that the search for discs considers, degrees: a slight lean does no harm.
 _LEAST_LEAN_DEG = 0.5
+#: Standard deviation of a tilt that is known exactly: covariances in files are positive definite.
+_LEAST_SIGMA_RAD = 1e-6
 #: Number of frames whose discs are levelled at once.
 _LEVELLED_AT_ONCE = 64
 
@@ -80,7 +82,7 @@ def level_run(
             for (prefix, lines, _), (pitch, roll, cpp, crr) in zip(frames, numbers, strict=True)
         ]
     elif settings.tilt_sigma_rad or settings.calibration_px or common is not None:
-        unknown = settings.tilt_sigma_rad**2
+        unknown = max(settings.tilt_sigma_rad, _LEAST_SIGMA_RAD) ** 2
         tilts = [t or FrameTilt(name, 0.0, 0.0, unknown, 0.0, unknown, 0) for name, _, t in frames]
     else:
         tilts = [tilt for _, _, tilt in frames]

@@ -17,16 +17,13 @@ from typing import Any
 
 from camera import Camera
 from detect.errors import EXIT_FRAMES_FAILED
+from detect.row_files import LEVELLED
 from detect.runs.plan import FramePlan, Job, Lean, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
 from redetect import __version__
 from redetect.landmarks import format_head
 from redetect.landmarks.times import TIMES_HEAD
-
-#: Phrases in the head of files whose positions are levelled, or corrected for the tilt.
-LEVEL = "level robot frame"
-LEVELLED = "corrected for the tilt of the frames that have one"
 
 #: The kind of the tilts that the second pass writes (`detect.runs.level_run`).
 RUN_TILT = "run tilt"

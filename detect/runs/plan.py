@@ -32,6 +32,7 @@ from redetect.landmarks import (
     frames_of_rows,
     parse_rows,
     read_rows,
+    read_tilts,
 )
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.landmarks.times import format_time
@@ -39,6 +40,10 @@ from redetect.plane import rotation
 
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
+
+#: Factor by which a search with the camera's lean must increase the evidence of discs: all
+#: verticals of a building may lean.
+_MORE_EVIDENCE = 1.03
 
 #: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
 Lean = tuple[float, float]
@@ -62,7 +67,7 @@ class KnownOfFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Known:
-    """Prior data on the frames of a run, by the prefixes of their images."""
+    """Prior data on the frames of a run, by the names of their images."""
 
     tilts: Mapping[str, FrameTilt] | None = None  # of frames whose verticals are not detected
     lines: FramesByImage | None = None  # with IDs, transferred to rows of the same lines
@@ -76,7 +81,7 @@ class Known:
         lines = self.lines.get(prefix) if self.lines else None
         discs = self.discs.get(prefix) if self.discs else None
         return KnownOfFrame(
-            self.tilts.get(prefix) if self.tilts else None,
+            self.tilts.get(image_name(prefix)) if self.tilts else None,
             lines.lines if lines else (),
             discs.circles if discs else (),
             self.discs_level,
@@ -228,6 +233,16 @@ class RunSummary:
             self.failed += 1
             if len(self.failures) < KEPT_FAILURES:
                 self.failures.append(rows.error)
+
+
+def tilts_by_image(path: Path) -> dict[str, FrameTilt]:
+    """The tilts of a file by the names of their images; see `redetect.landmarks.read_tilts`."""
+    return {image_name(prefix): tilt for prefix, tilt in read_tilts(path).items()}
+
+
+def pays(leaning: float, evidence: float) -> bool:
+    """Whether a search with the camera's lean finds clearly more evidence of discs."""
+    return leaning > _MORE_EVIDENCE * evidence
 
 
 def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:

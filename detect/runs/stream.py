@@ -41,7 +41,7 @@ import numpy as np
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary, pays
 from detect.runs.workers import WorkerPool, Workers, local_workers
 from detect.settings import LEAST_FRAMES
 from detect.sources.interface import ImageRun, RunFrame
@@ -237,8 +237,7 @@ def _with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FrameP
         return plan
     if expected < LEAST_FRAMES:
         return plan
-    from detect.runs.frame import pays  # loads the compiler, as the next one
-    from detect.runs.level_run import searched_lean, tilt_of_some
+    from detect.runs.level_run import searched_lean, tilt_of_some  # loads the compiler
 
     step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
     tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]

@@ -139,7 +139,8 @@ def _cause(error: Exception) -> str:
 def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     """The pixels of a `sensor_msgs/Image`: grey values, or blue, green, red and perhaps opacity.
 
-    Luminance of Bayer and YUV 4:2:2. FrameError for other encodings, or if data are missing.
+    For Bayer patterns and YUV 4:2:2 they are the luminance. Raises FrameError for other encodings,
+    or if there is less data than the message states.
     """
     encoding, height, width = message.encoding, message.height, message.width
     bayer = _BAYER.fullmatch(encoding)
@@ -269,8 +270,9 @@ def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPo
 def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPose, None, None]:
     """Poses with covariances accumulated over the movements since the first pose.
 
-    Each movement adds the growth of the pose's covariance or, if that has not grown as by a
-    movement (a driver that publishes a constant), the twist's covariance over the time step.
+    Each movement adds the growth of the pose's covariance, by a movement or, if it is diagonal (a
+    driver that ignores how errors of the heading move positions), of its diagonal; if that has not
+    grown (a driver that publishes a constant), the twist's covariance over the time step.
     """
     before: TimedPose | None = None
     total = np.zeros((3, 3))
@@ -278,7 +280,11 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
         if before is not None:
             grown = pose.covariance - carried(before.covariance, before, pose)
             scale = float(np.abs(pose.covariance).max())
-            if not np.any(grown) or np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:
+            if np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:
+                diagonal = np.diagonal(pose.covariance - before.covariance)
+                ignored = np.count_nonzero(pose.covariance) == 3 and diagonal.min() >= 0.0
+                grown = np.diag(diagonal) if ignored else np.zeros((3, 3))
+            if not np.any(grown):
                 cos, sin = np.cos(pose.theta), np.sin(pose.theta)
                 by_rate = (pose.time_s - before.time_s) * np.array(
                     [[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]

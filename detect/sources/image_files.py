@@ -1,4 +1,7 @@
-"""Image files as a source, and the image of each step, which is never outside the run."""
+"""Image files as a source, and the image of each step, which is never outside the run.
+
+Only the names of the images are kept in memory.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, sti
 from redetect.landmarks import read_steps
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
+from redetect.storage import demand_free
 from redetect.storage.bounded import leads_out, link_out
 
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
@@ -30,6 +34,19 @@ def image_name(prefix: str) -> str:
     return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
 
 
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending, which cannot lead out of a folder."""
+    return image_name(prefix) or "frame"
+
+
+def demand_pictures(frames: Frames, folder: Path, *, overwrite: bool) -> None:
+    """Make the folder for pictures of frames; reject existing pictures if names are known now."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not frames.ships_images:
+        names = (picture_name(frame.step.prefix) for frame in frames)
+        demand_free((folder / f"{name}.png" for name in names), overwrite=overwrite)
+
+
 def last_part(prefix: str) -> str:
     """A prefix without directories (of either system)."""
     return prefix.replace("\\", "/").rpartition("/")[2]
@@ -38,7 +55,8 @@ def last_part(prefix: str) -> str:
 class ImageNames:
     """Names of a folder's image files that match a pattern, in natural order: numbers by value.
 
-    Hidden files (``._`` and a name: metadata) are skipped unless the pattern begins with a dot.
+    Hidden files are skipped unless the pattern begins with a dot: some systems store metadata in
+    files whose names are ``._`` followed by the image's name.
     """
 
     def __init__(self, folder: Path, pattern: str = "*") -> None:
@@ -132,7 +150,8 @@ class RunFrames(Frames):
 class ImageFiles(Source):
     """Images in natural order of their names.
 
-    Calibration, times (``<folder>.times``) and results are in the folder of the run.
+    Calibration and times (by default ``<folder>.times``) are in the run's folder, and results are
+    written there: the folder of the images, or the one above ``images/``.
     """
 
     ships_images = False

@@ -31,9 +31,11 @@ from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
 
-#: Bit depths of cameras; a 16-bit image has the lowest that holds its values.
-_BIT_DEPTHS = (8, 10, 12, 14, 16)
-# Limit of a file's size: 16 bits in four channels, times two, plus metadata of cameras.
+#: Bit depths of cameras; a 16-bit image has the lowest that holds all but this share of its values
+#: (hot pixels).
+_BIT_DEPTHS, _BRIGHTEST = (8, 10, 12, 14, 16), 1e-4
+# Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
+# expand, plus thumbnails and other metadata of cameras.
 _BYTES_PER_PIXEL = 16
 _BYTES_BESIDE = 1 << 23
 
@@ -71,7 +73,10 @@ class Source(Frames):
     has_times = True  # whether the times of the images are known
 
     def calibration(self, *, posed: bool) -> Camera | None:
-        """The calibration beside or in the source, if any; if `posed`, one above the floor."""
+        """The calibration beside the source, or contained in it; None if there is none.
+
+        Several are an error; if `posed`, a calibration without a pose above the floor is ignored.
+        """
         return None if self.beside is None else camera_in(*self.beside)
 
     def poses(self, topic: str | None) -> PoseStream | None:
@@ -153,7 +158,8 @@ def read_image(
 def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
     """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
 
-    Only of the given `size`. FrameError, naming `name`, if it is no image, or truncated.
+    An image with another width and height than `size` is not decoded. Raises FrameError, with
+    `name` for the image, if the content is not an image, or is truncated.
     """
     if not content:
         raise FrameError(f"{name}: is empty: expected an image")
@@ -191,9 +197,9 @@ def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
         gray = gray[:, :, 0]
     if dtype == np.uint8:
         return gray
-    largest = int(gray.max())
-    bits = next(depth for depth in _BIT_DEPTHS if not largest >> depth)
-    return (gray >> (bits - 8)).astype(np.uint8)
+    few = _BRIGHTEST * gray.size
+    bits = next(bits for bits in _BIT_DEPTHS if np.count_nonzero(gray >> bits) <= few)
+    return np.asarray(np.minimum(gray >> (bits - 8), 255), np.uint8)
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:

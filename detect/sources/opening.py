@@ -12,7 +12,14 @@ from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
-from detect.sources.poses import FramesAlongPoses, PoseStream, SomeFrames, tick_poses, tum_poses
+from detect.sources.poses import (
+    FramesAlongPoses,
+    PoseStream,
+    SomeFrames,
+    tick_poses,
+    tum_poses,
+    velocity_poses,
+)
 from detect.sources.video import LiveCamera, VideoFile
 
 #: Extensions of bags that are a single file.
@@ -57,7 +64,10 @@ def open_source(
     *,
     posed: bool = False,
 ) -> ImageRun:
-    """Open a source as `open_run` does; without a calibration, posed if `posed`, it is no `Run`."""
+    """Open a source with or without a calibration; without one the result is not a `Run`.
+
+    Parameters and errors as for `open_run`. If `posed`, a calibration without a pose is ignored.
+    """
     options = options or SourceOptions()
     source = _source(name, options)
     if isinstance(camera, Path):
@@ -118,8 +128,9 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
     if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
         poses = source.poses(named)
-    elif named.endswith(".tum"):
-        poses = PoseStream(named, Path(named), lambda: tum_poses(Path(named)))
+    elif named.endswith((".tum", ".velocities")):
+        read = tum_poses if named.endswith(".tum") else velocity_poses
+        poses = PoseStream(named, Path(named), lambda: read(Path(named)))
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
@@ -131,7 +142,7 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         if not isinstance(source, ImageFiles):
             raise DetectError(
                 f"{named}: STEP rows belong to image files: expected a trajectory (.tum), "
-                f"ticks (.ticks), a bag's topic or none for {source.name}"
+                f"ticks (.ticks), velocities (.velocities), a bag's topic or none for {source.name}"
             )
         return source.along(Path(named)), Path(named)
     else:

@@ -2,8 +2,8 @@
 
 A pose (x, y, theta) has X forward and Y left, as in ROS; a STEP has X left and Y backward, in the
 robot's frame before the step. Rotations are the same in both. Poses come from TUM trajectories,
-rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; or from wheel encoders, rows
-``t left right``. The robot moves on the floor, so only heading, x and y are used.
+rows ``t x y z qx qy qz qw``: seconds, metres, unit quaternions; from wheel encoders, rows ``t left
+right``; or from velocities. The robot moves on the floor, so only heading, x and y are used.
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ _END_SLACK_S = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class TimedPose:
-    """A pose, X forward, Y left (m, rad), and its covariance since the start; 0 if unknown."""
+    """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
+
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
+    """
 
     time_s: float
     x: float
@@ -67,8 +70,9 @@ class PoseStream(NamedTuple):
 def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     """The STEP row of a robot's movement from one pose to another.
 
-    Covariances of poses are assumed to grow along the path, by that of each independent movement.
-    Without a positive definite one, that of the step is zero, which means unknown.
+    The covariances of poses are assumed to grow with the path: that of the later pose is that of
+    the earlier one, propagated, plus that of the movement, independent of it. If that is missing
+    or singular, the covariance of the step is zero, which means unknown.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
@@ -161,20 +165,64 @@ def tick_poses(
     path: Path, wheel_base_m: float, metres_per_tick: float
 ) -> Generator[TimedPose, None, None]:
     """The poses of a differential-drive robot from wheel ticks; arcs from row to row."""
-    x = y = theta = 0.0
-    last: list[float] = []
-    rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
-    for place, (time_s, *counts) in rows:
-        ways = [metres_per_tick * _ticks(*ends) for ends in zip(last or counts, counts)]
-        way, half_turn = 0.5 * sum(ways), 0.5 * (ways[1] - ways[0]) / wheel_base_m
-        if not max(abs(way), abs(half_turn)) <= FARTHEST:
+
+    def arcs() -> Iterator[_Arc]:
+        last: list[float] = []
+        rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
+        for place, (time_s, *counts) in rows:
+            left, right = (metres_per_tick * _ticks(*ends) for ends in zip(last or counts, counts))
+            yield _Arc(place, time_s, 0.5 * (left + right), (right - left) / wheel_base_m)
+            last = counts
+
+    return _poses_along(arcs())
+
+
+def velocity_poses(path: Path) -> Generator[TimedPose, None, None]:
+    """The poses of a robot from its velocities (m/s, rad/s), each valid until the next row.
+
+    Their noise is white and, for positions, the same in all directions; sigmas are the standard
+    deviations of its integral over one second (DLR Spatial Cognition data set report, equation 1).
+    """
+
+    def arcs() -> Iterator[_Arc]:
+        columns = "t v omega sigma_v sigma_omega"
+        last: list[float] = []
+        for place, row in rows_of_numbers(path, "file of velocities", columns, DetectError):
+            time_s, speed, turning, *sigmas = last or row
+            seconds = row[0] - time_s
+            deviations = (math.sqrt(max(seconds, 0.0)) * sigma for sigma in sigmas)
+            yield _Arc(place, row[0], seconds * speed, seconds * turning, *deviations)
+            last = row
+
+    return _poses_along(arcs())
+
+
+class _Arc(NamedTuple):
+    """A movement along an arc, with the row that it is from and the time of its end."""
+
+    place: str
+    time_s: float
+    way_m: float
+    turn_rad: float
+    sigma_m: float = 0.0  # of either coordinate
+    sigma_rad: float = 0.0  # of the heading
+
+
+def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
+    pose = TimedPose(0.0, 0.0, 0.0, 0.0)
+    for place, time_s, *movement in arcs:
+        if not max(map(abs, movement)) <= FARTHEST:
             raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
-        chord = way * float(np.sinc(half_turn / math.pi))
-        x += chord * math.cos(theta + half_turn)
-        y += chord * math.sin(theta + half_turn)
-        theta += 2.0 * half_turn
-        last = counts
-        yield TimedPose(time_s, x, y, theta)
+        way_m, turn_rad, sigma_m, sigma_rad = movement
+        chord, middle = way_m * float(np.sinc(turn_rad / math.tau)), pose.theta + 0.5 * turn_rad
+        dx, dy = chord * math.cos(middle), chord * math.sin(middle)
+        after = TimedPose(time_s, pose.x + dx, pose.y + dy, pose.theta + turn_rad)
+        # Errors of the heading arise all along the way: the mean of their effects, and its scatter.
+        by_heading = np.array([[-0.5 * dy, 0.5 * dx, 1.0], [-dy, dx, 0.0] / np.sqrt(12.0)])
+        errors = np.vstack([sigma_m * np.eye(2, 3), sigma_rad * by_heading])
+        covariance = carried(pose.covariance, pose, after) + errors.T @ errors
+        pose = replace(after, covariance=covariance)
+        yield pose
 
 
 def _ticks(before: float, after: float) -> float:
@@ -193,7 +241,8 @@ def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:
 class FramesAlongPoses(Frames):
     """The frames of a source with known poses of the robot over time.
 
-    Poses are interpolated. Images without one are not part of the run; the first step is zero.
+    The pose of an image is interpolated between those before and after it. Images without a pose at
+    their time are not part of the run; the first one's step is zero.
     """
 
     def __init__(self, source: Source, stream: PoseStream) -> None:

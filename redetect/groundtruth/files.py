@@ -30,10 +30,7 @@ NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 
 def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file with a JSON object.
-
-    Raises `GroundTruthError` if it cannot be read or is not one.
-    """
+    """Read a file with a JSON object; raises `GroundTruthError` if it cannot be read or is none."""
     text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
         content = json.loads(text)
@@ -51,8 +48,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
 class JsonObject:
     """An object of a JSON file, whose values are read by their names.
 
-    Missing or wrong values raise a `GroundTruthError` that states the place, the value and what was
-    expected.
+    Missing or wrong values raise a `GroundTruthError` with place, value and what was expected.
     """
 
     def __init__(self, place: str, value: Any) -> None:
@@ -244,8 +240,7 @@ def read_table(
     """Rows separated by commas or blanks after an optional head.
 
     `head` are the comma-separated names of the columns, `words` those with words; the others have
-    finite numbers. Raises `GroundTruthError` if the file cannot be read or a row is malformed; it
-    names file and line.
+    finite numbers. Raises `GroundTruthError` with file and line if a row is malformed.
     """
     names = head.split(",")
     rows: list[TableRow] = []

@@ -240,7 +240,8 @@ def detect(
     Parameters
     ----------
     image : (H, W) uint8, or path
-        Grey values of the camera's size, or an image file.
+        Grey values of the camera's size (an array, or a grey image of PIL or PyTorch), or an image
+        file.
     camera : Camera, or path
         The calibrated camera, or its `.cam` file.
     radius_m : float, optional
@@ -345,6 +346,8 @@ def settings_of(
             f"radius_m is {excerpt(radius_m)}: expected metres, which `detect all --radius-m auto` "
             "and detect.discs.radius.find_radius estimate from images"
         )
+    if not isinstance(settings, CircleSettings | None):
+        raise DetectError(f"settings is {excerpt(settings)}: expected rd.CircleSettings(...)")
     given: dict[str, Any] = {"radius_m": radius_m, "polarity": polarity}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(settings or CircleSettings(), **given)
@@ -359,8 +362,10 @@ def camera_of(camera: CameraLike) -> Camera:
 
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
-    if isinstance(image, np.ndarray):
-        return RunFrame(still("image"), None, content=plain_image(image))
+    # Arrays of NumPy and PyTorch, and PIL's images but for those whose values refer to a palette.
+    arrays = hasattr(image, "__array__") or hasattr(image, "__array_interface__")
+    if arrays and getattr(image, "mode", "L") != "P":
+        return RunFrame(still("image"), None, content=plain_image(np.asarray(image)))
     path = path_of(image, "an array of grey values, or the name of an image file", FrameError)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")

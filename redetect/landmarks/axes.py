@@ -1,10 +1,14 @@
 """Axes of the data set's robot, and those of other tools.
 
 The data set's robot has X left and Y backward; other tools expect X forward and Y left. A rotation
-about Z by 90 degrees, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, converts both the
-robot's frame and the map's: a pose or step T becomes Rz T Rz^-1, that is, its position is rotated
-and its angle is unchanged; covariances become Rz C Rz^T. Bearings are 0 forward, positive to the
-left, in both. Only numbers and signs are exchanged: the conversion back gives the same bits.
+about Z by 90 degrees, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, converts the first
+to the second. It is applied to both the robot's frame and the map's: a pose or step T becomes
+Rz T Rz^-1, that is, its position is rotated and its angle is unchanged. Covariances become
+Rz C Rz^T; if only the means were rotated, ellipses would have the wrong orientation. Bearings are
+0 forward, positive to the left, in both.
+
+Only numbers and signs are exchanged: nothing is rounded, and the conversion back gives the same
+bits.
 """
 
 from __future__ import annotations
@@ -21,13 +25,17 @@ Axes = Literal["robotics", "dataset"]
 #: Meaning of the axes.
 MEANING: dict[str, str] = {"robotics": "X forward, Y left", "dataset": "X left, Y backward"}
 
-# Indices and signs of the old coordinates; for the conversion back, the first two signs differ.
+# Indices and signs of the old coordinates that become the new first, second and third; for the
+# conversion back, the signs of the first two differ.
 _ORDER = np.array([1, 0, 2])
 _SIGNS = np.array([-1.0, 1.0, 1.0])
 
 
 def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = False) -> FloatArray:
-    """Convert (..., 2 or 3) x, y, angle from the data set's axes to others, or `back`."""
+    """Convert vectors, poses or steps from the data set's axes to others, or `back`.
+
+    Takes (..., 2) or (..., 3): x, y and, for poses and steps, the angle; returns the same shape.
+    """
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
         return old

@@ -142,14 +142,18 @@ def read_map(path: FilePath) -> LandmarkMap:
 def covariance_file(map_file: Path) -> Path:
     """Path of the joint covariance of a map: ``map_covariance.npy`` beside ``map.csv``.
 
-    In a map made by driving, landmarks share most of their error with their neighbours (the drift
-    from the start), which only the joint covariance describes.
+    A map's own file contains only the covariance of each landmark. In a map made by driving,
+    landmarks share most of their error with their neighbours (the drift from the start), which only
+    the joint covariance describes.
     """
     return map_file.with_name(f"{map_file.stem}_covariance.npy")
 
 
 def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> LandmarkMap:
-    """A map with the joint covariance beside its file, if any; malformed: LandmarkFileError."""
+    """A map with the joint covariance beside its file; unchanged if there is none.
+
+    Raises LandmarkFileError if that is malformed, or of another map.
+    """
     path = covariance_file(map_file)
     if not path.is_file():
         return landmark_map

@@ -174,7 +174,8 @@ class Frame:
 
     step: Step
     landmarks: tuple[Landmark, ...] = ()
-    #: Pitch and roll (rad) by which the positions of its discs were levelled, if they were
+    #: Pitch and roll (rad) by which the positions of its discs were levelled; None if they were
+    #: not
     levelled_by: tuple[float, float] | None = None
 
     @property
@@ -198,7 +199,8 @@ class Row:
     """A row of a landmark file with its text."""
 
     record: Record | None  #: None for comments, blank lines and settings of a detector
-    #: The row's text, with continuation lines and line end; None if it is new or changed
+    #: The row's text in the file, including continuation lines and line end; None for a row that
+    #: was not read from a file, or was changed
     source: bytes | None = None
     #: The number of the row's first line in its file, counted from 1; 0 without a file
     line: int = 0

@@ -14,7 +14,10 @@ TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them
 
 
 def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
-    """The times of images (s) by prefix; LandmarkFileError if a row is malformed or repeated."""
+    """The times of images (s) by prefix; rows are separated by blanks or a comma.
+
+    Raises LandmarkFileError if the file cannot be read, a row is malformed or an image has two.
+    """
     times: dict[str, float] = {}
     with opened(path, "file of times") as stream:
         for row, _, line in rows_of_words(stream, os.fspath(path)):

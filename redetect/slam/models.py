@@ -55,9 +55,8 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
     """
     before, moved = np.broadcast_arrays(pose, step)
-    return np.concatenate(
-        [apply(before, moved[..., :2]), (before + moved)[..., 2:]], axis=-1, dtype=np.float64
-    )
+    xy, theta = apply(before, moved[..., :2]), (before + moved)[..., 2:]
+    return np.concatenate([xy, theta], axis=-1, dtype=np.float64)
 
 
 def with_heading(matrices: FloatArray) -> FloatArray:

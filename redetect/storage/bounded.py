@@ -192,7 +192,8 @@ def read_plain_array(
 ) -> NDArray[Any]:
     """Read an array of a known type from a stream, to the array's end.
 
-    Larger ones are rejected before memory is allocated, by a ValueError that says what it is.
+    Arrays of more bytes than `largest_bytes` are rejected before memory is allocated. Raises a
+    ValueError that states on one line what was found instead.
     """
     expected = f"expected {dimensions}-dimensional {dtype}, row by row"
     try:
@@ -224,7 +225,8 @@ def read_plain_array(
 def claimed_size(content: bytes) -> tuple[int, int] | None:
     """Width and height (pixels) claimed by the header of an image file.
 
-    Those of a TIFF's tiles, if larger and enormous. None for other kinds or a damaged header.
+    For a TIFF with enormous tiles that are larger than the image, those of a tile. None if this is
+    not a JPEG, PNG, PNM, BMP or TIFF, or its header is damaged.
     """
     try:
         if content.startswith(b"\xff\xd8"):
@@ -318,7 +320,10 @@ def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
 
 
 def without_orientation(content: bytes) -> bytes:
-    """An image file's content, a TIFF's orientation, which OpenCV obeys, set to not rotated."""
+    """The content of an image file, with a TIFF's orientation tag set to "not rotated".
+
+    On request, OpenCV ignores the orientation of JPEG and PNG, but not that of TIFF.
+    """
     if not content.startswith(_TIFF):
         return content
     changed = bytearray(content)

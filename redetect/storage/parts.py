@@ -127,7 +127,10 @@ class _NamedFile(io.FileIO):
 
 
 def new_part(path: Path, suffix: str = "part", named: Path | None = None) -> PartFile:
-    """A new hidden file beside `path`; leftovers are removed, errors name `named`."""
+    """A new hidden file beside `path`; files left by killed processes are removed.
+
+    Errors name `named`, by default the path.
+    """
     for number in range(_NUMBERS):
         left = left_part(path, suffix, number)
         if left is not None:

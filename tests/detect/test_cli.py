@@ -393,3 +393,12 @@ def test_help_needs_nothing_heavy() -> None:
     assert shown.splitlines()[-1] == "set()"
     for word in ("circles", "compare", "--preset", "--radius-m", "--min-recall", "--reference"):
         assert word in shown
+
+
+@pytest.mark.parametrize("help_flag", ["--help", "--help-all"])
+def test_help_has_the_defaults_of_the_preset(help_flag: str, capsys: Captured) -> None:
+    with pytest.raises(SystemExit):
+        main(["circles", "--preset", "published", help_flag])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    calibration = text.partition("--calibration-px FLOAT")[2].partition(" --")[0]
+    assert "(default: 0.0)" in calibration

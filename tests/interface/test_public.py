@@ -204,6 +204,19 @@ def test_parts_and_equality(found: rd.Detection, demo_image: Path, demo_camera: 
     assert undone == replace(undone)
 
 
+@pytest.mark.parametrize("interface", ["__array__", "__array_interface__"])
+def test_images_of_other_libraries(
+    interface: str, found: rd.Detection, demo_camera: rd.Camera
+) -> None:
+    """PyTorch's have `__array__`, PIL's `__array_interface__`; palettes are not grey values."""
+    attribute = getattr(found.image, interface)
+    kind = type("Image", (), {interface: attribute, "mode": "L"})
+    assert ANY.detect(kind(), demo_camera).discs == rd.detect(found.image, demo_camera).discs
+    kind.mode = "P"  # type: ignore[attr-defined]
+    with pytest.raises(rd.Error, match="expected an array of grey values"):
+        ANY.detect(kind(), demo_camera)
+
+
 #: The API for arguments that type checkers refuse.
 ANY: Any = rd
 
@@ -217,6 +230,7 @@ ANY: Any = rd
         (lambda one: ANY.detect(one.image[:9], one.camera), "of these images by `camera`$"),
         (lambda one: ANY.detect(one.image, {}), "expected a Camera, or the name of its .cam file"),
         (lambda one: ANY.detect(one.image, one.camera, "auto"), "expected metres, which"),
+        (lambda one: ANY.detect(one.image, one.camera, settings={}), "expected rd.CircleSettings"),
         (lambda one: ANY.detect(one.image, one.camera, axes="rep103"), "robotics are REP 103's"),
         (lambda _: ANY.open(["e"]), "expected the name of a run"),
         (lambda _: ANY.open("images/e/images"), "named by `camera`; `camera calibrate`"),
@@ -342,6 +356,22 @@ def test_every_disc_that_is_found_is_explained(
     assert len(content["candidates"]) == len(why.candidates)
     assert why._repr_png_().startswith(b"\x89PNG")
     assert "data:image/png" in why._repr_html_()
+
+
+def test_a_disc_whose_centre_is_cut_off(
+    found: rd.Detection, demo_image: Path, demo_camera: rd.Camera
+) -> None:
+    """The image ends two columns before the centre of its clearest disc."""
+    image = np.asarray(cv2.imread(str(demo_image), cv2.IMREAD_GRAYSCALE), np.uint8)
+    clearest = int(np.argmax(found.discs.evidence))
+    width = int(found.discs.u[clearest]) - 2
+    why = rd.explain(image[:, :width].copy(), replace(demo_camera, width=width))
+    (cut,) = [row for row in why.candidates if row.stage == "outside"]
+    assert (cut.u, cut.v) == pytest.approx(
+        (found.discs.u[clearest], found.discs.v[clearest]), abs=1.5
+    )
+    assert "centre is outside the image" in cut.reason()
+    assert json.loads(why.to_json())
 
 
 def test_the_wrong_polarity_is_named(

@@ -127,7 +127,7 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
         run = Recording(
             names, steps, np.tile(noise, (60, 1, 1)), CircleRows.of(rows), LineRows.of()
         )
-        head = "settings radius_m=0.1 tilt_sigma_deg=0.3"
+        head = "settings radius_m=0.1 refine=True evidence=-0.1 tilt_sigma_deg=0.3"
         write_frames(tmp_path / f"{seed}.circles", frames_of_discs(run), head=head)
         mapped = map_run(read_recording(tmp_path / f"{seed}.circles"))
         error = mapped.estimate.disc_xy - discs[mapped.graph.disc_ids]
@@ -135,3 +135,22 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
         joint = joint_covariance(mapped.graph, mapped.estimate, Weighting())
         np.testing.assert_allclose(joint[-2:, -2:], mapped.covariance.discs[-1], rtol=1e-6)
     assert 0.2 < np.mean(found) < 2.0  # 0.5 and 0.8; as if independent 1.0 and 4.2
+
+
+@pytest.mark.parametrize(
+    ("settings", "tilted"),
+    [
+        ("refine=True evidence=-0.1 tilt_sigma_deg=None", True),
+        ("refine=True evidence=-0.1 tilt_sigma_deg=0.0", False),
+        ("refine=True evidence=-0.1 tilt_sigma_deg=0.05", True),
+        ("refine=False evidence=-0.1 tilt_sigma_deg=None", False),  # the published detector's
+    ],
+)
+def test_which_rows_state_a_tilt(tmp_path: Path, settings: str, tilted: bool) -> None:
+    run = Recording(
+        ("f.0",), np.array([[0.0, -0.2, 0.0]]), 1e-4 * np.eye(3)[None],
+        CircleRows.of([(0, np.array([0.0, -2.0]), 1e-4 * np.eye(2), 1)]), LineRows.of(),
+    )  # fmt: skip
+    path = tmp_path / "a.circles"
+    write_frames(path, frames_of_discs(run), head=f"settings radius_m=0.1 {settings}")
+    assert read_recording(path).tilted is tilted

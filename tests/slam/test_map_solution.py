@@ -16,7 +16,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
 from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.filtered_start import filtered_poses
+from redetect.slam.filters.ekf_slam import filtered_poses
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import PLACE_PRIOR_M, Weighting
 from redetect.slam.mapping.initial_lines import place_lines

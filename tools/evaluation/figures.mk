@@ -17,7 +17,8 @@ CODE := $(shell git ls-files 'camera/*.py' 'detect/*.py' 'detect/*.npz' 'lut/*.p
 # markers more than two, association, markers-photographs and real-run one to two.
 FIGURES ?= accuracy photographs buildings buildings-published buildings-report rendered-r1 rendered-r2 disturbed \
     demo sight-r1 sight-r2 tutorial real-run tilt-of-discs tilt-demo tilt-tilted tilt-room tilt-down soft \
-    markers markers-frames markers-photographs markers-timing poses fusion association map-speed speed
+    markers markers-frames markers-photographs markers-timing poses fusion association association-rows association-demo \
+    map-speed speed
 
 accuracy = accuracy
 photographs = photographs $(DATA)/discs
@@ -67,6 +68,8 @@ poses = programs 'tools.simulator marker-session @/session --session.steps 40 --
     'groundtruth score @/session/poses.csv @/session/truth.csv --json @/score.json'
 fusion = fusion --seeds 20
 association = association $(SHIPPED) --sigma-scale 1.4
+association-rows = programs 'tools.simulator rows @/s1' 'tools.evaluation association @/s1 --figures @/table.json'
+association-demo = association images/e --circles --lines
 map-speed = map-speed $(SHIPPED)
 speed = --photographs $(DATA)/discs --frames 80 1600 16000 --factors 1 2 3 5 --landmarks 0 10 30 --pictures 8 --rounds 5 --budget-s 1
 

@@ -24,6 +24,7 @@ from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from lut import cached_disc_table, cached_vertical_table
+from lut.outlines import floor_positions, size_down
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
@@ -118,6 +119,30 @@ def draw_tables(figure: Any, run: Path) -> None:
     for column in range(0, camera.width, 48):
         panels[1].plot(verticals.column[:, column], rows, color=_LINE, lw=1)
     panels[1].plot(np.arange(camera.width), verticals.anchor_row, "--", color=_RINGS, lw=1)
+
+
+def draw_field_of_view(figure: Any, run: Path) -> None:
+    """The floor that the camera sees, from above: the length of a pixel on it, and the outline."""
+    camera, _ = _frame(run, 0)
+    left, ahead = np.meshgrid(np.linspace(-6.0, 6.0, 601), np.linspace(-0.5, 9.5, 501))
+    floor_xy = np.stack([left, -ahead], axis=-1).reshape(-1, 2)
+    seen = np.rint(np.nan_to_num(camera.project_floor(floor_xy), nan=-1.0)).astype(int)
+    inside = np.all((seen >= 1) & (seen < [camera.width - 1, camera.height - 1]), axis=1)
+    u, v = seen[inside].T
+    size_m = size_down(floor_positions(camera))
+    length_mm = np.full(len(seen), np.nan)
+    length_mm[inside] = 1000.0 * size_m[v, u]
+    axes = figure.subplots()
+    levels = [2, 5, 10, 20, 50, 100, 200]
+    drawn = axes.contourf(-left, ahead, length_mm.reshape(left.shape), levels, extend="both",
+                          cmap="YlOrBr", norm=mpl.colors.LogNorm(2, 200))  # fmt: skip
+    figure.colorbar(drawn, label="height of a pixel on the floor (mm)", ticks=levels,
+                    format="%d", shrink=0.8)  # fmt: skip
+    axes.plot(0, 0, "^", color=_OWN, markersize=9)
+    axes.plot(-camera.centre[0], -camera.centre[1], "o", color=_OTHER, markersize=5)
+    axes.set(xlabel="right (m)", ylabel="forward (m)", aspect="equal", xlim=(-6, 6))
+    axes.set_title("robot (triangle), camera (dot), and the floor in its image", fontsize=9)
+    axes.grid(color="#dddddd", lw=0.5)
 
 
 def draw_markers(figure: Any, run: Path, frame: int) -> None:
@@ -307,6 +332,7 @@ class Pictures(Study):
         self._save("discs", (8, 9.4), lambda f: draw_discs(f, run, 4), 72)
         self._save("verticals", (8, 9.4), lambda f: draw_verticals(f, run, 15), 72)
         self._save("tables", (8, 6.4), lambda f: draw_tables(f, run), 72)
+        self._save("field-of-view", (6.4, 5.2), lambda f: draw_field_of_view(f, run), 72)
         self._save("marker-phases", (13, 4), lambda f: draw_markers(f, markers, 6), 80)
         if self.tutorial is not None:
             mine = self.tutorial / "mine"

@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
-from detect.circles import candidates_of, judged, vote_shape
+from detect.circles import candidates_of, judged, scene_of, vote_shape
 from detect.discs.judgement import FEATURES, GLANCED_AT, JUDGED, glance, pairs_of_steps
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
-from detect.grey_values import estimate_noise
 from detect.settings import CircleSettings
 from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
@@ -109,7 +108,7 @@ class _Gathering:
     ) -> None:  # fmt: skip
         """Look at an image."""
         table = cached_vote_table(camera, vote_shape(_SETTINGS))
-        noise, numbers = estimate_noise(image, 16), camera_numbers(camera)
+        scene = scene_of(image, camera, table, _SETTINGS)
         signs = len(truth.light) > 0, len(truth.dark) > 0
 
         def known(places: FloatArray, sign: FloatArray) -> Iterator[tuple[int, bool, float, str]]:
@@ -124,13 +123,13 @@ class _Gathering:
                     counted = weight[0 if is_disc else 1] * (other_sign if other else 1.0)
                     yield k, is_disc, counted, source
 
-        candidates = candidates_of(image, table, _SETTINGS, noise)
+        candidates = candidates_of(scene, table, _SETTINGS)
         for k, *row in known(candidates.floor_xy, candidates.sign):
             x, y = candidates.floor_xy[k]
-            grey, scale = glance(image, numbers, x, y, _RADIUS)
+            grey, scale = glance(image, scene.camera_numbers, x, y, _RADIUS)
             seen = candidates.score[k : k + 1], candidates.sign[k] * grey[None], scale[None]
             self.glances.append((*seen, *row))
-        rims = judged(image, camera, _SETTINGS, candidates, noise, _BY_RIM)
+        rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
         rims = rims.where((rims.fate == JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
             views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])

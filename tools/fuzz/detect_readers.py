@@ -20,7 +20,7 @@ from detect.row_files import read_head
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
-from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses
+from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses, velocity_poses
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
@@ -195,6 +195,8 @@ DETECT_READERS: tuple[Reader, ...] = (
            (b"# t x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n1 0.5 0 0 0 0 0.1 0.995\n",), NUMBERS),
     Reader("wheel ticks", "e.ticks", lambda p: steps_of(tick_poses(p, 0.5, 0.001)), _DETECT,
            (b"# t left right\n0 0 0\n1 500 510\n",), NUMBERS),
+    Reader("velocities", "e.velocities", lambda p: steps_of(velocity_poses(p)), _DETECT,
+           (b"# t v omega sigma_v sigma_omega\n0 1 0.1 0.01 0.02\n1 0 0 0 0\n",), NUMBERS),
     Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
     Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,

@@ -22,6 +22,7 @@ from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
+from redetect.groundtruth.validation import scoring
 from redetect.groundtruth.validation.onboard import (
     INCIDENCES_DEG,
     Onboard,
@@ -36,17 +37,6 @@ from redetect.groundtruth.validation.reference_poses import (
     poses_from_distances,
     read_distances,
     read_survey,
-)
-from redetect.groundtruth.validation.scoring import (
-    PUBLISHED,
-    PoseScore,
-    ReferenceErrors,
-    normalised_band,
-    normalised_errors,
-    reference_errors,
-    score_poses,
-    sigma_of,
-    stream_of,
 )
 from redetect.storage import write_bytes
 
@@ -83,22 +73,22 @@ def perform(options: Validate) -> int:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
         raise GroundTruthError("not a single reference pose")
-    errors, without = reference_errors(references, poses)
+    errors, without = scoring.reference_errors(references, poses)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
     if not errors.references:
         raise GroundTruthError("no ground truth at the time of any reference pose")
-    score = score_poses(errors.poses, errors.reference_poses, len(without))
+    score = scoring.score_poses(errors.poses, errors.reference_poses, len(without))
     rows = _table_rows(references, errors)
     figures: dict[str, Any] = asdict(score)
     if score.normalised:
-        figures["normalised_band"] = normalised_band(score.normalised)
+        figures["normalised_band"] = scoring.normalised_band(score.normalised)
     content = {
         **provenance({"refine": options.refine}, files),
         "poses": options.poses.name,
         "clock": None if clock_path is None else clock_path.name,
         "figures": figures,
-        "published": [asdict(published) for published in PUBLISHED],
+        "published": [asdict(published) for published in scoring.PUBLISHED],
         "refused": [asdict(r) for r in (*refused, *without)],
         "distances": _distance_figures(solved, survey.sigma_m),
         "rows": [
@@ -111,7 +101,8 @@ def perform(options: Validate) -> int:
         content |= _scanners_on_board(references, segments)
         pictures["scans.png"] = draw_scans(errors, segments)
     folder.mkdir(parents=True, exist_ok=True)
-    write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
+    stream = scoring.stream_of(references)
+    write_planar_poses(outputs["reference.csv"], stream, overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         write_bytes(outputs[name], data, overwrite=options.force)
@@ -129,7 +120,7 @@ def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray
         inside = errors[(np.degrees(angles) >= low) & (np.degrees(angles) <= high)]
         mean = float(inside.mean()) if len(inside) else math.nan
         row = {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean}
-        rows.append({**row, "sigma_m": sigma_of(inside)})
+        rows.append({**row, "sigma_m": scoring.sigma_of(inside)})
     content: dict[str, Any] = {"incidence": rows}
     if (found := refine_mounts(references, segments)) is not None:
         sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
@@ -142,12 +133,12 @@ def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray
 
 
 def _table_rows(
-    references: Sequence[ReferencePose], errors: ReferenceErrors
+    references: Sequence[ReferencePose], errors: scoring.ReferenceErrors
 ) -> list[dict[str, Any]]:
     """Rows of the table: every reference pose with its error, NaN if it has none."""
     columns = ("error_x_m", "error_y_m", "linear_m", "angular_deg", "nees")
     x, y, theta = errors.error.T
-    nees = 3.0 * normalised_errors(errors.poses, errors.reference_poses)
+    nees = 3.0 * scoring.normalised_errors(errors.poses, errors.reference_poses)
     table = np.column_stack([x, y, np.hypot(x, y), np.degrees(theta), nees])
     by_index = {r.index: row for r, row in zip(errors.references, table.tolist())}
     rows: list[dict[str, Any]] = []
@@ -185,7 +176,7 @@ def _table_text(rows: Sequence[dict[str, Any]]) -> str:
 def summary_lines(
     references: Sequence[ReferencePose],
     refused: Sequence[Refused],
-    score: PoseScore,
+    score: scoring.PoseScore,
     distances: dict[str, Any],
 ) -> list[str]:
     """The printed figures, with RAWSEEDS' beside them."""
@@ -201,7 +192,7 @@ def summary_lines(
             f"{p.name:<18} mean {1e3 * p.position_mean_m:.0f} mm, sigma "
             f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
             f"{p.angle_sigma_deg:.2f} (published)"
-            for p in PUBLISHED
+            for p in scoring.PUBLISHED
         ),
     ]
 

@@ -64,8 +64,7 @@ class ClockSegment:
     offset_s: float = 0.0  # Robot time minus ground truth time there
     rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
     angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
-    # Standard deviations; infinite if the segment does not determine the value
-    sigma_offset_s: float = math.inf
+    sigma_offset_s: float = math.inf  # Standard deviations; infinite if not determined
     sigma_rate: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
     # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
@@ -73,8 +72,7 @@ class ClockSegment:
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
-    # From the segment alone, if one line through all segments replaced offset and deviation
-    own_offset_s: float | None = None
+    own_offset_s: float | None = None  # From the segment alone, if one line replaced these two
     own_sigma_s: float | None = None
 
 
@@ -240,8 +238,7 @@ class PtpdLog:
 
     times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
     offset_s: FloatArray  # (N,): clock minus master
-    # (N,): observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
-    drift: FloatArray
+    drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
 
 
 def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:

@@ -92,8 +92,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """Factor of odometry's variances over seconds to those expected from single samples.
 
     A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
-    over a gap. So most measurements are dropped, and odometry's predictions between the remaining
-    ones are compared with them. The factor is 1 unless the errors are significantly larger.
+    over a gap. So its predictions between measurements seconds apart are compared with these. The
+    factor is 1 unless the errors are significantly larger.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -166,38 +166,25 @@ class OdometryErrors:
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
-    # Factor on their variances if nothing was measured for more than a second, since errors over
-    # seconds were larger than expected from single samples; 1 if they were not.
-    looser_in_gaps: float
+    looser_in_gaps: float  # Factor on their variances if nothing is measured for over a second
 
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
     """The robot's path from all streams."""
 
-    # At the odometry's times from the first measurement to the last, with covariances; headings
-    # within +-pi.
-    poses: PlanarPoses
-    # The same from the filter alone: each from measurements until then
-    filtered: PlanarPoses
+    poses: PlanarPoses  # At odometry's times from the first measurement to the last
+    filtered: PlanarPoses  # The same from the filter alone: each from measurements until then
     rejected: tuple[Rejected, ...]  # In order of time
-    # Times at which the filter was restarted because measurements did not fit any more
-    restarts_s: tuple[float, ...]
+    restarts_s: tuple[float, ...]  # When the filter restarted, as measurements did not fit any more
     used: dict[str, int]  # Number of measurements used, by stream
     odometry: OdometryErrors  # The estimated errors of odometry
-    # Errors of odometry treated as a localisation, if the path was estimated that way
-    localisation: LocalisationErrors | None
-    # Number of covariances that were not positive definite as written, by stream; they were
-    # increased by their file's rounding.
-    repaired: dict[str, int]
-    # Factor by which deviations were raised, by stream, since the poses jitter more from one to the
-    # next than their covariances allow; 1 if they do not.
-    raised: dict[str, float]
+    localisation: LocalisationErrors | None  # Errors of odometry treated as a localisation
+    repaired: dict[str, int]  # Number of covariances that were not positive definite, by stream
+    raised: dict[str, float]  # Factor on deviations, by stream, since the poses jitter more
     # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
-    # wheels or a reset: the covariances do not rely on it there.
+    # wheels or a reset, and its pauses: the covariances do not rely on it there.
     slips_s: tuple[tuple[float, float], ...]
-    # Pauses of odometry within the poses' time. Motion that it may have missed there, at the
-    # robot's usual rates, increases the covariances.
     pauses_s: tuple[tuple[float, float], ...]
 
 
@@ -316,8 +303,7 @@ class LeftOut:
     position_rms_m: float  # Root of the mean squared error of the fused path
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
-    # The same for odometry, rigidly aligned with the other segments
-    aligned_position_rms_m: float
+    aligned_position_rms_m: float  # The same for odometry, aligned with the other segments
     aligned_heading_rms_rad: float
 
 
@@ -326,10 +312,9 @@ def leave_out(
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
-    Parameters as for `fuse`. Segments are those of the first stream; the other streams are left out
-    at the same times. The first and the last segment are not predicted, since a fused path extends
-    from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
-    three segments within the odometry's time.
+    Parameters as for `fuse`. Segments are those of the first stream; the others are left out at the
+    same times. A fused path ends with the measured poses: the first and the last segment are not
+    predicted. Raises `GroundTruthError` if there are fewer than three within the odometry's time.
     """
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)

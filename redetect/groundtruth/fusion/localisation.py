@@ -58,8 +58,7 @@ class LocalisationErrors:
     heading_sigma: float  # Of the heading (rad)
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
-    # Heading of the ground truth minus that of the aligned localisation (rad)
-    heading_offset: float
+    heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
 
 
 def as_localisation(
@@ -200,9 +199,8 @@ def _bridged(
         last = min(int(np.searchsorted(times, measured_s[gap + 1])), len(times) - 1)
         within = slice(first + 1, last)
         ends = pose_differences(poses[[first, last]], there.poses[[first, last]])
-        after, before = (
-            np.exp(-np.abs(times[within, None] - times[end]) / correlation) for end in (first, last)
-        )
+        after = np.exp(-np.abs(times[within, None] - times[first]) / correlation)
+        before = np.exp(-np.abs(times[within, None] - times[last]) / correlation)
         whole = np.exp(-(times[last] - times[first]) / correlation)
         by_first = (after - whole * before) / (1.0 - whole**2)
         by_last = (before - whole * after) / (1.0 - whole**2)

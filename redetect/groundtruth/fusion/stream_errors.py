@@ -49,8 +49,7 @@ def roughness(values: FloatArray) -> float:
 def jitter_ratio(poses: PlanarPoses) -> float:
     """Jitter of poses in their standard deviations: about 1 if these are right.
 
-    The largest of x, y and the heading; 0 if it is unknown: without covariances, or
-    with too few or too slow poses.
+    The largest of x, y and the heading; 0 without covariances, or with too few or too slow poses.
     """
     count = len(poses) - _ORDER
     if poses.covariances is None or count < _FEWEST:

@@ -1,9 +1,8 @@
 """Poses of fixed scanners, aligned with each other and with the building, step by step.
 
 The steps are those of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners are aligned by ICP;
-their scans are merged one after the other; each scanner is aligned again with the others' merged
-scans, in rounds until none moves; finally all as one body with the map, then each, together with
-the walls' offsets.
+their scans are merged one after the other; each is aligned again with the others', in rounds until
+none moves; finally all as one body with the map, then each, together with the walls' offsets.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
+from math import inf
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -20,7 +20,14 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import MapProblem, StillScan, still_scan
+from redetect.groundtruth.lasers.walls import (
+    BULGE_M,
+    MapProblem,
+    StillScan,
+    WallCurves,
+    still_scan,
+    wall_curves,
+)
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 
@@ -41,6 +48,8 @@ _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 _MUCH_WORSE = 0.1
 # Walls farther than this from what scanners see, by their measured poses, are ignored (m).
 _AROUND_M = 5.0
+# Neighbouring walls may be chords of a curve that leaves them by less than this (m).
+_MOST_BULGE_M = 0.1
 # A scanner's start on the map is found with standard deviations down to this (m).
 _COARSE_M = 0.02
 # Standard deviations of measured poses (m, rad): without a covariance, and the least.
@@ -52,16 +61,12 @@ class Alignment:
     """Estimated poses of the scanners."""
 
     scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
-    # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
-    steps: dict[str, FloatArray]
-    # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
-    pairs: dict[tuple[int, int], float]
+    steps: dict[str, FloatArray]  # Poses after each of `STEPS`, at first in the measured frame
+    pairs: dict[tuple[int, int], float]  # Shares of two scans that coincide after their ICP
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
-    # (3 scanners, 3 scanners): covariance of their poses, jointly
-    covariance: FloatArray
-    # Standard deviation of the offsets of the walls' ends from the map (m); 0 if it is exact.
-    map_sigma_m: float
+    covariance: FloatArray  # (3 scanners, 3 scanners): of their poses, jointly
+    map_sigma_m: float  # Standard deviation of the walls' ends from the map (m); 0 if exact
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 
@@ -117,22 +122,27 @@ def align_scanners(
     gates = np.geomspace(s.gate_m, 0.08, 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = _round(scans, steps["merged"], s)
-    steps["together"] = _together(scans, steps["realigned"], s)
+    together = steps["realigned"]
+    for _ in range(_ROUNDS):  # until no scanner moves
+        before, together = together, _round(scans, together, s)
+        if np.abs(together - before).max() < 1e-5:
+            break
+    steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole = _whole_to_map(stills, steps["together"], measured, building, narrowing)
+    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
     starts, others = [], []
     for one, still, pose, prior in zip(scanners, stills, whole, priors):
         coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
         try:
-            lone = MapProblem([still], one.pose[None], prior, building)
+            lone = MapProblem([still], one.pose[None], prior, building, curves)
             start, other = lone.likely_pose(pose, coarse)
         except GeometryError as error:
             raise GeometryError(f"scanner {one.name}: {error}") from None
         starts.append(start)
         others.append(other)
-    problem = MapProblem(stills, measured, block_diag(*priors), building)
+    problem = MapProblem(stills, measured, block_diag(*priors), building, curves)
     fit = problem.fit(np.stack(starts), narrowing, _WEAK_M)
     steps["each to the map"] = fit.poses
     covariance = fit.covariance + block_diag(*others)
@@ -204,9 +214,8 @@ def _chained(
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):
-        pair = max(
-            (p for p in shares if (p[0] in placed) != (p[1] in placed)), key=lambda p: shares[p]
-        )
+        joining = (pair for pair in shares if (pair[0] in placed) != (pair[1] in placed))
+        pair = max(joining, key=shares.__getitem__)
         a, b = pair if pair[0] in placed else pair[::-1]
         a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
         poses[b] = compose(poses[a], a_from_b)
@@ -242,30 +251,29 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
     return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), s.keep)
 
 
-def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
-    """Rounds until no scanner moves."""
-    for _ in range(_ROUNDS):
-        before = poses
-        poses = _round(scans, poses, s)
-        if np.abs(poses - before).max() < 1e-5:
-            break
-    return poses
-
-
 def _whole_to_map(
     stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
     narrowing_m: list[float],
-) -> FloatArray:  # fmt: skip
-    """Align all scanners, as one rigid body, with the map, from their measured poses."""
+) -> tuple[FloatArray, WallCurves]:  # fmt: skip
+    """Align all scanners, as one rigid body, with the map, from their measured poses.
+
+    Also says which walls are chords of curves: whether coarse ones are, the readings decide.
+    """
     if len(poses) > 1:
         body = fitted(poses[:, :2], measured[:, :2])
     else:
         body = compose(measured[0], invert(poses[0]))
     prior = np.eye(3) / _UNKNOWN_SIGMA**2
-    problem = MapProblem(stills, body[None], prior, building, mounts=poses)
-    with suppress(GeometryError):  # then each scanner's start is searched around its measured pose
-        body = problem.fit(body[None], narrowing_m, _WEAK_M).poses[0]
-    return compose(np.broadcast_to(body, poses.shape), poses)
+    start, least = body[None], inf
+    fine, coarse = (wall_curves(building, bulge_m) for bulge_m in (BULGE_M, _MOST_BULGE_M))
+    curves = fine
+    for tried in (fine, coarse):
+        problem = MapProblem(stills, start, prior, building, tried, poses)
+        with suppress(GeometryError):  # then each scanner is searched around its measured pose
+            found, _, cost = problem.narrowed(start, narrowing_m)
+            if cost < least:
+                body, curves, least = found[0], tried, cost
+    return compose(np.broadcast_to(body, poses.shape), poses), curves
 
 
 def icp_by_step(
@@ -276,9 +284,5 @@ def icp_by_step(
     They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
     (3,).
     """
-    return np.array(
-        [
-            fit_outline(points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
-            for k in range(steps + 1)
-        ]
-    )
+    from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
+    return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

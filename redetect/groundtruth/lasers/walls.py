@@ -15,7 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
@@ -42,6 +45,15 @@ _SIGMA_PER_MEDIAN = 1.4826  # Of a normal distribution
 _START_SIGMAS, _COARSE_READINGS, _LARGEST_PRIOR_COST, _SAME_POSE = 1.5, 240, 50.0, 2e-3
 # Change of a mount (m, rad) for derivatives.
 _DIFFERENCE = 1e-5
+# Neighbouring walls are chords of a curve that leaves them by less than this (m), and turns by less
+# (rad) from one to the next; ends this close are the same corner (m).
+BULGE_M, _MOST_TURN, _SAME_CORNER_M = 0.003, 0.6, 1e-4
+# Largest correlation of the offsets of a curve's chords, and the distance in which it falls (m).
+_MOST_ALIKE, _ALIKE_M = 0.99, 3.0
+# A direction that only this many readings determine is undetermined.
+_FEW_READINGS = 3
+# Away from a pose: joint standard deviation (m), and share of the prior that holds a pose there.
+_WIDE_M, _HELD = 0.3, 1e-3
 # Length (m) that a turn of a radian corresponds to, where directions are compared.
 _TURN_ARM_M = 3.0
 
@@ -62,8 +74,8 @@ class StillScan(NamedTuple):
 def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
     """Average scans (N, readings) in which nothing moves.
 
-    Excluded are beams without a reading in half of the scans and those along an edge, which jump
-    between near and far; also a beam's readings far from its median, of passing objects.
+    Without beams that have no reading in half of the scans or jump along an edge, and readings far
+    from a beam's median, of passing objects.
     """
     metres = ranges_mm * 1e-3
     hit = scanner.has_return(ranges_mm)
@@ -84,10 +96,8 @@ def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
 def first_walls(
     origin: FloatArray, directions: FloatArray, walls: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """The walls (S, 4) that rays from a point meet first: distances (N,), infinite if there is
-    none, indices (N,), and cosines (N,) of the angles of incidence.
-
-    `directions`: (N, 2) unit vectors.
+    """Distances (N,), infinite if there is none, and indices (N,) of the walls (S, 4) that rays
+    from a point first meet in `directions` (N, 2), unit vectors; cosines (N,) of the incidence.
     """
     start, along = walls[:, :2] - origin, walls[:, 2:] - walls[:, :2]
     across = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
@@ -98,6 +108,38 @@ def first_walls(
     rows, first = np.arange(len(directions)), np.argmin(far, axis=1)
     cosines = np.abs(across[rows, first]) / np.hypot(*along[first].T)
     return far[rows, first], first, cosines
+
+
+class WallCurves(NamedTuple):
+    """Which of S walls are chords of curves."""
+
+    bends: FloatArray  # (S, 2): angles from walls to the curve at both ends (rad); 0 if straight
+    curve: IntArray  # (S,): equal for walls of the same curve
+
+
+def wall_curves(walls: FloatArray, bulge_m: float = BULGE_M) -> WallCurves:
+    """Chords among walls (S, 4): similar neighbours, from which their curve bulges by less.
+
+    Otherwise their corners would be features that tell how scanners in a round room are turned.
+    """
+    along, count = walls[:, 2:] - walls[:, :2], len(walls)
+    pairs = cKDTree(walls.reshape(-1, 2)).query_pairs(_SAME_CORNER_M, output_type="ndarray")
+    # Corners of exactly two walls.
+    pairs = pairs[np.all(np.bincount(pairs.ravel(), minlength=2 * count)[pairs] == 1, axis=1)]
+    side, end = np.divmod(pairs, 2)
+    # From the first wall through the corner to the second.
+    x, y = np.moveaxis(along[side] * np.where(end == [1, 0], 1, -1)[..., None], -1, 0)
+    turn = np.arctan2(x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1], x[:, 0] * x[:, 1] + y[:, 0] * y[:, 1])
+    length = np.hypot(*along.T)[side]
+    total = np.maximum(length.sum(axis=1), 1e-9)
+    chords = (np.abs(turn) * total < 16.0 * bulge_m) & (np.abs(turn) < _MOST_TURN)
+    chords &= total < 4.0 * length.min(axis=1)
+    bends, side = np.full((count, 2), np.nan), side[chords]
+    bends[side, end[chords]] = ([1.0, -1.0] * length * (turn / total)[:, None])[chords]
+    # The last chord is as bent at its other end.
+    bends = np.nan_to_num(np.where(np.isnan(bends), -bends[:, ::-1], bends))
+    joined = csr_array((np.ones(len(side)), side.T), shape=(count, count))
+    return WallCurves(bends, connected_components(joined, directed=False)[1])
 
 
 class MapFit(NamedTuple):
@@ -146,8 +188,8 @@ class MapProblem(NamedTuple):
     measured: FloatArray  # (poses, 3): measured by hand
     prior: FloatArray  # (3 poses, 3 poses): information of the measured poses
     walls: FloatArray  # (S, 4): pieces of wall, seen from both sides (m)
-    # (scanners, 3): poses on one body, the only pose; otherwise each scanner has a pose.
-    mounts: FloatArray | None = None
+    curves: WallCurves  # Which of them are chords
+    mounts: FloatArray | None = None  # (scanners, 3): on one body, the only pose; else no body
 
     def fit(self, starts: FloatArray, narrowing_m: Sequence[float], weak_sigma_m: float) -> MapFit:
         """The most likely poses near starts.
@@ -167,7 +209,7 @@ class MapProblem(NamedTuple):
         GeometryError
             If fewer than ten readings match walls.
         """
-        poses, offsets, _ = self._narrowed(starts, narrowing_m)
+        poses, offsets, _ = self.narrowed(starts, narrowing_m)
         # Walls are not straight to a millimetre everywhere.
         usual = np.median(np.abs(self._on_walls(poses, offsets, min(narrowing_m)).rest_m))
         floor = max(FLOOR_M, _SIGMA_PER_MEDIAN * float(usual))
@@ -179,7 +221,17 @@ class MapProblem(NamedTuple):
                 break
         # Again with the weights that the residuals suggest.
         ratio = float(np.sum(on.weight * on.rest_m**2)) / max(len(on.rest_m) - poses.size, 1)
-        found = self._solved(on._replace(weight=on.weight / max(ratio, 0.1)), poses, None)
+        on = on._replace(weight=on.weight / max(ratio, 0.1))
+        scale, parts = np.array([1.0, 1.0, _TURN_ARM_M]), range(0, poses.size, 3)
+        for k in range(len(poses)):  # Few readings may match a small object by chance.
+            own = np.flatnonzero(on.body == k)
+            rows = on.by_pose[own] / scale * np.sqrt(on.weight[own])[:, None]
+            share = (rows @ np.linalg.eigh(rows.T @ rows)[1][:, 0]) ** 2
+            few = np.argsort(share)[-_FEW_READINGS:]
+            if share.sum() - share[few].sum() < 1.0 / weak_sigma_m**2:
+                on.weight[own[few]] = 0.0
+        found = self._solved(on, poses, None)
+        poses, offsets = poses + found.step, found.offsets_m
         used = np.bincount(on.body, minlength=len(poses))
         squares = np.bincount(on.body, weights=on.rest_m**2, minlength=len(poses))
         by_mounts = []
@@ -187,18 +239,32 @@ class MapProblem(NamedTuple):
             moved = self._replace(mounts=self.mounts + change.reshape(-1, 3))
             on = moved._on_walls(poses, offsets, floor)
             by_mounts.append(self._solved(on, poses, found.map_sigma_m).step.ravel() / _DIFFERENCE)
-        scale, parts = np.array([1.0, 1.0, _TURN_ARM_M]), range(0, poses.size, 3)
         of_readings = [
             np.linalg.inv(found.covariance[k : k + 3, k : k + 3]) - self.prior[k : k + 3, k : k + 3]
             for k in parts
         ]
         values = np.linalg.eigvalsh(np.array(of_readings) / np.outer(scale, scale))
-        poses[:, 2] = wrap_angle(poses[:, 2])
         rms, is_open = np.sqrt(squares / np.maximum(used, 1)), values < 1.0 / weak_sigma_m**2
         covariance, of_mounts = found.covariance, np.array(by_mounts).T
+        if is_open.any():
+            covariance = covariance + self._by_curvature(poses, offsets, found)
+        poses[:, 2] = wrap_angle(poses[:, 2])
         return MapFit(
             poses, covariance, found.map_sigma_m, used, rms, is_open.sum(axis=1), of_mounts
         )
+
+    def _by_curvature(self, poses: FloatArray, offsets: FloatArray, found: _Solution) -> FloatArray:
+        """(3 poses, 3 poses) covariance since poses that fit are on a curve, as in a round room."""
+        parts = range(0, poses.size, 3)
+        values, vectors = np.linalg.eigh([found.covariance[k : k + 3, k : k + 3] for k in parts])
+        far, off = np.sqrt(values[:, -1:]) * vectors[:, :, -1], np.zeros_like(poses)
+        for at in (poses + far, poses - far):
+            there = self._replace(measured=at, prior=_HELD * self.prior)
+            with suppress(GeometryError):
+                on = there._on_walls(at, offsets, _WIDE_M)
+                off += 0.5 * there._solved(on, at, found.map_sigma_m).step
+        # The fourth moment of a normal distribution.
+        return np.asarray(block_diag(*(3.0 * np.outer(one, one) for one in off)))
 
     def likely_pose(
         self, aligned: FloatArray, narrowing_m: Sequence[float]
@@ -217,7 +283,7 @@ class MapProblem(NamedTuple):
         found: list[tuple[float, FloatArray]] = []
         for start in (aligned, *grid):
             with suppress(GeometryError):
-                poses, _, cost = coarse._narrowed(start[None], narrowing_m)
+                poses, _, cost = coarse.narrowed(start[None], narrowing_m)
                 if not any(np.allclose(poses[0], other, atol=_SAME_POSE) for _, other in found):
                     found.append((cost, poses[0]))
         if not found:
@@ -227,7 +293,7 @@ class MapProblem(NamedTuple):
         apart = pose_differences(np.stack([other for _, other in found]), pose)
         return pose, (weights[:, None] * apart).T @ apart / weights.sum()
 
-    def _narrowed(
+    def narrowed(
         self, starts: FloatArray, narrowing_m: Sequence[float]
     ) -> tuple[FloatArray, FloatArray, float]:
         """Poses, offsets of the walls' ends, and cost, as the gate of readings narrows."""
@@ -258,7 +324,12 @@ class MapProblem(NamedTuple):
             points = pose[:2] + scan.range_m[:, None] * rays
             apart, arm = points - self.walls[first, :2], points - poses[body, :2]
             share = np.clip(np.sum(apart * along, axis=1) / length**2, 0.0, 1.0)
-            error = np.sum(apart * normal, axis=1)
+            # A cubic from end to end, by its bends: height and slope.
+            t, bends = share[:, None], self.curves.bends[first]
+            height = np.sum(bends * t * (1.0 - t) * np.hstack([1.0 - t, -t]), axis=1) * length
+            slope = np.sum(bends * np.hstack([(1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)]), 1)
+            error = np.sum(apart * normal, axis=1) - height
+            normal = normal - (slope / length)[:, None] * along
             rest = error - (1.0 - share) * offsets_m[first, 0] - share * offsets_m[first, 1]
             weight = 1.0 / ((scan.sigma_m * np.maximum(cosines, _LEAST_COSINE)) ** 2 + floor_m**2)
             squared = np.where(np.isfinite(far), weight * rest**2, np.inf)
@@ -268,10 +339,8 @@ class MapProblem(NamedTuple):
             near = squared < _GATE_SIGMA**2
             found.append([v[near] for v in (*rows, np.column_stack([normal, turn]))])
         columns = [np.concatenate(column) for column in zip(*found)]
-        if len(columns[0]) < _LEAST_READINGS:
-            raise GeometryError(
-                f"{len(columns[0])} readings lie on the map: expected {_LEAST_READINGS} or more"
-            )
+        if (used := len(columns[0])) < _LEAST_READINGS:
+            raise GeometryError(f"{used} readings on the map: expected {_LEAST_READINGS} or more")
         return _OnWalls(cost, *columns)
 
     def _solved(self, on: _OnWalls, poses: FloatArray, map_sigma_m: float | None) -> _Solution:
@@ -287,6 +356,9 @@ class MapProblem(NamedTuple):
         )
         weighted = jacobian.multiply(on.weight[:, None]).T.tocsr()
         h, g = (weighted @ jacobian).toarray(), weighted @ on.error_m
+        root = np.linalg.cholesky(self._alike(seen))
+        h[count:], g[count:] = root.T @ h[count:], root.T @ g[count:]
+        h[:, count:] = h[:, count:] @ root
         own = np.linalg.inv(h[:count, :count] + self.prior)
         of_poses = own @ (g[:count] + self.prior @ missing)
         by_offsets = own @ h[:count, count:]
@@ -297,10 +369,21 @@ class MapProblem(NamedTuple):
             map_sigma_m, inflation = _map_sigma(rest, gradient)
         of_offsets = np.linalg.inv(rest + np.eye(len(rest)) / max(map_sigma_m, 1e-6) ** 2)
         offsets = np.zeros((len(self.walls), 2))
-        offsets[seen] = -(of_offsets @ gradient).reshape(-1, 2)
-        step = -of_poses - by_offsets @ offsets[seen].ravel()
+        apart = -of_offsets @ gradient
+        offsets[seen] = (root @ apart).reshape(-1, 2)
+        step = -of_poses - by_offsets @ apart
         covariance = own + inflation * by_offsets @ of_offsets @ by_offsets.T
         return _Solution(step.reshape(-1, 3), offsets, map_sigma_m, covariance)
+
+    def _alike(self, seen: IntArray) -> FloatArray:
+        """(2 s, 2 s) correlation of the offsets of s walls' ends: of neighbours on a curve."""
+        ends, along = self.walls[seen].reshape(-1, 2), self.walls[seen, 2:] - self.walls[seen, :2]
+        along = np.repeat(along / np.hypot(*along.T)[:, None], 2, axis=0)
+        curve = np.repeat(self.curves.curve[seen], 2)
+        same = (curve[:, None] == curve) & np.repeat(self.curves.bends[seen].any(axis=1), 2)
+        squared = np.sum((ends[:, None] - ends) ** 2, axis=-1)
+        alike = _MOST_ALIKE * np.exp(-0.5 * squared / _ALIKE_M**2) * (along @ along.T)
+        return np.where(np.eye(len(ends)), 1.0, np.where(same, alike, 0.0))
 
 
 def _map_sigma(h: FloatArray, g: FloatArray) -> tuple[float, float]:

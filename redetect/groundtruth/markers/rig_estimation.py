@@ -15,14 +15,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import (
-    AdjustedBundle,
-    Bundle,
-    Chain,
-    PosePrior,
-    adjust_bundle,
-    project_chain,
-)
+from redetect.groundtruth.markers import adjustment
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -34,7 +27,7 @@ from redetect.groundtruth.markers.poses import view_poses
 from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refined_poses
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings, RigSettings
-from redetect.groundtruth.trajectories.transforms import inverse, mean_pose
+from redetect.groundtruth.trajectories import se3
 
 # Standard deviations of exactly known poses: a micrometre and a microradian.
 _EXACT = 1e-12
@@ -51,7 +44,7 @@ class RigEstimate:
     rig: Rig
     reference: int  # The marker from which the others were chained
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
-    adjusted: AdjustedBundle
+    adjusted: adjustment.AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
     times: int  # Number of times (images, without a network) used
     left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
@@ -92,9 +85,7 @@ def estimate_rig(
     markers = [marker for group in groups for frame in group for marker in frame.markers]
     dictionaries = sorted({marker.dictionary for marker in markers})
     if len(dictionaries) != 1:
-        raise GroundTruthError(
-            f"markers of the dictionaries {dictionaries}: expected markers of one dictionary"
-        )
+        raise GroundTruthError(f"markers of the dictionaries {dictionaries}: expected one of them")
     # Pairs of markers seen together, and a consensus for each pair.
     ids = tuple(sorted({marker.id for marker in markers}))
     candidates = _bare_rig(dictionaries[0], ids, width_m)
@@ -126,7 +117,7 @@ def estimate_rig(
     }
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionaries[0], kept_ids, width_m)
-    priors: tuple[PosePrior, ...] = ()
+    priors: tuple[adjustment.PosePrior, ...] = ()
     if known is not None:
         start, priors = _in_known_frame(kept_ids, start, known, len(network.cameras))
     # One bundle adjustment of all markers and all times.
@@ -137,7 +128,7 @@ def estimate_rig(
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
     try:
-        adjusted = adjust_bundle(
+        adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
         )
     except GeometryError as error:
@@ -150,7 +141,7 @@ def estimate_rig(
 
 def _in_known_frame(
     ids: Sequence[int], rig_from_marker: FloatArray, known: Rig, cameras: int
-) -> tuple[FloatArray, tuple[PosePrior, ...]]:
+) -> tuple[FloatArray, tuple[adjustment.PosePrior, ...]]:
     """Markers (M, 4, 4) moved to where some are known, and priors of these behind the cameras."""
     common = [marker for marker in ids if marker in known.ids]
     if not common:
@@ -159,8 +150,8 @@ def _in_known_frame(
     for marker in common:
         i, j = ids.index(marker), known.ids.index(marker)
         priors.append(_prior(cameras + i, known.robot_from_marker[j], known.covariance, j))
-        starts.append(known.robot_from_marker[j] @ inverse(rig_from_marker[i]))
-    robot_from_rig, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+        starts.append(known.robot_from_marker[j] @ se3.inverse(rig_from_marker[i]))
+    robot_from_rig, _ = se3.mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return robot_from_rig @ rig_from_marker, tuple(priors)
 
 
@@ -240,7 +231,7 @@ def _bundle(
     start: FloatArray,
     network: Network,
     settings: RigSettings,
-) -> tuple[Bundle, tuple[View, ...], int]:
+) -> tuple[adjustment.Bundle, tuple[View, ...], int]:
     """The bundle, its views, and the number of times, each of which is a body."""
     views: list[View] = []
     bodies: list[int] = []
@@ -260,7 +251,7 @@ def _bundle(
             poses.append(pose)
     points = chain_points(views, rig, settings.corner_floor_px)
     cameras = len(network.cameras)
-    bundle = Bundle(
+    bundle = adjustment.Bundle(
         network.cameras,
         len(start),
         np.concatenate([network.world_from_camera, start, poses]),
@@ -271,7 +262,7 @@ def _bundle(
     return bundle, tuple(views), len(poses)
 
 
-def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
+def _with_free_cameras(bundle: adjustment.Bundle, covariance: FloatArray) -> adjustment.Bundle:
     """The bundle with its cameras free, each with its own covariance as a prior."""
     seen = np.unique(bundle.seen.camera)
     free = bundle.free.copy()
@@ -280,10 +271,12 @@ def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     return replace(bundle, free=free, priors=(*bundle.priors, *priors))
 
 
-def _prior(index: int, pose: FloatArray, covariance: FloatArray, among: int) -> PosePrior:
+def _prior(
+    index: int, pose: FloatArray, covariance: FloatArray, among: int
+) -> adjustment.PosePrior:
     """The prior of one pose of a bundle, which is one `among` several with a covariance."""
     own = slice(6 * among, 6 * among + 6)
-    return PosePrior(index, pose, covariance[own, own] + _EXACT * np.eye(6))
+    return adjustment.PosePrior(index, pose, covariance[own, own] + _EXACT * np.eye(6))
 
 
 def _best_start(
@@ -297,9 +290,9 @@ def _best_start(
     points = chain_points([view for view, _ in own], rig, settings.corner_floor_px)
     best, least = None, np.inf
     for view, solutions in own:
-        for pose in solutions.poses @ inverse(start[view.rig_index]):
-            chain = Chain(network.cameras, network.world_from_camera, pose[None], start)
-            pixels = project_chain(chain, points)
+        for pose in solutions.poses @ se3.inverse(start[view.rig_index]):
+            chain = adjustment.Chain(network.cameras, network.world_from_camera, pose[None], start)
+            pixels = adjustment.project_chain(chain, points)
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue

@@ -21,7 +21,7 @@ from redetect.array_types import FloatArray
 from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
@@ -38,11 +38,8 @@ class Rig:
     dictionary: str  # The set of markers that defines the identifiers
     ids: tuple[int, ...]  # The markers, M of them
     widths_m: FloatArray  # (M,): widths of the black squares
-    # (M, 4, 4): a marker's frame has its origin at the centre, x right, y up, z out of the print
-    robot_from_marker: FloatArray
-    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    robot_from_marker: FloatArray  # (M, 4, 4): markers' x right, y up, z out of the print
+    covariance: FloatArray  # (6 M, 6 M): of right perturbations (m, rad); zeros if exact
 
     @property
     def corners(self) -> FloatArray:
@@ -55,13 +52,10 @@ class Network:
     """Cameras fixed in the world."""
 
     names: tuple[str, ...]  # The cameras, C of them
-    # Their calibrations. The mounting in a ``.cam`` file is ignored.
-    cameras: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # Their lenses; the mounting in a ``.cam`` file is ignored
     calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's file
     world_from_camera: FloatArray  # (C, 4, 4)
-    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    covariance: FloatArray  # (6 C, 6 C): of right perturbations (m, rad); zeros if exact
 
 
 def marker_corners(width_m: float) -> FloatArray:
@@ -139,11 +133,9 @@ def write_network(
     overwrite: bool = False,
 ) -> None:
     """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
+    rows = zip(network.names, network.calibrations, network.world_from_camera)
     entries = {
-        name: {"calibration": calibration, **pose_entries(pose)}
-        for name, calibration, pose in zip(
-            network.names, network.calibrations, network.world_from_camera
-        )
+        name: {"calibration": calibration, **pose_entries(pose)} for name, calibration, pose in rows
     }
     content = {**_with_covariance("cameras", entries, network.covariance), **(extra or {})}
     write_json(path, content, overwrite=overwrite)
@@ -161,7 +153,7 @@ def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     """A (4, 4) pose in the form that `parse_pose` reads."""
     return {
         "translation_m": pose[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+        "quaternion_xyzw": se3.quaternion_xyzw(pose).tolist(),
     }
 
 
@@ -174,7 +166,7 @@ def parse_pose(entry: JsonObject) -> FloatArray:
         raise GroundTruthError(
             f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
-    return transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
+    return se3.transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
 
 
 def _joint_covariance(
@@ -192,11 +184,9 @@ def _joint_covariance(
     if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
         raise content.wrong("covariance", f"an object with {key} and matrix")
     order, names = [str(name) for name in joint[key]], list(entries)
-    if sorted(order) != sorted(names):
-        raise GroundTruthError(
-            f"{content.place}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
-        )
     place = f"{content.place}: covariance"
+    if sorted(order) != sorted(names):
+        raise GroundTruthError(f"{place}: {key} are {excerpt(order)}: expected {excerpt(names)}")
     matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])

@@ -16,8 +16,8 @@ from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
 from redetect.landmarks import squared_mahalanobis
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
@@ -79,13 +79,12 @@ class Track:
         """The poses on the floor with their covariances, raised where residuals contradict them."""
         posed = self.posed
         poses = np.array([pose.world_from_robot for _, pose in posed]).reshape(-1, 4, 4)
-        covariances = np.array([excess_of(pose) * pose.covariance for _, pose in posed]).reshape(
-            -1, 6, 6
-        )
+        raised = [excess_of(pose) * pose.covariance for _, pose in posed]
+        covariances = np.array(raised).reshape(-1, 6, 6)
         return PlanarPoses(
             np.array([time_s for time_s, _ in posed], dtype=np.float64),
-            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], heading(poses)]),
-            planar_covariance(poses, covariances),
+            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], se3.heading(poses)]),
+            se3.planar_covariance(poses, covariances),
         )
 
 
@@ -153,7 +152,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
             {
                 "x_y_theta": [
                     *(round(float(v), 6) for v in candidate.world_from_robot[:2, 3]),
-                    round(float(heading(candidate.world_from_robot)), 6),
+                    round(float(se3.heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
                 "rms_px": round(candidate.rms_px, 4),

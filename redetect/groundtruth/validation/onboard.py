@@ -1,9 +1,8 @@
 """Fit of the readings on board, at the reference poses, to the building's walls.
 
-The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
-fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls do not determine a direction or the results disagree. From all reference poses together, the
-range errors and the mounts of the scanners are estimated.
+The robot is at rest, so its readings are averaged first. The fit starts at the pose from distances,
+its prior; both are combined by their covariances, unless the walls leave a direction undetermined
+or they disagree. All reference poses together give range errors and the scanners' mounts.
 """
 
 from __future__ import annotations
@@ -22,7 +21,13 @@ from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import MapProblem, StillScan, first_walls, still_scan
+from redetect.groundtruth.lasers.walls import (
+    MapProblem,
+    StillScan,
+    first_walls,
+    still_scan,
+    wall_curves,
+)
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose
 from redetect.landmarks import wrap_angle
@@ -171,7 +176,9 @@ def refined_by_walls(
     prior, covariance = distances.pose, distances.covariance
     try:
         free = np.eye(3) / _FREE_SIGMA**2
-        problem = MapProblem(still.scans, prior[None], free, segments, still.mounts)
+        problem = MapProblem(
+            still.scans, prior[None], free, segments, wall_curves(segments), still.mounts
+        )
         found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:
         return _unrefined(distances, "no scans", str(error))

@@ -152,10 +152,9 @@ class Measured(NamedTuple):
 
 
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
+    """All minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    By Levenberg-Marquardt from many starts: with all headings, all around the fiducial of the first
-    distance.
+    By Levenberg-Marquardt with all headings, from all around the fiducial of the first distance.
     """
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
@@ -220,9 +219,8 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
         )
     else:
         status, reason = _determined(poses[costs < costs[0] + _AMBIGUITY_CHI2], covariance)
-    return DistancePose(
-        index, time_s, status, reason, poses[0], covariance, residuals, float(costs[0])
-    )
+    pose, chi2 = poses[0], float(costs[0])
+    return DistancePose(index, time_s, status, reason, pose, covariance, residuals, chi2)
 
 
 def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
@@ -236,10 +234,8 @@ def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status,
             f"most {_LARGEST_SIGMA_M:g} m and {_LARGEST_SIGMA_DEG:g} deg"
         )
     if len(candidates) > 1:
-        others = ", ".join(
-            f"({x:.2f}, {y:.2f}, {math.degrees(t):.0f} deg)" for x, y, t in candidates
-        )
-        return "ambiguous", f"{len(candidates)} poses fit the distances: {others}"
+        places = (f"({x:.2f}, {y:.2f}, {math.degrees(t):.0f} deg)" for x, y, t in candidates)
+        return "ambiguous", f"{len(candidates)} poses fit the distances: {', '.join(places)}"
     return "ok", ""
 
 

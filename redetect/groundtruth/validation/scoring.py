@@ -73,9 +73,7 @@ class PoseScore(ErrorFigures):
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
     normalised: int  # Poses with an invertible covariance
-    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
-    # right. NaN without covariances.
-    normalised_error: float
+    normalised_error: float  # Mean of these: 1 if covariances are right; NaN without any
 
     def lines(self) -> list[str]:
         """The figures to print."""
@@ -142,8 +140,7 @@ class Relations(NamedTuple):
 
     from_s: FloatArray  # (N,)
     to_s: FloatArray  # (N,): may be the earlier one
-    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
-    from_to: FloatArray
+    from_to: FloatArray  # (N, 3): x, y (m), theta (rad) of the second pose in the first's frame
 
 
 @dataclass(frozen=True)
@@ -178,9 +175,8 @@ def score_relations(
     before, known_before = _at(poses, relations.from_s, largest_gap_s)
     after, known_after = _at(poses, relations.to_s, largest_gap_s)
     known = known_before & known_after
-    return relative_score(
-        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
-    )
+    mine = between(before[known], after[known])
+    return relative_score(relations.from_to[known], mine, int((~known).sum()))
 
 
 def score_steps(
@@ -261,9 +257,8 @@ class ReferenceErrors(NamedTuple):
 
     @property
     def sigma(self) -> FloatArray:
-        """(E, 2) standard deviations of position (m) and heading (rad), from both covariances.
-
-        For the position, the root of the trace; NaN if the ground truth has no invertible one.
+        """(E, 2) standard deviations of position (m; root of the trace) and heading (rad), from
+        both covariances; NaN if the ground truth has no invertible one.
         """
         found = np.full((len(self.poses), 2), np.nan)
         if self.poses.covariances is not None and self.reference_poses.covariances is not None:

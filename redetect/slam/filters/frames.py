@@ -76,14 +76,11 @@ class Innovation(NamedTuple):
 class RowCount:
     """Use of a run's rows."""
 
-    # Rows that were used.
-    discs: int = 0
+    discs: int = 0  # rows that were used
     lines: int = 0
     left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
-    # Sum of the squared innovations, normalised by their covariances.
-    innovation_squared: float = 0.0
-    # Their degrees of freedom: the expectation of the sum if the covariances are right.
-    innovation_numbers: int = 0
+    innovation_squared: float = 0.0  # sum of the squared normalised innovations
+    innovation_numbers: int = 0  # its expectation, the degrees of freedom
 
     def use(self, rows: FrameRows, whitened: FloatArray) -> None:
         """Count rows that are used, with their whitened innovation (m,)."""
@@ -102,13 +99,10 @@ class RowCount:
 class FilterRun:
     """Poses of a run as a filter estimated them at the time, and the use of the rows."""
 
-    # The start, and the pose after each step and its frame, with covariances; theta is not wrapped.
-    path: Path2D
+    path: Path2D  # the start, and the pose after each step and its frame; theta is not wrapped
     count: RowCount
-    # (n,): the disc of each row, -1 for none, from the file or from association; the same for
-    # lines, empty for none.
-    disc_ids: IntArray
-    line_ids: tuple[tuple[int, ...], ...]
+    disc_ids: IntArray  # (n,): the disc of each row, from the file or association; -1 for none
+    line_ids: tuple[tuple[int, ...], ...]  # the lines of each row; empty for none
 
 
 def frames_of(recording: Recording) -> Iterator[FrameRows]:
@@ -347,8 +341,7 @@ class Associator:
 
     method: Association = "known"  # `known`, `nearest` or `joint`
     gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of correct rows that pass
-    # The identifier of the next new disc; None: no new discs.
-    new_id: Callable[[], int] | None = None
+    new_id: Callable[[], int] | None = None  # gives the IDs of new discs; None: there are none
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)

@@ -62,10 +62,7 @@ def load_gtsam() -> Any:
 
 
 def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
-    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`.
-
-    Pose k has key k, disc j key N + 1 + j.
-    """
+    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`: keys of poses, then discs."""
     gtsam = load_gtsam()
     noise = gtsam.noiseModel
     root = noise.Gaussian.SqrtInformation
@@ -87,9 +84,8 @@ def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
         graph.disc_pose.tolist(), graph.disc_index.tolist(), graph.disc_xy, graph.disc_whitening
     ):
         model = root(whiten, False)
-        factors.add(
-            gtsam.PlanarProjectionFactor2(pose, first_disc + disc, xy, looking_up, lens, model)
-        )
+        key = first_disc + disc
+        factors.add(gtsam.PlanarProjectionFactor2(pose, key, xy, looking_up, lens, model))
     on_floor = root(np.diag([0.0, 0.0, _HEIGHT_ROOT_INFORMATION]), False)
     for j in range(len(graph.disc_ids)):
         factors.add(gtsam.PriorFactorPoint3(first_disc + j, np.zeros(3), on_floor))

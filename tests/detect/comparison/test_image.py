@@ -40,9 +40,15 @@ FloatArray = NDArray[np.float64]
 PITCH, ROLL = np.radians([-2.3, 0.7])
 
 
-def frame(index: int, xy: FloatArray, by: tuple[float, float] | None = None, ids: int = 1) -> Frame:
+def frame(
+    index: int,
+    xy: FloatArray,
+    by: tuple[float, float] | None = None,
+    ids: int = 1,
+    sigma_m: float = 0.02,
+) -> Frame:
     count = len(xy)
-    covariance = np.tile(4e-4 * np.eye(2), (count, 1, 1))
+    covariance = np.tile(sigma_m**2 * np.eye(2), (count, 1, 1))
     rows = circle_landmarks(xy, np.full(count, 0.9), covariance, np.full(count, ids))
     return Frame(Step(f"s.{index:04d}", *[0.0] * 9), rows, by)
 
@@ -86,6 +92,24 @@ def test_pixels_come_back_from_detection_and_levelling(
     known = np.isfinite(level).all(axis=1) & (np.linalg.norm(level, axis=1) < 100.0)
     back = image_positions(published_camera, level, (pitch, roll))
     np.testing.assert_allclose(back[known], seen[known], atol=1e-6)
+
+
+@pytest.mark.parametrize(("whole", "said"), [(True, "at whole pixels"), (False, "too small if")])
+def test_rows_at_whole_pixels_do_not_tell_of_covariances(
+    published_camera: Camera, whole: bool, said: str
+) -> None:
+    """The published detector's rows have errors of a pixel, which are not those of other rows."""
+    rng = np.random.default_rng(8)
+    truth, rounded = [], []
+    for k in range(20):
+        xy = places(rng)
+        pixels = published_camera.project_floor(xy)
+        pixels = np.rint(pixels) if whole else pixels + rng.uniform(-0.5, 0.5, xy.shape)
+        truth.append(frame(k, xy, sigma_m=0.002))
+        rounded.append(frame(k, published_camera.floor_from_pixel(pixels).round(6)))
+    result = compare(published_camera, rounded, truth)
+    assert result.reference_whole_pixels == whole
+    assert said in result.sentences()[-1]
 
 
 def test_files_keep_what_levelled_a_frame(published_camera: Camera, tmp_path: Path) -> None:

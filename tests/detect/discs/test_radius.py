@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from functools import cache
@@ -13,7 +14,7 @@ import pytest
 
 from camera import Camera
 from detect.cli import main, parsed
-from detect.discs.radius import find_radius
+from detect.discs.radius import FACTOR, SMALLEST_M, find_radius
 from detect.options import All, Circles
 from detect.settings import CircleSettings
 from lut import build_vote_table
@@ -33,6 +34,16 @@ def image(camera: Camera, radius_m: float, seed: int) -> np.ndarray:
     return floor.image(seed=seed)
 
 
+class Discs:
+    """Discs of which only the evidence matters."""
+
+    def __init__(self, evidence: list[float]) -> None:
+        self.evidence = np.array(evidence)
+
+    def __len__(self) -> int:
+        return len(self.evidence)
+
+
 @pytest.fixture(autouse=True)
 def tables_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("detect.discs.radius.build_vote_table", TABLE_OF)
@@ -50,6 +61,24 @@ def test_radius_comes_back(published_camera: Camera, radius_m: float) -> None:
 def test_an_empty_floor_has_no_radius(published_camera: Camera) -> None:
     bare = PaintedFloor(published_camera).image()
     assert find_radius([bare], published_camera, CircleSettings()) is None
+
+
+@pytest.mark.parametrize("beside", [1.9, 2.0, 5.0])
+def test_a_radius_with_few_discs_beside_the_best(
+    published_camera: Camera, monkeypatch: pytest.MonkeyPatch, beside: float
+) -> None:
+    """Too few discs to count have as much evidence as those of the best radius."""
+    best_m = SMALLEST_M * FACTOR**10
+
+    def found(image: object, camera: object, table: object, settings: CircleSettings) -> Discs:
+        steps = round(math.log(settings.radius_m / best_m) / math.log(FACTOR))
+        return Discs({0: [0.4, 0.3, 0.3], 1: [beside / 2.0] * 2}.get(steps, []))
+
+    monkeypatch.setattr("detect.discs.radius.detect_circles", found)
+    blank = np.zeros((4, 4), np.uint8)
+    estimate = find_radius([blank], published_camera, CircleSettings())
+    assert estimate is not None
+    assert best_m <= estimate.radius_m <= best_m * FACTOR**0.5
 
 
 @pytest.mark.parametrize(
@@ -103,6 +132,21 @@ def test_another_radius_is_offered(run: Path, capsys: Captured) -> None:
     assert main(["circles", str(run)]) == 0
     offered = number_in(capsys.readouterr().err, "radius seems to be")
     assert offered == pytest.approx(0.06, rel=0.02)
+
+
+def test_another_radius_is_offered_although_a_look_alike_is_found(
+    run: Path, published_camera: Camera, capsys: Captured
+) -> None:
+    floor = PaintedFloor(published_camera)
+    for place in PLACES:
+        floor.disc(place, radius_m=0.06)
+    floor.disc((-0.5, -2.6), radius_m=0.1)
+    for path in (run / "images").iterdir():
+        cv2.imwrite(str(path), floor.image(seed=0))
+    assert main(["circles", str(run)]) == 0
+    said = capsys.readouterr()
+    assert "12 discs in 12 frames" in said.out
+    assert number_in(said.err, "radius seems to be") == pytest.approx(0.06, rel=0.02)
 
 
 def test_the_other_polarity_is_offered(run: Path, capsys: Captured) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -113,6 +114,25 @@ def test_frames_that_count_as_level_are_told(short_run: Path, capsys: Captured) 
     )
     assert main(["all", str(short_run), "--tilt", "frame", "--force", "--tilt-sigma-deg", "0"]) == 3
     assert "the other 1 are assumed exactly level" in capsys.readouterr().out
+
+
+def test_tilts_that_are_known_exactly_can_be_read(short_run: Path) -> None:
+    """A run without verticals, of which it is said that it is level."""
+    words = ["all", str(short_run), "--least-lines", "40", "--tilt-sigma-deg", "0"]
+    assert main(words) == 0
+    tilts = read_tilts(short_run / "detected.tilt")
+    assert len(tilts) == 4
+    assert all((tilt.pitch, tilt.roll) == (0.0, 0.0) for tilt in tilts.values())
+
+
+@pytest.mark.parametrize("ending", ["", ".jpg"])
+def test_tilts_belong_to_images_whatever_their_extension(short_run: Path, ending: str) -> None:
+    assert main(["lines", str(short_run)]) == 0
+    tilts = short_run / "detected.tilt"
+    tilts.write_text(re.sub(r"(TILT \S+)", rf"\1{ending}", tilts.read_text()))
+    assert main(["circles", str(short_run), "--tilt", str(tilts)]) == 0
+    frames = list(read_frames(short_run / "detected.circles"))
+    assert all(frame.levelled_by is not None for frame in frames)
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,19 @@ def test_covariances_that_do_not_grow_are_none(tmp_path: Path) -> None:
     assert all(step.cxx == step.cyy == step.cphiphi == 0.0 for step in steps)
 
 
+def test_variances_that_are_added_up(tmp_path: Path) -> None:
+    """Some drivers add up variances, and ignore how errors of the heading move positions."""
+    ros, said = Ros(), []
+    for k in range(3):
+        variances = np.diag([0.1, 0.1, 0.2]) + k * np.diag([2e-4, 2e-4, 1e-4])
+        odometry = ros.odometry(0.3 * k, 0.0, 0.0, 1.0 + k, variances)
+        said.append(Said("/odom", 1.0 + k, odometry))
+        said.append(Said("/i", 1.0 + k, ros.image(np.zeros((4, 4), np.uint8), "mono8", 1.0 + k)))
+    for frame in list(open_source(ros.write(tmp_path / "d", said)).frames)[1:]:
+        step = frame.step
+        assert (step.cxx, step.cyy, step.cphiphi) == pytest.approx((2e-4, 2e-4, 1e-4))
+
+
 def test_covariances_of_twists_where_those_of_poses_do_not_grow(tmp_path: Path) -> None:
     """Of ten independent movements over 0.1 s, the variances add up; unless one is singular."""
     twist = np.diag([0.04, 0.01, 0.0025])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,14 @@ from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import RunFrames
 from detect.sources.opening import open_source
-from detect.sources.poses import TimedPose, pose_between, step_between, tick_poses, tum_poses
+from detect.sources.poses import (
+    TimedPose,
+    pose_between,
+    step_between,
+    tick_poses,
+    tum_poses,
+    velocity_poses,
+)
 from redetect.landmarks import read_frames
 from redetect.landmarks.times import format_time, read_times
 
@@ -152,6 +160,70 @@ def test_ticks_of_wheels_give_the_path(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses, expected, atol=1e-12)
 
 
+def test_velocities_give_steps_with_covariances(timed_run: Path, tmp_path: Path) -> None:
+    """0.3 m ahead, then an arc of 0.4 rad to the left over 0.2 m, both in half a second."""
+    path = tmp_path / "a.velocities"
+    path.write_text(
+        "# t v omega sigma_v sigma_omega\n100 0.6 0 0.02 0.03\n100.5 0.4 0.8 0 0\n101 0 0 0 0\n"
+    )
+    options = SourceOptions(odometry=str(path))
+    first, ahead, arc = [frame.step for frame in open_source(timed_run, None, options).frames]
+    assert (first.dx, first.dy, first.dphi) == (0.0, 0.0, 0.0)
+    assert (ahead.dx, ahead.dy, ahead.dphi) == pytest.approx((0.0, -0.3, 0.0))
+    # The heading's error acts on the average for half the way, and varies along it.
+    of_turn = 0.5 * 0.03**2
+    assert (ahead.cyy, ahead.cphiphi) == pytest.approx((0.5 * 0.02**2, of_turn))
+    assert ahead.cxx == pytest.approx(0.5 * 0.02**2 + of_turn * 0.3**2 / 3.0)
+    assert ahead.cxphi == pytest.approx(of_turn * 0.15)
+    assert (arc.dx, arc.dy) == pytest.approx((0.5 * (1 - math.cos(0.4)), -0.5 * math.sin(0.4)))
+    assert arc.dphi == pytest.approx(0.4)
+    assert arc.cphiphi == 0.0  # not stated
+
+
+def test_the_covariance_of_velocities_is_what_random_drives_show(tmp_path: Path) -> None:
+    """Monte Carlo: a drive over two rows, with white noise in many short intervals."""
+    rng = np.random.default_rng(5)
+    count, parts = 20_000, 40
+    rows = np.array([[0.0, 0.5, 0.3, 0.05, 0.1], [2.0, 0.3, -0.2, 0.1, 0.05], [3.0, 0, 0, 0, 0]])
+    path = tmp_path / "a.velocities"
+    np.savetxt(path, rows)
+    x, y, theta = np.zeros((3, count))
+    for (begin, speed, turning, *sigma), end in zip(rows.tolist(), rows[1:, 0]):
+        dt = (end - begin) / parts
+        root = math.sqrt(dt)
+        for _ in range(parts):
+            x += speed * dt * np.cos(theta) + root * sigma[0] * rng.standard_normal(count)
+            y += speed * dt * np.sin(theta) + root * sigma[0] * rng.standard_normal(count)
+            theta += turning * dt + root * sigma[1] * rng.standard_normal(count)
+    last = list(velocity_poses(path))[-1]
+    np.testing.assert_allclose(last.covariance, np.cov([x, y, theta]), rtol=0.08, atol=6e-4)
+
+
+def test_the_shipped_steps_have_the_covariances_of_velocities(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """The noise of the data set's robot grows with the way of its wheels, 0.25 m from its centre.
+
+    Its variances per metre of that are 8.1e-5 m^2 and 1.5e-3 rad^2.
+    """
+    steps = [frame.step for frame in read_frames(shared_data / "dlr" / "map.circles")]
+    path, rows = tmp_path / "e.velocities", list[list[float]]()
+    for number, step in enumerate(steps):
+        way = math.hypot(step.dx, step.dy)
+        wheels = way + 0.25 * abs(step.dphi)
+        sigmas = math.sqrt(8.1e-5 * wheels), math.sqrt(1.5e-3 * wheels)
+        rows.append([number, math.copysign(way, -step.dy), step.dphi, *sigmas])
+    np.savetxt(path, [*rows, [len(steps), 0.0, 0.0, 0.0, 0.0]])
+    along = list(velocity_poses(path))
+    found = [step_between("e", *ends) for ends in pairwise(along)]
+    for name in ("cxx", "cyy", "cphiphi"):
+        ratio = [getattr(a, name) / getattr(b, name) for a, b in zip(found, steps)]
+        assert np.percentile(ratio, [1, 16, 84, 99]) == pytest.approx(1.0, abs=0.04)
+        assert np.percentile(ratio, [16, 84]) == pytest.approx(1.01, abs=0.01)
+    lever = [(a.cxphi - b.cxphi) / math.sqrt(b.cxx * b.cphiphi) for a, b in zip(found, steps)]
+    assert np.abs(np.percentile(lever, [1, 99])).max() < 0.03
+
+
 @pytest.mark.parametrize("low", [-(2**15), 0, -(2**31)])
 def test_counters_of_ticks_may_overflow(low: int, tmp_path: Path) -> None:
     turn = 2**32 if low == -(2**31) else 2**16
@@ -230,3 +302,18 @@ def test_poses_between_are_between(share: float, before: TimedPose, after: Timed
     turned = abs(math.remainder(pose.theta - before.theta, 2 * math.pi))
     whole = abs(math.remainder(after.theta - before.theta, 2 * math.pi))
     assert turned <= whole + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("1 2 3\n", r":1: '1 2 3': expected 5 numbers: t v omega sigma_v sigma_omega"),
+        ("1 1e200 0 0 0\n2 0 0 0 0\n", r":2: expected distance and turn of at most"),
+        ("2 0 0 0 0\n1 0 0 0 0\n101 0 0 0 0\n", r"the pose of 1\.0+ s comes after that of 2"),
+    ],
+)
+def test_malformed_velocities(timed_run: Path, tmp_path: Path, content: str, told: str) -> None:
+    path = tmp_path / "a.velocities"
+    path.write_text(content)
+    with pytest.raises(DetectError, match=told):
+        list(open_source(timed_run, None, SourceOptions(odometry=str(path))).frames)

@@ -176,6 +176,15 @@ def test_deep_images_by_their_significant_bits(tmp_path: Path, deep: int, signif
         np.testing.assert_array_equal(read_image(frame, None), values >> (significant - 8))
 
 
+def test_a_hot_pixel_darkens_no_other(tmp_path: Path) -> None:
+    values = np.full((200, 200), 900, np.uint16)
+    values[3, 5] = 4095
+    assert cv2.imwrite(str(tmp_path / "a.png"), values)
+    (frame,) = open_source(tmp_path).frames
+    image = read_image(frame, None)
+    assert (image[3, 5], image[4, 5]) == (255, 900 >> 2)
+
+
 def test_a_description_of_images_makes_no_bag(small_run: Path) -> None:
     (small_run / "metadata.yaml").write_text("camera: front\n")
     assert open_source(small_run).frames.expected == 3

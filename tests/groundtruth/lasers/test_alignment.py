@@ -142,6 +142,49 @@ def test_a_corridor_leaves_a_direction_open() -> None:
     assert found.scanners[0].covariance[0, 0] > 0.05**2
 
 
+def ring(count: int, radius_m: float = 4.0) -> FloatArray:
+    """(count, 4) chords of a circle, not at the angles of another ring's."""
+    angles = 0.1 + np.linspace(0.0, 2.0 * np.pi, count + 1)
+    corners = radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return np.hstack([corners[:-1], corners[1:]])
+
+
+@pytest.mark.parametrize("chords", [100, 36])
+def test_a_round_room_leaves_a_turn_open(chords: int) -> None:
+    """Where the drawing's chords meet are no features, whether they are fine or off by 15 mm."""
+    walls = ring(2000)
+    one = scanner("round", np.array([1.5, 1.0, 0.2]))
+    rng = np.random.default_rng(4)
+    empty = Scans(np.arange(50) / 75.0, np.stack([ranges_mm(one, walls, rng) for _ in range(50)]))
+    for shift in (*SHIFTS, 3.0 * SHIFTS[0]):
+        found = align_scanners(by_hand((one,), shift[None]), [empty], ring(chords))
+        assert found.undetermined == ("round",)
+        error = found.scanners[0].pose - one.pose
+        assert error @ np.linalg.solve(found.scanners[0].covariance, error) < 20.0
+        # The distance from the centre is determined.
+        across = np.array([1.5, 1.0]) @ error[:2] / np.hypot(1.5, 1.0)
+        assert abs(across) < 0.01
+
+
+def test_what_few_readings_determine_is_undetermined() -> None:
+    """A niche of 4 cm that a scanner hardly sees may match readings at the wrong place, too."""
+    walls = np.array(
+        [
+            [-30.0, 0.0, 3.0, 0.0], [3.0, 0.0, 3.0, -0.04], [3.0, -0.04, 3.2, -0.04],
+            [3.2, -0.04, 3.2, 0.0], [3.2, 0.0, 30.0, 0.0], [-30.0, 4.1, 30.0, 4.1],
+        ]
+    )  # fmt: skip
+    one = scanner("corridor", np.array([0.0, 1.0, 0.2]), max_range_m=30.0)
+    for seed in (7, 8, 11):
+        rng = np.random.default_rng(seed)
+        scans = np.stack([ranges_mm(one, walls, rng) for _ in range(50)])
+        stated = replace(one, covariance=np.diag([0.04, 0.04, 0.01]))
+        stated = replace(stated, pose=one.pose + rng.normal(0.0, [0.2, 0.2, 0.1]))
+        found = align_scanners([stated], [Scans(np.arange(50) / 75.0, scans)], walls).scanners[0]
+        error = found.pose - one.pose
+        assert error @ np.linalg.solve(found.covariance, error) < 16.0
+
+
 def test_walls_drawn_slightly_askew_do_not_move_a_scanner_along_a_corridor() -> None:
     """Where walls that are parallel were drawn as a wedge, some other place fits exactly."""
     walls = np.array([[-30.0, 0.0, 30.0, 0.0], [-30.0, 3.0, 30.0, 3.0]])

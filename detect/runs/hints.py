@@ -1,0 +1,133 @@
+"""Reasons why hardly anything was found in a run, and what to try."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+from camera import Camera
+from detect.errors import DetectError, FrameError
+from detect.runs.plan import Job, Known, RunSummary
+from detect.seen import leaning_camera
+from detect.settings import CircleSettings
+from detect.sources.interface import Run, read_image
+from detect.sources.poses import SomeFrames
+from redetect.array_types import ByteArray
+from redetect.messages import counted
+
+#: Approximate number of images from which the radius of the discs is estimated.
+_RADIUS_IMAGES = 12
+#: Runs of at least `_FEWEST_FRAMES` frames get a warning if less than `_FEW_DISCS` per frame are
+#: found (parts of larger discs are, or look-alikes) and the logarithms of the likely and the given
+#: radius differ by `_OTHER_RADIUS`.
+_FEWEST_FRAMES, _FEW_DISCS, _OTHER_RADIUS = 10, 3, 0.15
+#: Other settings are worth mentioning if they find this many times as many discs.
+_MANY = 3
+#: Number of images in which the discs' size is compared with their radius, and the difference of
+#: logarithms that is reported: .06 on run e, whose camera leans by 2.5 degrees.
+_COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
+
+
+def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
+    """Images spread over a run, if its length is known in advance."""
+    if run.frames.expected is None:
+        raise DetectError("--radius-m auto: expected recorded images, which can be read twice")
+    step = max(1, run.frames.expected // count)
+    for frame in SomeFrames(run.frames, step * count, step):
+        with suppress(FrameError):
+            yield read_image(frame, run.camera)
+
+
+def hints(job: Job, summary: RunSummary) -> Iterator[str]:
+    """Reasons why hardly anything was found, and what to try."""
+    plan, camera, found = job.plan, job.plan.camera, summary.found
+    if job.known != Known() and not summary.known:
+        yield (
+            "no image of this run is in the files of known tilts or IDs, or they have no rows: "
+            "were they made from other images?"
+        )
+    others = summary.rejected["no matching pattern"]
+    if plan.markers and not found["markers"] and others >= summary.frames:
+        yield (
+            f"{others} squares look like markers, but not of the dictionary "
+            f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
+        )
+    if camera is None:
+        return
+    if plan.lines is not None and not found["lines"]:
+        from lut import cached_vertical_table
+
+        if not cached_vertical_table(camera).usable.any():
+            yield (
+                "no verticals: according to the calibration, the camera looks too far above or "
+                "below the horizon, or lies on its side"
+            )
+    if camera.seen_share < 1.0:
+        yield (
+            "according to the calibration, the distortion is not invertible in all of the image: "
+            f"only {100 * camera.seen_share:.0f} % of the pixels are used"
+        )
+    seen = summary.frames - summary.failed
+    run, settings = job.run, plan.circles
+    if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
+        return
+    leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
+    given = False
+    if not found["discs"] or (found["discs"] < _FEW_DISCS * seen and seen >= _FEWEST_FRAMES):
+        for hint in _hints_on_discs(run, leaning, settings, summary):
+            given = True
+            yield hint
+    if not given and found["discs"] >= seen >= _FEWEST_FRAMES:
+        from detect.discs.radius import ratio_of_radii
+
+        ratio = ratio_of_radii(list(some_images(run, _COMPARED_IMAGES)), leaning, settings)
+        if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
+            yield (
+                f"the discs look {ratio:.2f} times as large as with a radius of "
+                f"{settings.radius_m:g} m: if that is right, the camera is not as high as "
+                "calibrated, or leans, and positions are wrong by as much; measure the discs and "
+                "its height"
+            )
+
+
+def _hints_on_discs(
+    run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
+) -> Iterator[str]:
+    """Why a run has few discs per frame; nothing if no other settings find more."""
+    from detect.discs.radius import find_radius
+    from detect.discs.unfound import why_none
+
+    images, number = list(some_images(run)), summary.found["discs"]
+    in_images = f"in {len(images)} of the images"
+    discs = (
+        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in "
+        f"{counted(summary.frames, 'frame')}. "
+    )
+    if not number:
+        discs += f"{why_none(images, camera, settings)} "
+    if summary.frames < _FEWEST_FRAMES:
+        yield discs + (
+            "If discs are visible, try --radius-m auto, which estimates their radius, and check "
+            "the calibration against the images (`detect draw`)."
+        )
+        return
+    likely = find_radius(images, camera, replace(settings, polarity="any"))
+    if likely and likely.discs <= _MANY * len(images) * number / summary.frames:
+        likely = None  # not worth mentioning
+    if likely and abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
+        yield discs + (
+            f"Their radius seems to be {likely.radius_m:.3f} m: {likely.discs} of them are found "
+            f"{in_images}. Try --radius-m {likely.radius_m:.3f}; if they are not that "
+            f"{'small' if likely.radius_m < settings.radius_m else 'large'}, the camera has "
+            "another height or pitch, or the calibration is not its own (`detect draw` shows "
+            "outlines)."
+        )
+    elif likely and settings.polarity != "any" and number < summary.frames:
+        yield discs + f"--polarity any finds {likely.discs} {in_images}."
+    elif _MANY * number < summary.frames:
+        yield discs + (
+            f"Other radii find no more {in_images}: is the calibration that of this camera "
+            "(`detect draw` shows outlines; are its rows full or half?), are discs visible?"
+        )
