@@ -82,7 +82,7 @@ def test_file(tmp_path: Path, some: LandmarkMap) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (np.eye(6), "expected float64 of"),
+        (np.eye(6), r"expected \(4, 4\)"),
         (np.eye(4, dtype=np.float32), "expected 2-dimensional float64"),
         (np.eye(4), "not the covariance of"),
         (np.full((4, 4), np.nan), "not the covariance of"),
