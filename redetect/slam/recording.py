@@ -287,15 +287,12 @@ def recording_of_frames(
 def frames_of_discs(recording: Recording) -> list[landmarks.Frame]:
     """Steps and rows of discs, of quality 1, as frames: the inverse of `recording_of_frames`."""
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
-    quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
     numbers = np.column_stack([recording.steps, spread[:, [0, 1, 4, 2, 5, 8]]])
     frames = []
     for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers.tolist())):
-        some = slice(starts[k], starts[k + 1])
-        seen = landmarks.circle_landmarks(
-            circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
-        )
+        own = circles.only(slice(starts[k], starts[k + 1]))
+        seen = landmarks.circle_landmarks(own.xy, np.ones(len(own)), own.covariance, own.ids)
         frames.append(landmarks.Frame(landmarks.Step(prefix, *row), seen))
     return frames
 

@@ -189,11 +189,9 @@ def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray
 def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose:
     time_s = float(np.median([row.time_s for row in rows]))
     if len(rows) < 3:
-        reason, open_ = f"{len(rows)} distances: expected 3 or more", np.full((3, 3), np.inf)
-        nothing = np.full(len(rows), np.nan)
-        return DistancePose(
-            index, time_s, "undetermined", reason, np.full(3, np.nan), open_, nothing, math.nan
-        )
+        reason, nothing = f"{len(rows)} distances: expected 3 or more", np.full(len(rows), np.nan)
+        pose, open_ = np.full(3, np.nan), np.full((3, 3), np.inf)
+        return DistancePose(index, time_s, "undetermined", reason, pose, open_, nothing, math.nan)
     measured = Measured(
         np.array([survey.fiducials[row.fiducial] for row in rows]),
         np.array([survey.robot_points[row.point] for row in rows]),
