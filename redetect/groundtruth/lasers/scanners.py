@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 import struct
 import zipfile
@@ -29,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.array_types import BoolArray, FloatArray
 from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
+from redetect.groundtruth.files import JsonObject, PathLike, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
 from redetect.storage.bounded import read_content, read_plain_array
 
@@ -104,9 +103,7 @@ class Robot:
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
 
-def read_joint_covariance(
-    path: str | os.PathLike[str], scanners: Sequence[Scanner]
-) -> FloatArray | None:
+def read_joint_covariance(path: PathLike, scanners: Sequence[Scanner]) -> FloatArray | None:
     """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
 
     Raises `GroundTruthError` if it is not one of these scanners, in their order.
@@ -149,13 +146,13 @@ def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Pat
     ]
 
 
-def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
+def read_scanners(path: PathLike) -> tuple[Scanner, ...]:
     """The scanners of a ``scanners.json``, in order; `GroundTruthError` if it is malformed."""
     return _scanners(JsonObject.read(path))
 
 
 def write_scanners(
-    path: str | os.PathLike[str],
+    path: PathLike,
     scanners: Sequence[Scanner],
     extra: Mapping[str, Any] | None = None,
     *,
@@ -166,7 +163,7 @@ def write_scanners(
     write_json(path, content, overwrite=overwrite)
 
 
-def read_robot(path: str | os.PathLike[str]) -> Robot:
+def read_robot(path: PathLike) -> Robot:
     """Read a ``robot.json``; raises `GroundTruthError` if it is malformed."""
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
@@ -232,7 +229,7 @@ class Scans:
         return len(self.times_s)
 
 
-def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
+def find_scans(folder: PathLike, name: str) -> Path:
     """The one file with a scanner's scans (see `_ENDINGS`); `GroundTruthError` if not one."""
     found = [path for end in _ENDINGS if (path := Path(folder) / (name + end)).is_file()]
     if len(found) != 1:
@@ -244,9 +241,7 @@ def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
     return found[0]
 
 
-def read_scans(
-    path: str | os.PathLike[str], readings: int | None = None, *, ordered: bool = True
-) -> Scans:
+def read_scans(path: PathLike, readings: int | None = None, *, ordered: bool = True) -> Scans:
     """Read scans.
 
     Parameters
@@ -290,7 +285,7 @@ def read_scans(
     return scans
 
 
-def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_npz(path: PathLike) -> tuple[FloatArray, NDArray[np.uint16]]:
     """Read the two arrays, checking the sizes stated in the file and without unpickling."""
     content = read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
     place, arrays = f"{path}: unreadable .npz", []
@@ -316,9 +311,7 @@ def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint
     return times, ranges
 
 
-def _read_rows(
-    path: str | os.PathLike[str], readings: int | None
-) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_rows(path: PathLike, readings: int | None) -> tuple[FloatArray, NDArray[np.uint16]]:
     rows: list[FloatArray] = []
     columns = None if readings is None else readings + 1
     for line, words in read_rows(path, _LARGEST_FILE_BYTES):

@@ -16,7 +16,6 @@ between two fiducials.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -28,7 +27,7 @@ from scipy.special import chdtrc
 from redetect.array_types import FloatArray
 from redetect.bounds import ABOVE_0
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, known_name, read_table
+from redetect.groundtruth.files import JsonObject, PathLike, known_name, read_table
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, fitted, rotation
 
@@ -71,7 +70,7 @@ class Distance:
     distance_m: float
 
 
-def read_survey(path: str | os.PathLike[str]) -> Survey:
+def read_survey(path: PathLike) -> Survey:
     """Read a ``fiducials.json``; raises `GroundTruthError` if it is malformed."""
     content = JsonObject.read(path)
     content.demand_version()
@@ -79,7 +78,7 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     return Survey(fiducials, robot_points, content.number("sigma_m", ABOVE_0))
 
 
-def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
+def read_distances(path: PathLike, survey: Survey) -> list[Distance]:
     """Read a ``distances.csv`` between the survey's points, in the file's order.
 
     Raises `GroundTruthError` if a row is malformed or names an unknown point.
@@ -258,7 +257,7 @@ class SurveyedFiducials(NamedTuple):
     residuals_m: FloatArray  # (K,): measured distances minus those between `places`
 
 
-def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
+def read_dimensions(path: PathLike) -> list[Dimension]:
     """Read a ``dimensions.csv``."""
     found = []
     for _, (name,), (x1, y1, x2, y2, measured) in read_table(path, DIMENSIONS_HEAD, ("name",)):
@@ -266,7 +265,7 @@ def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
     return found
 
 
-def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> list[FiducialDistance]:
+def read_fiducial_distances(path: PathLike, survey: Survey) -> list[FiducialDistance]:
     """Read a ``fiducial_distances.csv``, which may name only the survey's fiducials."""
     found = []
     for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):
