@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -55,17 +54,6 @@ class CircleRows:
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""
         return CircleRows(*(each[chosen] for each in vars(self).values()))
-
-    @classmethod
-    def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
-        """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
-        table = list(rows)
-        return cls(
-            np.array([row[0] for row in table], dtype=np.int64),
-            np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
-            np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
-            np.array([row[3] for row in table], dtype=np.int64),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,12 +152,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
         np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
         CircleRows(*map(np.concatenate, zip(*(vars(some).values() for some in circles)))),
-        LineRows(
-            np.concatenate([some.frame for some in lines]),
-            np.concatenate([some.bearing_rad for some in lines]),
-            np.concatenate([some.sigma_rad for some in lines]),
-            tuple(ids for some in lines for ids in some.ids),
-        ),
+        LineRows.of(row for some in lines for row in zip(*vars(some).values())),
         sum(run.unstated_steps for run in runs),
         any(run.tilted for run in runs),
     )
