@@ -17,10 +17,8 @@ from redetect.slam.settings import AddedNoise
 
 def perform(options: Noise) -> int:
     """Execute the command; returns the exit code."""
-    noise = options.noise
-    (source,) = landmark_files(
-        options.run, circles=not options.lines, lines=options.lines, stem=options.stem
-    )
+    noise, lines = options.noise, options.lines
+    (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
     target = options.output or source.with_name(f"noisy{source.suffix}")
     rows = noisy_rows(landmarks.read_rows(source), noise)
     landmarks.write_rows(target, rows, overwrite=options.force)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -57,17 +56,6 @@ class CircleRows:
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""
         return CircleRows(*(each[chosen] for each in vars(self).values()))
-
-    @classmethod
-    def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
-        """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
-        table = list(rows)
-        return cls(
-            np.array([row[0] for row in table], dtype=np.int64),
-            np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
-            np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
-            np.array([row[3] for row in table], dtype=np.int64),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,12 +155,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
         np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
         CircleRows(*map(np.concatenate, zip(*(vars(some).values() for some in circles)))),
-        LineRows(
-            np.concatenate([some.frame for some in lines]),
-            np.concatenate([some.bearing_rad for some in lines]),
-            np.concatenate([some.sigma_rad for some in lines]),
-            tuple(ids for some in lines for ids in some.ids),
-        ),
+        LineRows.of(row for some in lines for row in zip(*vars(some).values())),
         sum(run.unstated_steps for run in runs),
         any(run.tilted for run in runs),
     )
@@ -293,15 +276,12 @@ def recording_of_frames(
 def frames_of_discs(recording: Recording) -> list[landmarks.Frame]:
     """Steps and rows of discs, of quality 1, as frames: the inverse of `recording_of_frames`."""
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
-    quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
     numbers = np.column_stack([recording.steps, spread[:, [0, 1, 4, 2, 5, 8]]])
     frames = []
     for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers.tolist())):
-        some = slice(starts[k], starts[k + 1])
-        seen = landmarks.circle_landmarks(
-            circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
-        )
+        own = circles.only(slice(starts[k], starts[k + 1]))
+        seen = landmarks.circle_landmarks(own.xy, np.ones(len(own)), own.covariance, own.ids)
         frames.append(landmarks.Frame(landmarks.Step(prefix, *row), seen))
     return frames
 

@@ -25,13 +25,13 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.mapping.solve import equations_at, joint_covariance
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import (
-    CircleRows,
     LineRows,
     Recording,
     frames_of_discs,
     read_recording,
 )
 from redetect.storage import OutputExistsError
+from tests.slam.ekf_rows import circle_rows
 
 
 @pytest.mark.parametrize("calibrate", [False, True])
@@ -124,9 +124,7 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
         noise = np.diag([1e-4, 4e-4, 1e-5])
         steps = way + rng.multivariate_normal(np.zeros(3), noise, 60)
         names = tuple(f"f.{k}" for k in range(60))
-        run = Recording(
-            names, steps, np.tile(noise, (60, 1, 1)), CircleRows.of(rows), LineRows.of()
-        )
+        run = Recording(names, steps, np.tile(noise, (60, 1, 1)), circle_rows(rows), LineRows.of())
         head = "settings radius_m=0.1 refine=True evidence=-0.1 tilt_sigma_deg=0.3"
         write_frames(tmp_path / f"{seed}.circles", frames_of_discs(run), head=head)
         mapped = map_run(read_recording(tmp_path / f"{seed}.circles"))
@@ -149,7 +147,7 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
 def test_which_rows_state_a_tilt(tmp_path: Path, settings: str, tilted: bool) -> None:
     run = Recording(
         ("f.0",), np.array([[0.0, -0.2, 0.0]]), 1e-4 * np.eye(3)[None],
-        CircleRows.of([(0, np.array([0.0, -2.0]), 1e-4 * np.eye(2), 1)]), LineRows.of(),
+        circle_rows([(0, np.array([0.0, -2.0]), 1e-4 * np.eye(2), 1)]), LineRows.of(),
     )  # fmt: skip
     path = tmp_path / "a.circles"
     write_frames(path, frames_of_discs(run), head=f"settings radius_m=0.1 {settings}")

@@ -46,9 +46,8 @@ def perform(options: Lasers) -> int:
         warn(text)
     alignment = align_scanners(measured, empties, building, options.settings)
 
-    far_off = [
-        a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
-    ]
+    pairs = zip(measured, alignment.scanners)
+    far_off = [after.name for before, after in pairs if _sigmas(before, after) > _FAR_OFF_SIGMA]
     extra: dict[str, Any] = {
         **provenance(options.settings, [by_hand, map_file]),
         "steps": {name: poses.tolist() for name, poses in alignment.steps.items()},

@@ -12,7 +12,6 @@ comma-separated statistics under a head with the names of the columns, and debug
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray
 from redetect.bounds import NOT_NEGATIVE, from_to, inside
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import NUMBER, JsonObject
+from redetect.groundtruth.files import NUMBER, JsonObject, PathLike
 from redetect.storage.bounded import read_content
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
@@ -152,7 +151,7 @@ def _extended(
     return np.asarray(np.interp(at, knots, values) + beyond)
 
 
-def read_clock(path: str | os.PathLike[str]) -> ClockModel:
+def read_clock(path: PathLike) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
 
     Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
@@ -241,7 +240,7 @@ class PtpdLog:
     drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
 
 
-def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
+def read_ptpd(path: PathLike) -> PtpdLog:
     """Read a log of ptpd.
 
     Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from

@@ -105,10 +105,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     inflation = 1.0
     for _ in range(_LOOSENING_ROUNDS):
         # The first one of each part gives no information on odometry.
-        squared = sum(
-            float(np.sum(np.minimum(found.squared[1:], problem.gate())))
-            for found in (part.innovations(math.sqrt(inflation) * noise) for part in some)
-        )
+        tried = (part.innovations(math.sqrt(inflation) * noise).squared[1:] for part in some)
+        squared = sum(float(np.sum(np.minimum(values, problem.gate()))) for values in tried)
         if inflation == 1.0 and squared < chdtri(numbers, _DOUBT):
             return 1.0
         inflation *= max(squared / numbers, 1.0)
@@ -250,34 +248,25 @@ def fuse(
         if found is not None:
             path, localisation = found
             restarted[:] = False
+    columns = (problem.streams, problem.measured_s, innovations.squared)
+    rejected = (column[~innovations.accepted].tolist() for column in columns)
+    numbers = [smoothed[-1, 3:], _systematic_deviations(spread), noise, np.array([inflation])]
+    pauses = pauses_of(last_of_each_time(odometry))
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
-        rejected=tuple(
-            Rejected(
-                str(problem.streams[i]), float(problem.measured_s[i]), float(innovations.squared[i])
-            )
-            for i in np.flatnonzero(~innovations.accepted)
-        ),
+        rejected=tuple(Rejected(*row) for row in zip(*rejected)),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
             name: int(np.count_nonzero(innovations.accepted & (problem.streams == name)))
             for name in streams
         },
-        odometry=OdometryErrors(
-            *np.concatenate(
-                [smoothed[-1, 3:], _systematic_deviations(spread), noise, [inflation]]
-            ).tolist()
-        ),
+        odometry=OdometryErrors(*np.concatenate(numbers).tolist()),
         localisation=localisation,
         repaired=problem.repaired,
         raised={name: factor for name, (_, factor) in covered.items()},
         slips_s=slipped_intervals(problem.times_s, slips),
-        pauses_s=tuple(
-            (begin, end)
-            for begin, end in pauses_of(last_of_each_time(odometry))
-            if end > first and begin < last
-        ),
+        pauses_s=tuple(pause for pause in pauses if pause[1] > first and pause[0] < last),
     )
 
 

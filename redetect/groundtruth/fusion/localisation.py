@@ -86,9 +86,8 @@ def as_localisation(
     errors = pose_differences(measured.poses[usual], there)
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
     centre = there[:, :2].mean(axis=0)
-    position = _stationary(
-        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(there[:, :2] - centre)
-    )
+    design = _by_motion(there[:, :2] - centre)
+    position = _stationary(times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), design)
     heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
     if not deviance < thin.innovations(noise).deviance:

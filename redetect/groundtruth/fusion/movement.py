@@ -129,9 +129,8 @@ class MovementProblem:
     def split(self, longest_s: float) -> list[MovementProblem]:
         """The parts between gaps in the measurements longer than this, without the gaps."""
         cuts = np.flatnonzero(np.diff(self.measured_s) > longest_s) + 1
-        return [
-            self._part(int(own[0]), int(own[-1]) + 1) for own in np.split(self.measured.nodes, cuts)
-        ]
+        parts = np.split(self.measured.nodes, cuts)
+        return [self._part(int(own[0]), int(own[-1]) + 1) for own in parts]
 
     def innovations(
         self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None

@@ -225,10 +225,9 @@ def _chained(
 
 def _merge(scans: list[Scan], poses: FloatArray, members: Iterable[int]) -> Scan:
     """Several scans in one frame."""
-    return Scan(
-        np.concatenate([apply(poses[k], scans[k].points) for k in members]),
-        np.concatenate([apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]),
-    )
+    points = [apply(poses[k], scans[k].points) for k in members]
+    normals = [apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]
+    return Scan(np.concatenate(points), np.concatenate(normals))
 
 
 def _realigned(

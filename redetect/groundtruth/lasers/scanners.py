@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 import struct
 import zipfile
@@ -29,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.array_types import BoolArray, FloatArray
 from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
+from redetect.groundtruth.files import JsonObject, PathLike, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
 from redetect.storage.bounded import read_content, read_plain_array
 
@@ -108,9 +107,7 @@ class Robot:
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
 
-def read_joint_covariance(
-    path: str | os.PathLike[str], scanners: Sequence[Scanner]
-) -> FloatArray | None:
+def read_joint_covariance(path: PathLike, scanners: Sequence[Scanner]) -> FloatArray | None:
     """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
 
     Raises `GroundTruthError` if it is not one of these scanners, in their order.
@@ -153,7 +150,7 @@ def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Pat
     ]
 
 
-def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
+def read_scanners(path: PathLike) -> tuple[Scanner, ...]:
     """Read a ``scanners.json``: the scanners, in the file's order.
 
     Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
@@ -163,7 +160,7 @@ def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
 
 
 def write_scanners(
-    path: str | os.PathLike[str],
+    path: PathLike,
     scanners: Sequence[Scanner],
     extra: Mapping[str, Any] | None = None,
     *,
@@ -174,7 +171,7 @@ def write_scanners(
     write_json(path, content, overwrite=overwrite)
 
 
-def read_robot(path: str | os.PathLike[str]) -> Robot:
+def read_robot(path: PathLike) -> Robot:
     """Read a ``robot.json``.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
@@ -246,7 +243,7 @@ class Scans:
         return len(self.times_s)
 
 
-def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
+def find_scans(folder: PathLike, name: str) -> Path:
     """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
 
     Raises `GroundTruthError` if there is none, or more than one.
@@ -261,9 +258,7 @@ def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
     return found[0]
 
 
-def read_scans(
-    path: str | os.PathLike[str], readings: int | None = None, *, ordered: bool = True
-) -> Scans:
+def read_scans(path: PathLike, readings: int | None = None, *, ordered: bool = True) -> Scans:
     """Read scans.
 
     Parameters
@@ -307,7 +302,7 @@ def read_scans(
     return scans
 
 
-def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_npz(path: PathLike) -> tuple[FloatArray, NDArray[np.uint16]]:
     """Read the two arrays, checking the sizes stated in the file and without unpickling."""
     content = read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
     place, arrays = f"{path}: unreadable .npz", []
@@ -333,9 +328,7 @@ def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint
     return times, ranges
 
 
-def _read_rows(
-    path: str | os.PathLike[str], readings: int | None
-) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_rows(path: PathLike, readings: int | None) -> tuple[FloatArray, NDArray[np.uint16]]:
     rows: list[FloatArray] = []
     columns = None if readings is None else readings + 1
     for line, words in read_rows(path, _LARGEST_FILE_BYTES):

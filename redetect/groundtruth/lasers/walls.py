@@ -340,7 +340,9 @@ class MapProblem(NamedTuple):
             found.append([v[near] for v in (*rows, np.column_stack([normal, turn]))])
         columns = [np.concatenate(column) for column in zip(*found)]
         if (used := len(columns[0])) < _LEAST_READINGS:
-            raise GeometryError(f"{used} readings on the map: expected {_LEAST_READINGS} or more")
+            raise GeometryError(
+                f"{used} readings lie on the map: expected {_LEAST_READINGS} or more"
+            )
         return _OnWalls(cost, *columns)
 
     def _solved(self, on: _OnWalls, poses: FloatArray, map_sigma_m: float | None) -> _Solution:

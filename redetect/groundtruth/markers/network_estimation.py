@@ -142,9 +142,8 @@ def _chained(
                     pair = ((camera, here[-1][1]), (other, other_from_body))
                     (a, a_from_body), (b, b_from_body) = sorted(pair, key=lambda one: one[0])
                     if a != b:
-                        estimates.setdefault((a, b), []).append(
-                            a_from_body @ se3.inverse(b_from_body)
-                        )
+                        a_from_b = a_from_body @ se3.inverse(b_from_body)
+                        estimates.setdefault((a, b), []).append(a_from_b)
     support = {pair: len(poses) for pair, poses in estimates.items()}
     central = {pair: _most_central(poses) for pair, poses in estimates.items()}
     poses = chained_poses(central, support, 1 + len(names), 0)

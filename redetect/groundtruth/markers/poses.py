@@ -242,9 +242,8 @@ def estimate_pose(problem: refinement.PoseProblem) -> PoseEstimate:
 
 
 def _disagreeing(refined: refinement.RefinedPose, settings: PoseSettings) -> BoolArray:
-    return np.asarray(
-        (refined.view_errors > settings.outlier_sigma) & (refined.view_rms_px > settings.outlier_px)
-    )
+    far = refined.view_errors > settings.outlier_sigma
+    return np.asarray(far & (refined.view_rms_px > settings.outlier_px))
 
 
 def _starts(problem: refinement.PoseProblem) -> list[FloatArray]:

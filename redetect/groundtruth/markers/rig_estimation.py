@@ -24,7 +24,7 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
 )
 from redetect.groundtruth.markers.poses import view_poses
-from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refined_poses
+from redetect.groundtruth.markers.refinement import chain_points, pose_problem, refined_poses
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings, RigSettings
 from redetect.groundtruth.trajectories import se3
@@ -85,7 +85,9 @@ def estimate_rig(
     markers = [marker for group in groups for frame in group for marker in frame.markers]
     dictionaries = sorted({marker.dictionary for marker in markers})
     if len(dictionaries) != 1:
-        raise GroundTruthError(f"markers of the dictionaries {dictionaries}: expected one of them")
+        raise GroundTruthError(
+            f"markers of the dictionaries {dictionaries}: expected markers of one dictionary"
+        )
     # Pairs of markers seen together, and a consensus for each pair.
     ids = tuple(sorted({marker.id for marker in markers}))
     candidates = _bare_rig(dictionaries[0], ids, width_m)
@@ -157,32 +159,21 @@ def _in_known_frame(
 
 def _bare_rig(dictionary: str, ids: tuple[int, ...], width_m: float) -> Rig:
     count = len(ids)
-    return Rig(
-        dictionary,
-        ids,
-        np.full(count, width_m),
-        np.tile(np.eye(4), (count, 1, 1)),
-        np.zeros((6 * count, 6 * count)),
-    )
+    poses, exact = np.tile(np.eye(4), (count, 1, 1)), np.zeros((6 * count, 6 * count))
+    return Rig(dictionary, ids, np.full(count, width_m), poses, exact)
 
 
 def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) -> MarkerPose | None:
     """Both poses of a marker in an image, refined; None if it has none."""
-    problem = PoseProblem(
-        replace(network, covariance=np.zeros_like(network.covariance)),
-        rig,  # with identities: the marker itself is the body
-        chain_points([view], rig, settings.corner_floor_px),
-        np.zeros(4, dtype=np.int64),
-        PoseSettings(),
-    )
+    exact = replace(network, covariance=np.zeros_like(network.covariance))
+    # The rig's poses are identities: the marker itself is the body.
+    floor = PoseSettings(corner_floor_px=settings.corner_floor_px)
+    problem = pose_problem([view], rig, exact, floor)
     found = refined_poses(problem, view_poses(problem, 0))
     if not found:
         return None
-    return MarkerPose(
-        np.stack([refined.world_from_robot for refined in found]),
-        np.stack([refined.covariance for refined in found]),
-        np.array([refined.cost for refined in found]),
-    )
+    poses, covariances, costs = zip(*((r.world_from_robot, r.covariance, r.cost) for r in found))
+    return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
 
 
 def _consensus_of_pairs(
@@ -250,15 +241,11 @@ def _bundle(
             bodies += [len(poses)] * len(own)
             poses.append(pose)
     points = chain_points(views, rig, settings.corner_floor_px)
-    cameras = len(network.cameras)
-    bundle = adjustment.Bundle(
-        network.cameras,
-        len(start),
-        np.concatenate([network.world_from_camera, start, poses]),
-        np.arange(cameras + len(start) + len(poses)) >= cameras,
-        replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
-        np.repeat(np.arange(len(views)), 4),
-    )
+    points = replace(points, body=np.repeat(bodies, 4).astype(np.int64))
+    together = np.concatenate([network.world_from_camera, start, poses])
+    free = np.arange(len(together)) >= len(network.cameras)
+    view = np.repeat(np.arange(len(views)), 4)
+    bundle = adjustment.Bundle(network.cameras, len(start), together, free, points, view)
     return bundle, tuple(views), len(poses)
 
 

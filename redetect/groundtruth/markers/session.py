@@ -6,7 +6,6 @@ each camera; both may contain covariances (see docs/groundtruth.md).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from camera import Camera, read_camera
 from redetect.array_types import FloatArray
 from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, write_json
+from redetect.groundtruth.files import JsonObject, PathLike, write_json
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
@@ -64,7 +63,7 @@ def marker_corners(width_m: float) -> FloatArray:
     return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
 
 
-def read_rig(path: str | os.PathLike[str]) -> Rig:
+def read_rig(path: PathLike) -> Rig:
     """Read a ``rig.json``; its markers are returned in the order of their identifiers.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
@@ -85,7 +84,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     return Rig(dictionary, ids, widths, poses, _joint_covariance(content, "markers", entries))
 
 
-def read_network(path: str | os.PathLike[str]) -> Network:
+def read_network(path: PathLike) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
     Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
@@ -109,11 +108,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
 
 
 def write_rig(
-    path: str | os.PathLike[str],
-    rig: Rig,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
+    path: PathLike, rig: Rig, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
 ) -> None:
     """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
     entries = {
@@ -126,7 +121,7 @@ def write_rig(
 
 
 def write_network(
-    path: str | os.PathLike[str],
+    path: PathLike,
     network: Network,
     extra: Mapping[str, Any] | None = None,
     *,

@@ -259,14 +259,11 @@ def _steps(
     turned = Rotation.from_matrix(rotation_b @ rotation_a.transpose(0, 2, 1)).as_rotvec()
     moved = np.concatenate([b[:, :3, 3] - a[:, :3, 3], turned], axis=1)
     spread = np.zeros((len(moved), 6, 6))
-    for pose_rotation, covariance in (
-        (rotation_a, covariances[first]),
-        (rotation_b, covariances[second]),
-    ):
+    for pose_rotation, which in ((rotation_a, first), (rotation_b, second)):
         axes = np.zeros((len(moved), 6, 6))
         axes[:, :3, :3] = pose_rotation
         axes[:, 3:, 3:] = rotation_b
-        spread += axes @ covariance @ axes.transpose(0, 2, 1)
+        spread += axes @ covariances[which] @ axes.transpose(0, 2, 1)
     at = np.asarray(times_s)[frame]
     seconds = at[second] - at[first]
     reach, turn = settings.speed_m_s * seconds, np.radians(settings.turn_deg_s) * seconds

@@ -188,9 +188,8 @@ def _all_streams(inputs: Inputs) -> dict[str, PlanarPoses]:
 def _maps(inputs: Inputs) -> list[Part]:
     tracks = [_track(name, poses, inputs) for name, poses in inputs.streams.items()]
     beside = {"odometry": inputs.odometry, "truth": inputs.truth}
-    everything = tracks + [
-        _track(name, poses, inputs) for name, poses in beside.items() if poses is not None
-    ]
+    others = [_track(name, poses, inputs) for name, poses in beside.items() if poses is not None]
+    everything = tracks + others
     if not everything and inputs.building is None:
         return [Part("note", "Neither a building nor a stream of poses: nothing to draw.")]
     words = "The building" if inputs.building is not None else "No building map in the session"
@@ -208,9 +207,8 @@ def _maps(inputs: Inputs) -> list[Part]:
 
 def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
-        return [
-            Part("note", "No truth in the session: give it by --truth to see errors over time.")
-        ]
+        words = "No truth in the session: give it by --truth to see errors over time."
+        return [Part("note", words)]
     rows: list[tuple[str, ...]] = []
     place, turn, faults, outside = [], [], [], []
     compared = [

@@ -109,9 +109,8 @@ def series_figure(
             axes.set(xlim=(0.0, span), yscale="log")
             axes.grid(axis="y", alpha=0.25, lw=0.6)
             if span > 0.08 * sum(spans):
-                axes.set_xlabel(
-                    f"visit {visits.index((first, last)) + 1}: {span:.0f} s", fontsize=8
-                )
+                number = visits.index((first, last)) + 1
+                axes.set_xlabel(f"visit {number}: {span:.0f} s", fontsize=8)
             else:
                 axes.set_xticks([])
         least = 10.0 ** math.floor(math.log10(max(float(np.quantile(positive, 0.05)), 1e-9)))

@@ -7,7 +7,6 @@ a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth th
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import parse_numbers, read_rows
+from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
@@ -89,7 +88,7 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     return poses if np.all(last) else poses.only(last)
 
 
-def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
+def read_planar_poses(path: PathLike) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
     All rows have 4, or all have 13, numbers separated by commas or blanks; blank lines and `#`
@@ -132,9 +131,7 @@ def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> st
     return "".join(lines)
 
 
-def write_planar_poses(
-    path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
-) -> None:
+def write_planar_poses(path: PathLike, poses: PlanarPoses, *, overwrite: bool = False) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
     write_bytes(path, format_planar_poses(poses).encode(), overwrite=overwrite)
 

@@ -201,9 +201,8 @@ def refined_by_walls(
     # Joseph's form remains symmetric and positive definite.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return ReferencePose(
-        distances, pose, combined, "used", "", int(found.used[0]), float(found.rms_m[0]), still
-    )
+    points, rms_m = int(found.used[0]), float(found.rms_m[0])
+    return ReferencePose(distances, pose, combined, "used", "", points, rms_m, still)
 
 
 class RefinedMounts(NamedTuple):
@@ -245,9 +244,8 @@ def refine_mounts(
     None if fewer than three poses have both distances and scans.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
-    used = [
-        r for r in references if r.scans in ("used", "disagrees") and r.distances.status == "ok"
-    ]
+    accepted = [r for r in references if r.distances.status == "ok"]
+    used = [r for r in accepted if r.scans in ("used", "disagrees")]
     stills = [r.still for r in used if r.still is not None]
     if len(stills) < 3:
         return None

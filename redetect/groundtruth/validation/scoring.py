@@ -6,7 +6,6 @@ A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_table
+from redetect.groundtruth.files import PathLike, read_table
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
@@ -151,7 +150,7 @@ class RelativeScore(ErrorFigures):
     unmatched: int  # Pairs without poses on one side, or too far apart
 
 
-def read_relations(path: str | os.PathLike[str]) -> Relations:
+def read_relations(path: PathLike) -> Relations:
     """Read relations: rows t_i, t_j, x, y, z, roll, pitch, yaw separated by blanks or commas.
 
     Only x, y and yaw are used, as poses are on a floor. Raises `GroundTruthError` if the file
@@ -172,9 +171,9 @@ def score_relations(
     Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
     has poses at both its times.
     """
-    before, known_before = _at(poses, relations.from_s, largest_gap_s)
-    after, known_after = _at(poses, relations.to_s, largest_gap_s)
-    known = known_before & known_after
+    times_s = (relations.from_s, relations.to_s)
+    before, after = (_at(poses, some, largest_gap_s) for some in times_s)
+    known = np.isfinite(before[:, 0]) & np.isfinite(after[:, 0])
     mine = between(before[known], after[known])
     return relative_score(relations.from_to[known], mine, int((~known).sum()))
 
@@ -213,16 +212,13 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
     return RelativeScore(**_figures(error), pairs=len(error), unmatched=unmatched)
 
 
-def _at(
-    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
-) -> tuple[FloatArray, BoolArray]:
-    """(N, 3) poses at times in any order, zeros if unknown, and a mask of the known ones."""
+def _at(poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float) -> FloatArray:
+    """(N, 3) poses at times in any order; NaN if unknown."""
     order = np.argsort(times_s, kind="stable")
     interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
-    result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
+    result = np.full((len(times_s), 3), np.nan)
     result[order[found]] = interpolated.poses
-    known[order[found]] = True
-    return result, known
+    return result
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def associate_locally(
     settings = settings or AssociateSettings()
     circles = recording.circles
     scaled = replace(circles, covariance=settings.sigma_scale**2 * circles.covariance)
-    none = FrameRows(CircleRows.of(), LineRows.of())
+    none = FrameRows(circles.only([]), LineRows.of())
     disc_labels: list[int] = []
     line_labels: list[int] = []
     discs_seen: dict[int, int] = {}  # frame of each landmark's last sight

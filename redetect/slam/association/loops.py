@@ -295,10 +295,9 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
         for earlier, later, motion in candidates
         if motion.agreeing >= search.least_agreeing
     ]
-    return sorted(
-        (m for m in matches if m and m.log10_false_alarms <= np.log10(search.false_alarms)),
-        key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame),
-    )
+    most = np.log10(search.false_alarms)
+    significant = (match for match in matches if match and match.log10_false_alarms <= most)
+    return sorted(significant, key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame))
 
 
 class Motion(NamedTuple):

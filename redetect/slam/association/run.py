@@ -275,10 +275,8 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
             matches += found
             if len(at.xy) == before and search.most_shift_m == math.inf:
                 break
-            search = _EVERYWHERE._replace(
-                stretch_frames=length,
-                attached_frames=_EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES,
-            )
+            attached = _EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES
+            search = _EVERYWHERE._replace(stretch_frames=length, attached_frames=attached)
         if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
             return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
         length = min(2 * length, _LONGEST)

@@ -124,7 +124,9 @@ def identified_rows(
     for kind, labels in ((CircleLandmark, circle_labels), (LineLandmark, line_labels)):
         count = sum(isinstance(row.record, kind) for row in rows)
         if count not in (0, len(labels)):
-            raise SlamError(f"{source}: {count} rows of a kind: expected {len(labels)}, as before")
+            raise SlamError(
+                f"{source}: {count} rows of a kind: expected the {len(labels)} associated"
+            )
         numbers[kind] = iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
     for row in rows:
         if isinstance(row.record, CircleLandmark | LineLandmark):

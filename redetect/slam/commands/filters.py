@@ -32,7 +32,6 @@ _LOST_FRAMES = 20
 # Factor of innovations with known identifiers above which some are wrong, or covariances too small.
 _MOST_FACTOR = 2.5
 
-
 #: Results of a filter: the run, the map, and further lines for the terminal.
 _Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
 

@@ -18,7 +18,7 @@ from redetect.landmarks.map_file import covariance_file, write_map, write_path
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.odometry_check import OdometryCheck
+from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
@@ -29,7 +29,6 @@ from redetect.storage import demand_free, write_bytes
 from redetect.tables import plain
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
-
 
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
 # changes of lengths (%), turns (rad/m) and lags (intervals between frames).
@@ -47,9 +46,8 @@ def perform(command: Map) -> int:
     joint_name = covariance_file(Path(files.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
     paths = several if command.more else [files.PATH_NAME]
-    names = [files.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE] + [
-        CAMERA_NAME
-    ] * command.calibrate
+    names = [files.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
+    names += [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = files.recordings_of(command)
     recording = joined(runs)
@@ -70,7 +68,7 @@ def perform(command: Map) -> int:
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
-    check = mapped.odometry_check()
+    check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
     results = plain(_results(mapped, check, command))
     files.write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):

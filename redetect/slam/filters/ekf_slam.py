@@ -160,12 +160,11 @@ class EkfSlam(frames.Filter):
         if not len(rows.circles) and not len(rows.lines):
             return
         before = self._state.copy()
+        inverse = frames.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
-            nearer = np.abs(
-                change[frames.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]]
-            )
+            nearer = np.abs(change[inverse])
             self._state += change * min(1.0, _LONGEST_STEP / max(nearer.max(initial=0.0), 1e-9))
             if np.max(np.abs(change)) < _CONVERGED:
                 break

@@ -49,7 +49,7 @@ class FrameRows(NamedTuple):
     circles: CircleRows
     lines: LineRows
 
-    def only(self, discs: BoolArray, lines: BoolArray) -> FrameRows:
+    def only(self, discs: BoolArray | slice, lines: BoolArray | slice) -> FrameRows:
         """The selected rows."""
         return FrameRows(self.circles.only(discs), self.lines.only(lines))
 
@@ -107,14 +107,11 @@ class FilterRun:
 
 def frames_of(recording: Recording) -> Iterator[FrameRows]:
     """The rows of each frame of a run, in order."""
-    frames = np.arange(len(recording) + 1)
-    discs = np.searchsorted(recording.circles.frame, frames)
-    lines = np.searchsorted(recording.lines.frame, frames)
+    frames, rows = np.arange(len(recording) + 1), FrameRows(recording.circles, recording.lines)
+    discs = np.searchsorted(rows.circles.frame, frames)
+    lines = np.searchsorted(rows.lines.frame, frames)
     for k in range(len(recording)):
-        yield FrameRows(
-            recording.circles.only(slice(discs[k], discs[k + 1])),
-            recording.lines.only(slice(lines[k], lines[k + 1])),
-        )
+        yield rows.only(slice(discs[k], discs[k + 1]), slice(lines[k], lines[k + 1]))
 
 
 class Filter(ABC):

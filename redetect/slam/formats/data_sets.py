@@ -68,10 +68,8 @@ def discs_of_ranges(
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
     direction = np.stack([sin, -cos], axis=-1)
-    root = np.stack(
-        [sigma_m * direction, sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)],
-        axis=-1,
-    )
+    across = sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)
+    root = np.stack([sigma_m * direction, across], axis=-1)
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 

@@ -193,9 +193,8 @@ def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss
         return []
     layout = layout_of(graph)
     pose, share = _members(graph)
-    by_pose, by_line = models.bearing_jacobians(
-        estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
-    )
+    line_xy = estimate.line_xy[graph.member_line]
+    by_pose, by_line = models.bearing_jacobians(estimate.poses[pose], line_xy, graph.camera_xy)
     scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
     by_pose, by_line = by_pose * scale, by_line * scale
     # The k-th line of each row; rows with fewer lines have none there.

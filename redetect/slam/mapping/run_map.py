@@ -24,7 +24,6 @@ from redetect.slam.filters.ekf_slam import filtered_poses
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
@@ -168,10 +167,6 @@ class MappedRun:
         """The map with the joint covariance of its landmarks."""
         joint = joint_covariance(self.graph, self.estimate, self.weighting)
         return replace(self.landmarks, joint_covariance=joint)
-
-    def odometry_check(self) -> OdometryCheck:
-        """Do odometry and rows fit each other?"""
-        return check_odometry(self.graph, self.estimate, self.weighting, self.table.expected)
 
 
 def map_run(
@@ -388,7 +383,9 @@ def _check_usable(
         raise SlamError(f"{name}: {needs} cannot be estimated without a calibration: expected one")
     if weighting.calibrate and camera is not None:
         if len(recording.lines):
-            raise SlamError(f"{name}: bearings do not determine the mounting: expected discs alone")
+            raise SlamError(
+                f"{name}: bearings do not determine the camera's mounting: expected discs alone"
+            )
         check_rows_fit_camera(camera, recording.circles.xy)
 
 
