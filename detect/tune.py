@@ -167,13 +167,10 @@ def combinations(varied: Mapping[str, str]) -> tuple[dict[str, Any], ...]:
 
 
 def tune_run(
-    run: Run,
-    frames: Sequence[RunFrame],
-    settings: Sequence[CircleSettings],
-    compare: Callable[[list[Frame]], DiscComparison],
-    workers: Workers,
+    run: Run, frames: Sequence[RunFrame], settings: Sequence[CircleSettings],
+    compare: Callable[[list[Frame]], DiscComparison], workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
-) -> Iterator[tuple[DiscComparison, list[str]]]:
+) -> Iterator[tuple[DiscComparison, list[str]]]:  # fmt: skip
     """Detect discs in frames of a run with each setting, and compare them.
 
     `compare` compares their rows with the reference; `on_progress` is called after every frame of

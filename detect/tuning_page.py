@@ -205,8 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._try(lambda: ("application/json", json.dumps(self._carried_out(body)).encode()))
 
     def _carried_out(self, body: bytes) -> dict[str, Any]:
-        request = json.loads(body)
-        session = self.server.session
+        request, session = json.loads(body), self.server.session
         if self.path == "/detect":
             return session.detect(self._number(request["frame"]), request["settings"])
         if self.path == "/save":
@@ -214,11 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
         raise DetectError("no such request")
 
     def _number(self, word: Any) -> int:
-        number = int(word)
-        if not 0 <= number < len(self.server.session.frames):
-            raise DetectError(
-                f"no frame {number}: expected 0 to {len(self.server.session.frames) - 1}"
-            )
+        number, last = int(word), len(self.server.session.frames) - 1
+        if not 0 <= number <= last:
+            raise DetectError(f"no frame {number}: expected 0 to {last}")
         return number
 
     def _allowed(self, token: str) -> bool:

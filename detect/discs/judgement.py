@@ -102,13 +102,9 @@ _FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 
 @kernel()
 def judge(
-    image: GreyImage,
-    candidates: HoughCandidates,
-    nominal: float,
-    least_step: float,
-    camera_numbers: FloatArray,
-    networks: Networks,
-) -> Judgement:
+    image: GreyImage, candidates: HoughCandidates, nominal: float, least_step: float,
+    camera_numbers: FloatArray, networks: Networks,
+) -> Judgement:  # fmt: skip
     """Judge candidates, the best first.
 
     Parameters
