@@ -205,8 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._try(lambda: ("application/json", json.dumps(self._carried_out(body)).encode()))
 
     def _carried_out(self, body: bytes) -> dict[str, Any]:
-        request = json.loads(body)
-        session = self.server.session
+        request, session = json.loads(body), self.server.session
         if self.path == "/detect":
             return session.detect(self._number(request["frame"]), request["settings"])
         if self.path == "/save":

@@ -59,13 +59,9 @@ def pixel_positions(
 
 @kernel()
 def refined_covariances(
-    camera_numbers: FloatArray,
-    centre: FloatArray,
-    floor_xy: FloatArray,
-    fitted: FloatArray,
-    pixel_variance: float,
-    tilt_variance: float,
-) -> FloatArray:
+    camera_numbers: FloatArray, centre: FloatArray, floor_xy: FloatArray, fitted: FloatArray,
+    pixel_variance: float, tilt_variance: float,
+) -> FloatArray:  # fmt: skip
     """(N, 2, 2) covariances of the fits, plus a systematic error in pixels and the camera's tilt.
 
     `camera_numbers` as in `camera.kernels`; the variances are per axis, square pixels and square

@@ -26,6 +26,7 @@ from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage
+from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
 
 Video = Callable[[ByteArray], None]
@@ -53,7 +54,7 @@ def perform(options: Draw) -> int:
         drawn, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:
-            print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
+            print(f"{where}: {counted(drawn, 'picture')} of {', '.join(rows.detected)}")
     return report_failures(len(failures), failures)
 
 

@@ -38,6 +38,8 @@ _POINTS = 33
 #: Size of the ellipses of markers' corners, in standard deviations.
 _SIGMAS = 20.0
 Colour = tuple[int, int, int]
+#: Upper left and lower right corner, pixels.
+Box = tuple[FloatArray, FloatArray]
 LINE_COLOUR: Colour = (60, 220, 60)
 SIGMA_COLOUR: Colour = (0, 170, 255)
 _OUTLINE_COLOUR: Colour = (60, 200, 60)
@@ -70,7 +72,7 @@ def draw_rows(
     scale = 2 if image.shape[1] < _SMALL_PX else 1
     canvas = canvas_of(image, None if sight is None else sight.camera)
     canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
-    words, labels = [title] if title else [], list[FloatArray]()
+    words, labels = [title] if title else [], list[Box]()
     if not processed(rows):
         words.append("not processed")
     options = CompareOptions()
@@ -142,7 +144,7 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 def _draw_discs(
     canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int,
-    taken: list[FloatArray],
+    taken: list[Box],
 ) -> None:  # fmt: skip
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
     view = match.view
@@ -173,7 +175,7 @@ def _draw_discs(
 
 def _draw_label(
     canvas: ByteArray, text: str, places: Sequence[tuple[FloatArray, float]], colour: Colour,
-    size: float, taken: list[FloatArray],
+    size: float, taken: list[Box],
 ) -> None:  # fmt: skip
     """Draw a label at the first place where it is on no other, or a little below the last one.
 
@@ -184,25 +186,20 @@ def _draw_label(
     times = enlargement(canvas)
     extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
     wide, high = np.array(extent) + 2.0 * times
-
-    def box(u: float, v: float) -> FloatArray:
-        return np.array([[u, v], [u + wide, v + high]])
-
-    def free(one: FloatArray) -> bool:
-        return not any(np.all((one[0] < other[1]) & (other[0] < one[1])) for other in taken)
-
-    boxes = [box(u - share * wide, v - 0.5 * high) for (u, v), share in places]
-    boxes += [boxes[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
-    for chosen in boxes:
-        if 0.0 <= chosen[0, 0] <= chosen[1, 0] <= canvas.shape[1] and free(chosen):
-            taken.append(chosen)
-            draw_text(canvas, text, (chosen[0, 0], chosen[1, 1] - times), colour, size)
+    corners = [place - np.array([share * wide, 0.5 * high]) for place, share in places]
+    corners += [corners[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
+    for least in corners:
+        most = np.add(least, (wide, high))
+        within = least[0] >= 0.0 and most[0] <= canvas.shape[1]
+        if within and not any(np.all((least < b) & (a < most)) for a, b in taken):
+            taken.append((least, most))
+            draw_text(canvas, text, (least[0], most[1] - times), colour, size)
             return
 
 
 def _draw_lines(
     canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int,
-    taken: list[FloatArray],
+    taken: list[Box],
 ) -> None:  # fmt: skip
     for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
         draw_curve(canvas, curve, MISSED_COLOUR)

@@ -74,11 +74,10 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
     leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
-    given = False
-    if not found["discs"] or (found["discs"] < _FEW_DISCS * seen and seen >= _FEWEST_FRAMES):
-        for hint in _hints_on_discs(run, leaning, settings, summary):
-            given = True
-            yield hint
+    given, few = list[str](), found["discs"] < _FEW_DISCS * seen and seen >= _FEWEST_FRAMES
+    if few or not found["discs"]:
+        given = list(_hints_on_discs(run, leaning, settings, summary))
+    yield from given
     if not given and found["discs"] >= seen >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii
 

@@ -225,16 +225,10 @@ class Detection(Table):
 
 @keywords_named()
 def detect(
-    image: ImageLike,
-    camera: CameraLike,
-    radius_m: float | None = None,
-    polarity: Polarity | None = None,
-    *,
-    level: bool = True,
-    axes: Axes = "dataset",
-    settings: CircleSettings | None = None,
-    line_settings: LineSettings | None = None,
-) -> Detection:
+    image: ImageLike, camera: CameraLike, radius_m: float | None = None,
+    polarity: Polarity | None = None, *, level: bool = True, axes: Axes = "dataset",
+    settings: CircleSettings | None = None, line_settings: LineSettings | None = None,
+) -> Detection:  # fmt: skip
     """Detect discs, verticals and tilt in one image.
 
     Parameters
@@ -311,15 +305,10 @@ class RecordedFrame:
 
     @keywords_named()
     def detect(
-        self,
-        radius_m: float | None = None,
-        polarity: Polarity | None = None,
-        *,
-        level: bool = True,
-        axes: Axes = "dataset",
-        settings: CircleSettings | None = None,
+        self, radius_m: float | None = None, polarity: Polarity | None = None, *,
+        level: bool = True, axes: Axes = "dataset", settings: CircleSettings | None = None,
         line_settings: LineSettings | None = None,
-    ) -> Detection:
+    ) -> Detection:  # fmt: skip
         """Detect discs, verticals and tilt: see `detect`."""
         if axes not in MEANING:
             meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())
@@ -431,14 +420,10 @@ class Explanation(DiscExplanation):
 
 @keywords_named()
 def explain(
-    image: ImageLike,
-    camera: CameraLike,
-    at: tuple[float, float] | None = None,
-    radius_m: float | None = None,
-    polarity: Polarity | None = None,
-    *,
+    image: ImageLike, camera: CameraLike, at: tuple[float, float] | None = None,
+    radius_m: float | None = None, polarity: Polarity | None = None, *,
     settings: CircleSettings | None = None,
-) -> Explanation:
+) -> Explanation:  # fmt: skip
     """Explain why candidates for discs in an image are accepted or rejected.
 
     Parameters
