@@ -192,9 +192,11 @@ def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> H
 
 
 def judged(
-    scene: Scene, settings: CircleSettings, candidates: HoughCandidates,
+    scene: Scene,
+    settings: CircleSettings,
+    candidates: HoughCandidates,
     networks: Networks | None = None,
-) -> JudgedCandidates:  # fmt: skip
+) -> JudgedCandidates:
     """Classify candidates (`detect.discs.judgement`), by default with the trained networks."""
     weakest = settings.noise_floor * max(scene.noise, _LEAST_NOISE)
     step, networks = max(weakest, _LEAST_STEP), networks or trained_networks()

@@ -70,9 +70,13 @@ def tilt_of_outlines(
 
 @kernel()
 def _tilts_of_discs(
-    image: GreyImage, numbers: FloatArray, centre: FloatArray, floor_xy: FloatArray, radius: float,
+    image: GreyImage,
+    numbers: FloatArray,
+    centre: FloatArray,
+    floor_xy: FloatArray,
+    radius: float,
     height_ratio: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Tilts of the discs for which the estimate succeeds, and their covariances."""
     tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
     used = 0

@@ -144,9 +144,14 @@ def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio
 
 @kernel(forceinline=True)
 def gather(
-    image: GreyImage, floor_xy: Float32Array, candidate: Candidate, blur_ratio: float, reach: Reach,
-    start: Disc, patch: Any,
-) -> tuple[int, IntArray]:  # fmt: skip
+    image: GreyImage,
+    floor_xy: Float32Array,
+    candidate: Candidate,
+    blur_ratio: float,
+    reach: Reach,
+    start: Disc,
+    patch: Any,
+) -> tuple[int, IntArray]:
     """Fill a patch (`PATCH`) with the pixels around a candidate; none if no floor is visible.
 
     `floor_xy` (H, W, 2) are the pixels' floor positions, metres. `blur_ratio` is the blur along v
@@ -174,9 +179,14 @@ def sector_of(x: float, y: float) -> Any:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _sort_by_sector(
-    floor_xy: Float32Array, candidate: Candidate, start: Disc, reach: Reach, count: int, patch: Any,
+    floor_xy: Float32Array,
+    candidate: Candidate,
+    start: Disc,
+    reach: Reach,
+    count: int,
+    patch: Any,
     ends: IntArray,
-) -> None:  # fmt: skip
+) -> None:
     """Sort pixels by sector, and drop those that are too near to the centre or too far from it.
 
     Sectors are padded with copies of their first pixel, of weight 0.
@@ -210,9 +220,14 @@ def _sort_by_sector(
 
 @kernel(forceinline=True)
 def _choose(
-    floor_xy: Float32Array, candidate: Candidate, blur_ratio: float, reach: Reach, start: Disc,
-    view: View, patch: Any,
-) -> int:  # fmt: skip
+    floor_xy: Float32Array,
+    candidate: Candidate,
+    blur_ratio: float,
+    reach: Reach,
+    start: Disc,
+    view: View,
+    patch: Any,
+) -> int:
     """Write the indices of the pixels within reach into the patch; returns their number."""
     height, width = floor_xy.shape[:2]
     u0, v0 = candidate.u, candidate.v
@@ -288,9 +303,13 @@ def _take(
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _describe(
-    image: GreyImage, floor_xy: Float32Array, candidate: Candidate, shape: int, count: int,
+    image: GreyImage,
+    floor_xy: Float32Array,
+    candidate: Candidate,
+    shape: int,
+    count: int,
     patch: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Write floor positions, steps and grey values of the chosen pixels into the patch."""
     grey, floor = image.reshape(-1), floor_xy.reshape(-1, 2)
     width = image.shape[1]

@@ -59,9 +59,13 @@ def pixel_positions(
 
 @kernel()
 def refined_covariances(
-    camera_numbers: FloatArray, centre: FloatArray, floor_xy: FloatArray, fitted: FloatArray,
-    pixel_variance: float, tilt_variance: float,
-) -> FloatArray:  # fmt: skip
+    camera_numbers: FloatArray,
+    centre: FloatArray,
+    floor_xy: FloatArray,
+    fitted: FloatArray,
+    pixel_variance: float,
+    tilt_variance: float,
+) -> FloatArray:
     """(N, 2, 2) covariances of the fits, plus a systematic error in pixels and the camera's tilt.
 
     `camera_numbers` as in `camera.kernels`; the variances are per axis, square pixels and square

@@ -246,9 +246,14 @@ def _bounded(step: float) -> float:
 
 @kernel()
 def _choose(
-    x: FloatArray, y: FloatArray, weight: FloatArray, tolerance: FloatArray, circle: Circle,
-    wide: float, chosen: FloatArray,
-) -> tuple[int, bool]:  # fmt: skip
+    x: FloatArray,
+    y: FloatArray,
+    weight: FloatArray,
+    tolerance: FloatArray,
+    circle: Circle,
+    wide: float,
+    chosen: FloatArray,
+) -> tuple[int, bool]:
     """Write the inliers' weights, 0 for outliers, into `chosen`; their number, and any change.
 
     Points with weight 0 are missing.

@@ -143,9 +143,13 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int,
+    canvas: ByteArray,
+    match: FrameMatch,
+    settings: CircleSettings,
+    compared: bool,
+    scale: int,
     taken: list[Box],
-) -> None:  # fmt: skip
+) -> None:
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
     view = match.view
     assert view is not None
@@ -174,9 +178,13 @@ def _draw_discs(
 
 
 def _draw_label(
-    canvas: ByteArray, text: str, places: Sequence[tuple[FloatArray, float]], colour: Colour,
-    size: float, taken: list[Box],
-) -> None:  # fmt: skip
+    canvas: ByteArray,
+    text: str,
+    places: Sequence[tuple[FloatArray, float]],
+    colour: Colour,
+    size: float,
+    taken: list[Box],
+) -> None:
     """Draw a label at the first place where it is on no other, or a little below the last one.
 
     A place is a point at half the label's height, and the share of its width to the left of it. If
@@ -198,9 +206,13 @@ def _draw_label(
 
 
 def _draw_lines(
-    canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int,
+    canvas: ByteArray,
+    camera: Camera,
+    match: FrameMatch,
+    compared: bool,
+    scale: int,
     taken: list[Box],
-) -> None:  # fmt: skip
+) -> None:
     for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
         draw_curve(canvas, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]

@@ -76,9 +76,13 @@ class JudgedTracks(NamedTuple):
 
 
 def fit_and_judge(
-    image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers, before: JudgedTracks | None = None,
-) -> JudgedTracks:  # fmt: skip
+    image: GreyImage,
+    strip: Strip,
+    tracks: LineTracks,
+    filters: StepFilters,
+    numbers: LineNumbers,
+    before: JudgedTracks | None = None,
+) -> JudgedTracks:
     """Fit lines to tracks, select them individually, and estimate the consensus tilt.
 
     If only the doubtful tracks of an earlier pass were tracked again, only these are fitted.

@@ -225,10 +225,16 @@ class Detection(Table):
 
 @keywords_named()
 def detect(
-    image: ImageLike, camera: CameraLike, radius_m: float | None = None,
-    polarity: Polarity | None = None, *, level: bool = True, axes: Axes = "dataset",
-    settings: CircleSettings | None = None, line_settings: LineSettings | None = None,
-) -> Detection:  # fmt: skip
+    image: ImageLike,
+    camera: CameraLike,
+    radius_m: float | None = None,
+    polarity: Polarity | None = None,
+    *,
+    level: bool = True,
+    axes: Axes = "dataset",
+    settings: CircleSettings | None = None,
+    line_settings: LineSettings | None = None,
+) -> Detection:
     """Detect discs, verticals and tilt in one image.
 
     Parameters
@@ -420,10 +426,14 @@ class Explanation(DiscExplanation):
 
 @keywords_named()
 def explain(
-    image: ImageLike, camera: CameraLike, at: tuple[float, float] | None = None,
-    radius_m: float | None = None, polarity: Polarity | None = None, *,
+    image: ImageLike,
+    camera: CameraLike,
+    at: tuple[float, float] | None = None,
+    radius_m: float | None = None,
+    polarity: Polarity | None = None,
+    *,
     settings: CircleSettings | None = None,
-) -> Explanation:  # fmt: skip
+) -> Explanation:
     """Explain why candidates for discs in an image are accepted or rejected.
 
     Parameters

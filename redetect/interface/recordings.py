@@ -88,10 +88,14 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
 
 @keywords_named()
 def compare(
-    run: PathLike, detected: PathLike | Detection | Iterable[Detection] | None = None,
-    reference: PathLike | None = None, *, lines: bool = False, camera: CameraLike | None = None,
+    run: PathLike,
+    detected: PathLike | Detection | Iterable[Detection] | None = None,
+    reference: PathLike | None = None,
+    *,
+    lines: bool = False,
+    camera: CameraLike | None = None,
     options: CompareOptions | None = None,
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Compare detected discs, or verticals, with reference rows, as `detect compare` does.
 
     Parameters

@@ -251,9 +251,12 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
 
 
 def _whole_to_map(
-    stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    stills: list[StillScan],
+    poses: FloatArray,
+    measured: FloatArray,
+    building: FloatArray,
     narrowing_m: list[float],
-) -> tuple[FloatArray, WallCurves]:  # fmt: skip
+) -> tuple[FloatArray, WallCurves]:
     """Align all scanners, as one rigid body, with the map, from their measured poses.
 
     Also says which walls are chords of curves: whether coarse ones are, the readings decide.
