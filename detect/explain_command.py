@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from camera import camera_in, read_camera
-from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, png_of
 from detect.errors import DetectError
 from detect.options import Explain

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
-from detect.discs.unfound import explain_discs
+from detect.discs.explanation import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
 from detect.runs.frame import detect_batch

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
-from detect.discs.unfound import DiscExplanation, Stage
+from detect.discs.explanation import DiscExplanation, Stage
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections

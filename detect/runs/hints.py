@@ -95,8 +95,8 @@ def _hints_on_discs(
     run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
 ) -> Iterator[str]:
     """Why a run has few discs per frame; nothing if no other settings find more."""
+    from detect.discs.explanation import why_none
     from detect.discs.radius import find_radius
-    from detect.discs.unfound import why_none
 
     images, number = list(some_images(run)), summary.found["discs"]
     in_images = f"in {len(images)} of the images"

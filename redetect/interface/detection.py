@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
@@ -409,7 +409,7 @@ class Explanation(DiscExplanation):
     Attributes
     ----------
     image, camera, settings, at, candidates, place, suggestions
-        Those of `detect.discs.unfound.DiscExplanation`.
+        Those of `detect.discs.explanation.DiscExplanation`.
     """
 
     def picture(self) -> NDArray[np.uint8]:

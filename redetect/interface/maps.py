@@ -110,7 +110,7 @@ class RunMap(Table):
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        map_file.write_map(place / MAP_NAME, self.result.landmarks_jointly(), overwrite=overwrite)
+        map_file.write_map(place / MAP_NAME, self.result.landmarks_to_write(), overwrite=overwrite)
         map_file.write_path(place / PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:

@@ -242,7 +242,7 @@ def _read(
         raise LandmarkFileError(path, None, f"cannot be read: {reason}: expected {what}") from None
     head: list[str] = []
     empty = True
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):  # names may have other line ends
         if not line.strip() or line.startswith("#"):
             continue
         try:

@@ -17,6 +17,7 @@ from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks.map_file import covariance_file, write_map, write_path
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
+from redetect.slam.mapping import run_map
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_lines
@@ -35,9 +36,6 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 _SIGNIFICANT, _LEAST_PERCENT, _LEAST_TURN, _LEAST_LAG = 5.0, 2.0, 0.01, 0.1
 # Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
-
-#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
-MOST_LANDMARKS_TOGETHER = 5000
 
 
 def perform(command: Map) -> int:
@@ -58,12 +56,9 @@ def perform(command: Map) -> int:
     output.mkdir(parents=True, exist_ok=True)
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {__version__}: {name}"]
-    final, path = mapped.landmarks, mapped.path
-    few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
-    if few:
-        final = mapped.landmarks_jointly()
+    final, path = mapped.landmarks_to_write(), mapped.path
     write_map(output / files.MAP_NAME, final, head, overwrite=command.force)
-    if not few:
+    if final.joint_covariance is None:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
@@ -73,9 +68,9 @@ def perform(command: Map) -> int:
     files.write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
-    if not few:
+    if final.joint_covariance is None:
         print(
-            f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
+            f"more than {run_map.MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
             "localize` assumes independent errors"
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)

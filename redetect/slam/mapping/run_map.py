@@ -40,6 +40,9 @@ _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 Solver = Literal["separable", "gtsam"]
 
+#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
+MOST_LANDMARKS_TOGETHER = 5000
+
 
 @dataclass(frozen=True)
 class ChiSquared:
@@ -167,6 +170,11 @@ class MappedRun:
         """The map with the joint covariance of its landmarks."""
         joint = joint_covariance(self.graph, self.estimate, self.weighting)
         return replace(self.landmarks, joint_covariance=joint)
+
+    def landmarks_to_write(self) -> LandmarkMap:
+        """The map with its joint covariance, unless that would be gigabytes."""
+        few = len(self.landmarks.discs) + len(self.landmarks.lines) <= MOST_LANDMARKS_TOGETHER
+        return self.landmarks_jointly() if few else self.landmarks
 
 
 def map_run(

@@ -93,7 +93,7 @@ class DiscExplanation(Table):
     settings : CircleSettings
     at : (float, float) or None
         The given pixel.
-    candidates : tuple of detect.discs.unfound.Candidate
+    candidates : tuple of detect.discs.explanation.Candidate
         Accepted ones first, then in order of decreasing votes.
     place : str
         Description of the given pixel; empty without one.
