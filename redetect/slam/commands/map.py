@@ -70,8 +70,8 @@ def perform(command: Map) -> int:
         print(line)
     if final.joint_covariance is None:
         print(
-            f"more than {run_map.MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
-            "localize` assumes independent errors"
+            f"more than {run_map.MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that "
+            "`slam localize` assumes independent errors"
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
     write_bytes(output / files.MAP_PICTURE, drawn, overwrite=command.force)
