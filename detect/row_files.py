@@ -47,9 +47,8 @@ class FileHead:
         """The settings of discs."""
         known = {each.name for each in fields(CircleSettings)}
         try:
-            words = {name: word for name, word in self.settings if name in known}
-            values = {name: word_value(CircleSettings, name, word) for name, word in words.items()}
-            return CircleSettings(**values)
+            words = [(name, word) for name, word in self.settings if name in known]
+            return CircleSettings(**{n: word_value(CircleSettings, n, word) for n, word in words})
         except DetectError as error:
             raise DetectError(f"{self.name}: {error}") from None
 

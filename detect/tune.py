@@ -25,6 +25,7 @@ from detect.options import Tune
 from detect.report.figures import DATA, MARK
 from detect.row_files import read_head
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
+from detect.runs.stream import with_first_look
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
 from detect.seen import Sight
 from detect.settings import CircleSettings
@@ -178,10 +179,16 @@ def tune_run(
     `on_progress` is called after every frame of every setting. Yields the comparison of each, and
     why frames could not be processed: these count as frames without detections.
     """
-    plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame in frames]
-    work = (task._replace(plan=plan) for plan in plans for task in tasks)
     with closing(WorkerPool(workers)) as pool:
+        unknown = replace(settings[0], tilt_sigma_deg=None)
+        seen = with_first_look(run, FramePlan(run.camera, circles=unknown), pool)
+        assert seen.circles is not None
+        usual, given = seen.circles.tilt_sigma_deg, [each.tilt_sigma_deg for each in settings]
+        sigmas = [usual if sigma_deg is None else sigma_deg for sigma_deg in given]
+        circles = [replace(s, tilt_sigma_deg=sigma) for s, sigma in zip(settings, sigmas)]
+        plans = [replace(seen, circles=each) for each in circles]
+        work = (task._replace(plan=plan) for plan in plans for task in tasks)
         done = chain.from_iterable(pool.detect_chunks(work, plans[0]))
         for _ in plans:
             found: list[Frame] = []

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from camera.calibration.images import quiet_opencv
-from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of, processed
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.row_files import RunRows, open_rows
@@ -51,23 +51,25 @@ def perform(options: Draw) -> int:
         demand_pictures(run.frames, options.output, overwrite=options.force)
     force, path = options.force, options.video
     with nullcontext() if path is None else mp4(path, options.fps, overwrite=force) as video:
-        drawn, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
+        drawn, blank, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:
-            print(f"{where}: {counted(drawn, 'picture')} of {', '.join(rows.detected)}")
+            some = f"; {counted(blank, 'frame')} without rows" if blank else ""
+            print(f"{where}: {counted(drawn, 'picture')} of {', '.join(rows.detected)}{some}")
     return report_failures(len(failures), failures)
 
 
 def draw_run(
     run: ImageRun, rows: RunRows, folder: Path | None, plan: FramePlan | None = None,
     *, video: Video | None = None, overwrite: bool,
-) -> tuple[int, list[str]]:  # fmt: skip
+) -> tuple[int, int, list[str]]:  # fmt: skip
     """Draw rows into the images of a run, to PNG files in a folder, and to a video.
 
     With the plan of their detection, verticals are drawn as tracks, and markers with the rejected
-    candidates. Returns the number of pictures, and the reasons why frames have none.
+    candidates. Returns the numbers of pictures, and of those without rows, and the reasons why
+    frames have none.
     """
-    drawn, failures = 0, list[str]()
+    drawn, blank, failures = 0, 0, list[str]()
     sight = rows.sight(run.camera) if isinstance(run, Run) else None
     with progress_bar("pictures", run.frames.expected) as advance:
         for frame in run.frames:
@@ -78,16 +80,17 @@ def draw_run(
             else:
                 prefix = frame.step.prefix
                 name = picture_name(prefix)
-                picture = draw_rows(image, sight, rows.of(prefix), rows.circle_settings, name)
+                seen = rows.of(prefix)
+                picture = draw_rows(image, sight, seen, rows.circle_settings, name)
                 if plan is not None:
                     picture = _with_rejected(picture, image, frame, plan)
                 if folder is not None:
                     write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
                 if video is not None:
                     video(picture)
-                drawn += 1
+                drawn, blank = drawn + 1, blank + (not processed(seen))
             advance()
-    return drawn, failures
+    return drawn, blank, failures
 
 
 def _with_rejected(

@@ -162,6 +162,14 @@ def test_rows_are_drawn_without_detecting_again(small_run: Path, tmp_path: Path)
     assert (again / "s.0001.png").read_bytes() == (tmp_path / "d" / "s.0001.png").read_bytes()
 
 
+def test_pictures_without_rows_are_counted(
+    small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    assert main(["circles", str(small_run), "--frames", "1"]) == 0
+    assert main(["draw", str(small_run), "-o", str(tmp_path / "d")]) == 0
+    assert "d: 3 pictures of circles; 2 frames without rows" in capsys.readouterr().out
+
+
 def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
     assert main(["circles", str(small_run), "--outer-ring", "1.5"]) == 0
     head = read_head(small_run / "detected.circles")

@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera import read_camera, write_camera
 from detect.cli import main
 from detect.errors import DetectError
+from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.tune import combinations, curve_picture, knee, marked, parameter_values, pareto_front
 from tests.detect.commands import Captured, assert_refused
@@ -170,6 +172,22 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert main([*arguments, "-o", str(folder), "--force"]) == 0
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+@pytest.mark.long
+def test_covariances_have_the_usual_tilt_of_the_run(project_root: Path, tmp_path: Path) -> None:
+    """As those of `detect circles`, which examines some images for it."""
+    run, rows, compared = project_root / "images" / "e", tmp_path / "c.circles", tmp_path / "c.json"
+    leaning = leaning_camera(read_camera(run / "e.cam"), (0.01, 0.0))
+    write_camera(leaning, tmp_path / "leaning.cam")
+    some = [str(run), "--camera", str(tmp_path / "leaning.cam")]
+    trials = ["tune", *some, "--frames", "20", "--vary", "evidence=-0.1"]
+    assert main([*trials, "-o", str(tmp_path / "t")]) == 0
+    (trial,) = json.loads((tmp_path / "t" / "table.json").read_text())["trials"]
+    assert main(["circles", *some, "--frames", "20", "-o", str(rows)]) == 0
+    assert main(["compare", *some, "--detected", str(rows), "--json", str(compared)]) == 0
+    expected = json.loads(compared.read_text())["normalised_error"]["per_dof"]
+    assert trial["normalised_error"] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.long
