@@ -107,7 +107,8 @@ class MovementProblem:
     # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
     # one, else 0.
     controls: FloatArray
-    # (N, 2): additional distance (m) and turn (rad) that are possible in pauses of odometry
+    # (N, 4): additional distance (m) and turn (rad) that are possible in pauses of odometry; and
+    # variances of where the robot is (m^2, rad^2) if it is measured within a pause
     unseen: FloatArray
     measured: MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
@@ -280,11 +281,11 @@ class MovementProblem:
         along, across, by_turn, by_way = np.square(noise)
         way, turn = np.hypot(self.controls[:, 0], self.controls[:, 1]), np.abs(self.controls[:, 2])
         passed = np.concatenate([[0.0], np.diff(self.times_s)])
-        hidden_way, hidden_turn = self.unseen.T
+        hidden_way, hidden_turn, anywhere, any_turn = self.unseen.T
         bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_way)
         hidden = by_turn * hidden_turn + by_way * hidden_way + bend
-        aside = hidden * hidden_way**2 / 12.0 + CREEP_M2_PER_S * passed
-        rest = by_turn * turn + by_way * way + hidden + CREEP_RAD2_PER_S * passed
+        aside = hidden * hidden_way**2 / 12.0 + anywhere + CREEP_M2_PER_S * passed
+        rest = by_turn * turn + by_way * way + hidden + any_turn + CREEP_RAD2_PER_S * passed
         way = way + hidden_way
         return np.column_stack([along * way + aside, across * way + aside, rest])
 
