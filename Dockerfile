@@ -9,7 +9,7 @@ COPY camera camera
 COPY detect detect
 COPY lut lut
 COPY redetect redetect
-RUN pip install --no-cache-dir '.[bags,parquet]'
+RUN pip install --no-cache-dir '.[bags,dxf,parquet]'
 
 # Kernels are compiled once, when the image is built; compiled ones and tables stay in the image.
 ENV NUMBA_CACHE_DIR=/var/cache/redetect/kernels REDETECT_CACHE=/var/cache/redetect/tables

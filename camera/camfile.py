@@ -9,6 +9,7 @@ such terms, and ``covariance: { ... }``, the lower triangle of the parameters' c
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from itertools import pairwise
@@ -31,6 +32,8 @@ _TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
 _LINE_END = re.compile(r"\r\n|\r|\n")
 # Python's float also reads "1_000", "infinity" and digits of other scripts.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+_LENS = {"scale_x": "scaleX", "scale_y": "scaleY", "offset_x": "offsetX", "offset_y": "offsetY"}
 
 # A key's value: its tokens, each with its line.
 _Entries = dict[str, list[tuple[str, int]]]
@@ -94,17 +97,10 @@ def parse_camera(text: str, name: str = "<text>") -> Camera:
             raise CameraError(f"{name}:{line}: {key} is {value}: expected a whole number")
         return int(value)
 
-    def number(key: str) -> float:
-        return numbers(key, 1)[0]
-
     fields: dict[str, Any] = {
         "robot_from_camera": np.reshape(numbers("sensor2World", 12), (3, 4)),
-        "width": whole("width"),
-        "height": whole("height"),
-        "scale_x": number("scaleX"),
-        "scale_y": number("scaleY"),
-        "offset_x": number("offsetX"),
-        "offset_y": number("offsetY"),
+        **{key: whole(key) for key in ("width", "height")},
+        **{name: numbers(key, 1)[0] for name, key in _LENS.items()},
         "coef": numbers("coef", 5),
     }
     if "sensor2Tcp" in entries:
@@ -129,11 +125,8 @@ def format_camera(camera: Camera) -> str:
         lines += _pose_lines("sensor2Tcp", camera.sensor_to_tcp)
     lines += _pose_lines("sensor2World", camera.robot_from_camera)
     lines.append(f"mountIndex: {camera.mount_index}")
-    lines.append(
-        f"width: {camera.width} height: {camera.height} "
-        f"scaleX: {_shortest(camera.scale_x)} scaleY: {_shortest(camera.scale_y)} "
-        f"offsetX: {_shortest(camera.offset_x)} offsetY: {_shortest(camera.offset_y)}"
-    )
+    pinhole = " ".join(f"{key}: {_shortest(x)}" for key, x in zip(_LENS.values(), camera.pinhole))
+    lines.append(f"width: {camera.width} height: {camera.height} {pinhole}")
     for key in ("coef", "tangential", "polynomial"):
         terms = getattr(camera, key)
         if key == "coef" or any(terms):
@@ -197,13 +190,10 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
     for token, line in value:
         if token in "{}[]":
             continue
-        if not _NUMBER.fullmatch(token):
-            raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: expected a number")
+        if not _NUMBER.fullmatch(token) or math.isinf(float(token)):
+            expected = "expected a number that fits a double"
+            raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: {expected}")
         numbers.append(float(token))
-        if not abs(numbers[-1]) < float("inf"):
-            raise CameraError(
-                f"{name}:{line}: {key} has {excerpt(token)}: expected a number that fits a double"
-            )
     if len(numbers) != count:
         where = f":{value[0][1]}" if value else ""
         raise CameraError(f"{name}{where}: {key} has {len(numbers)} numbers: expected {count}")

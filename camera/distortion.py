@@ -188,43 +188,27 @@ def polynomial_of(brown: Brown) -> Polynomial:
     return brown[0], brown[1], brown[4]
 
 
-def brown_shift(xy: FloatArray, brown: Brown) -> FloatArray:
-    """Displacement of (..., 2) points by Brown's terms, in addition to the rational distortion."""
-    k1, k2, p1, p2, k3 = brown
-    q = np.array([p2, p1])
-    squared = np.sum(xy * xy, axis=-1)
-    shift = 2.0 * (xy @ q)[..., None] * xy + squared[..., None] * q
-    if any(polynomial_of(brown)):
-        shift = shift + (squared * (k1 + squared * (k2 + squared * k3)))[..., None] * xy
-    return np.asarray(shift)
-
-
-def brown_jacobian(xy: FloatArray, brown: Brown) -> FloatArray:
-    """(..., 2, 2) derivative of `brown_shift` by x, y."""
-    k1, k2, p1, p2, k3 = brown
-    q = np.array([p2, p1])
-    outer = xy[..., :, None] * q
-    along = (xy @ q)[..., None, None] * np.eye(2)
-    jacobian = 2.0 * (along + outer + outer.swapaxes(-1, -2))
-    if any(polynomial_of(brown)):
-        squared = np.sum(xy * xy, axis=-1)[..., None, None]
-        # d(x p)/dx = p + x dp/dx, and dp/dr is r times the slope below.
-        jacobian = jacobian + squared * (k1 + squared * (k2 + squared * k3)) * np.eye(2)
-        slope = 2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3))
-        jacobian = jacobian + slope * (xy[..., :, None] * xy[..., None, :])
-    return np.asarray(jacobian)
+def tangential_shift(xy: FloatArray, tangential: Tangential) -> FloatArray:
+    """Displacement of (..., 2) points by the tangential terms, in addition to the radial ones."""
+    q = np.array(tangential[::-1])
+    return np.asarray(2.0 * (xy @ q)[..., None] * xy + np.sum(xy * xy, axis=-1)[..., None] * q)
 
 
 def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
     """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
+    polynomial, q = polynomial_of(brown), np.array([brown[3], brown[2]])
     radius = np.hypot(xy[..., 0], xy[..., 1])
-    factor = radial_factor(radius, coef)
-    slope = radial_factor_derivative(radius, coef)
+    factor = radial_factor(radius, coef, polynomial)
+    slope = radial_factor_derivative(radius, coef, polynomial)
     # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
     unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
     outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
     jacobian = factor[..., None, None] * np.eye(2) + outer
-    return jacobian + brown_jacobian(xy, brown) if any(brown) else jacobian
+    if q.any():
+        outer = xy[..., :, None] * q
+        along = (xy @ q)[..., None, None] * np.eye(2)
+        jacobian += 2.0 * (along + outer + outer.swapaxes(-1, -2))
+    return np.asarray(jacobian)
 
 
 @lru_cache(maxsize=256)

@@ -8,8 +8,7 @@ from redetect.messages import OneLineError
 class CameraError(OneLineError, ValueError):
     """An impossible camera, or a calibration file that cannot be read.
 
-    The message names the file and line if there is one, the quantity, its value and what was
-    expected.
+    The message names file and line if there are any, the quantity, its value, what was expected.
     """
 
 

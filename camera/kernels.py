@@ -48,16 +48,6 @@ def published_camera_numbers(camera: Camera) -> FloatArray:
 
 
 @kernel()
-def brown_shift_point(
-    k1: float, k2: float, p1: float, p2: float, k3: float, x: float, y: float
-) -> tuple[float, float]:
-    """Displacement of a point by Brown's terms; all normalised."""
-    squared = x * x + y * y
-    along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
-    return along * x + squared * p2, along * y + squared * p1
-
-
-@kernel()
 def straightened_point(
     lens: FloatArray, x_seen: float, y_seen: float, x: float, y: float
 ) -> tuple[float, float]:
@@ -151,13 +141,6 @@ def straighten_points(
 
 
 @kernel()
-def has_brown(terms: FloatArray) -> bool:
-    """Whether any of k1, k2, p1, p2, k3 is not 0."""
-    k1, k2, p1, p2, k3 = terms[0], terms[1], terms[2], terms[3], terms[4]
-    return bool(k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0)
-
-
-@kernel()
 def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> tuple[float, float]:
     """Pixel (u, v) of a direction in the robot frame; both NaN where it is undefined."""
     z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
@@ -172,12 +155,12 @@ def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> t
         1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
     )
     u, v = numbers[0] * x * factor, numbers[1] * y * factor
-    if has_brown(numbers[22:27]):
-        x_shift, y_shift = brown_shift_point(
-            numbers[22], numbers[23], numbers[24], numbers[25], numbers[26], x, y
-        )
-        u += numbers[0] * x_shift
-        v += numbers[1] * y_shift
+    k1, k2, p1, p2, k3 = numbers[22], numbers[23], numbers[24], numbers[25], numbers[26]
+    if k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0:
+        squared = x * x + y * y
+        along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
+        u += numbers[0] * (along * x + squared * p2)
+        v += numbers[1] * (along * y + squared * p1)
     return u + numbers[2], v + numbers[3]
 
 

@@ -22,28 +22,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from camera.distortion import (
-    NO_POLYNOMIAL,
-    NOT_TANGENTIAL,
-    Brown,
-    Coef,
-    Polynomial,
-    Tangential,
-    brown_shift,
-    distorted_jacobian,
-    one_to_one_radius,
-    radial_factor,
-    straightened,
-    undistorted_radius,
-)
-from camera.model_checks import (
-    check_numbers,
-    check_one_to_one,
-    checked_covariance,
-    checked_pose,
-    checked_whole,
-    seen_share,
-)
+from camera import distortion
+from camera import model_checks as checks
+from camera.distortion import Brown, Coef, Polynomial, Tangential
 from redetect.array_types import FloatArray
 
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -106,26 +87,26 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    tangential: Tangential = NOT_TANGENTIAL
-    polynomial: Polynomial = NO_POLYNOMIAL
+    tangential: Tangential = distortion.NOT_TANGENTIAL
+    polynomial: Polynomial = distortion.NO_POLYNOMIAL
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "mount_index"):
-            object.__setattr__(self, name, checked_whole(name, getattr(self, name)))
+            object.__setattr__(self, name, checks.checked_whole(name, getattr(self, name)))
         object.__setattr__(self, "unknown", tuple((key, text) for key, text in self.unknown))
         for name in ("coef", "tangential", "polynomial"):
             object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
-        pose = checked_pose("sensor2World", self.robot_from_camera)
+        pose = checks.checked_pose("sensor2World", self.robot_from_camera)
         object.__setattr__(self, "robot_from_camera", pose)
         if self.sensor_to_tcp is not None:
-            pose = checked_pose("sensor2Tcp", self.sensor_to_tcp)
+            pose = checks.checked_pose("sensor2Tcp", self.sensor_to_tcp)
             object.__setattr__(self, "sensor_to_tcp", pose)
         if self.covariance is not None:
-            covariance = checked_covariance(self.covariance, PARAMETERS)
+            covariance = checks.checked_covariance(self.covariance, PARAMETERS)
             object.__setattr__(self, "covariance", covariance)
-        check_numbers(self)
-        check_one_to_one(self)
+        checks.check_numbers(self)
+        checks.check_one_to_one(self)
 
     def __hash__(self) -> int:
         # By a digest that is kept: tables are looked up by the camera, image by image.
@@ -164,12 +145,12 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return one_to_one_radius(self.coef, self.brown)
+        return distortion.one_to_one_radius(self.coef, self.brown)
 
     @cached_property
     def seen_share(self) -> float:
         """Share of the image that sees anything: less than 1 where the distortion folds in it."""
-        return seen_share(self)
+        return checks.seen_share(self)
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
@@ -218,14 +199,12 @@ class Camera:
 
         Both NaN past the distortion's fold.
         """
-        xy, radius = self._before_fold(normalised)
-        factor = radial_factor(radius, self.coef)
-        u = self.scale_x * xy[..., 0] * factor
-        v = self.scale_y * xy[..., 1] * factor
-        if any(self.brown):
-            shift = brown_shift(xy, self.brown)
-            u, v = u + self.scale_x * shift[..., 0], v + self.scale_y * shift[..., 1]
-        return np.stack([u + self.offset_x, v + self.offset_y], axis=-1)
+        (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        pixels = scale * xy * factor[..., None]
+        if self.decentred:
+            pixels = pixels + scale * distortion.tangential_shift(xy, self.tangential)
+        return np.asarray(pixels + self.pinhole[2:])
 
     def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """(..., 2) coordinates and their (...) radii, NaN past the fold."""
@@ -241,10 +220,11 @@ class Camera:
         """
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            return straightened(seen, self.coef, self.brown, self.r_max)
+            return distortion.straightened(seen, self.coef, self.brown, self.r_max)
         distorted = np.hypot(seen[..., 0], seen[..., 1])
-        radius = undistorted_radius(distorted, self.coef, self.polynomial)
-        return np.asarray(seen / radial_factor(radius, self.coef, self.polynomial)[..., None])
+        radius = distortion.undistorted_radius(distorted, self.coef, self.polynomial)
+        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        return np.asarray(seen / factor[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 3) points in the camera frame (m).
@@ -302,7 +282,7 @@ class Camera:
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
         xy, _ = self._before_fold(normalised)
-        jacobian = distorted_jacobian(xy, self.coef, self.brown)
+        jacobian = distortion.distorted_jacobian(xy, self.coef, self.brown)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:

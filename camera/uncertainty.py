@@ -54,8 +54,7 @@ def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> C
 def with_pose(camera: Camera, pose: FloatArray) -> Camera:
     """The camera at a (3, 4) pose `robot_from_camera`.
 
-    Its ``sensor2Tcp`` is kept, if it has one, since that belongs to the mount; otherwise it becomes
-    the identity.
+    A ``sensor2Tcp`` is kept, since that belongs to the mount; without one it is the identity.
     """
     rows = checked_pose("sensor2World", pose)
     return replace(camera, robot_from_camera=rows, sensor_to_tcp=camera.sensor_to_tcp or IDENTITY)
@@ -65,10 +64,8 @@ def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
     """Standard deviation of the projection of directions, apart from a rotation of the camera.
 
     A small rotation has the same effect as a shift of the principal point, and the pose absorbs it;
-    so the component equivalent to a rotation is removed, as in mrcal.
-
-    Returns the root of the trace of each pixel's covariance over the image, (37, 49) pixels, from
-    the (14, 14) covariance of the intrinsics.
+    so the component equivalent to a rotation is removed, as in mrcal. Returns the root of the trace
+    of covariances at (37, 49) pixels, from the intrinsics' (14, 14) covariance.
     """
     rays = camera.unproject(pixel_grid(camera.width, camera.height))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
@@ -121,8 +118,7 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
 def tilt_by_parameters(camera: Camera) -> FloatArray:
     """(2, 20) derivatives of pitch and roll, estimated from verticals all over the image.
 
-    With a wrong calibration, true verticals seem to lean; the tilt that makes them vertical is
-    fitted by least squares.
+    With a wrong calibration, verticals seem to lean: the tilt is fitted by least squares.
     """
     bearing, elevation = np.meshgrid(_BEARINGS, _ELEVATIONS, indexing="ij")
     ray = np.stack([np.sin(bearing), -np.cos(bearing), np.tan(elevation)], axis=-1)

@@ -22,7 +22,7 @@ from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import JUDGED, Judgement, judge
+from detect.discs.judgement import JUDGED, JudgedCandidates, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
@@ -173,7 +173,7 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 def judged_discs(
     scene: Scene, table: VoteTable, settings: CircleSettings
-) -> tuple[Judgement, FloatArray]:
+) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
     judgement = judged(scene, settings, candidates_of(scene, table, settings))
     log_odds = adjusted_log_odds(judgement, settings)
@@ -192,16 +192,18 @@ def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> H
 
 
 def judged(
-    scene: Scene, settings: CircleSettings, candidates: HoughCandidates,
+    scene: Scene,
+    settings: CircleSettings,
+    candidates: HoughCandidates,
     networks: Networks | None = None,
-) -> Judgement:  # fmt: skip
+) -> JudgedCandidates:
     """Classify candidates (`detect.discs.judgement`), by default with the trained networks."""
     weakest = settings.noise_floor * max(scene.noise, _LEAST_NOISE)
     step, networks = max(weakest, _LEAST_STEP), networks or trained_networks()
     return judge(scene.image, candidates, scene.radius, step, scene.camera_numbers, networks)
 
 
-def adjusted_log_odds(judgement: Judgement, settings: CircleSettings) -> FloatArray:
+def adjusted_log_odds(judgement: JudgedCandidates, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
     rims = np.flatnonzero(judgement.fate == JUDGED)
     step, log_odds = judgement.step[rims], judgement.log_odds[rims]

@@ -19,28 +19,10 @@ from typing import Any
 
 from tyro import MISSING
 
+from detect import options
 from detect.errors import DetectError
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.options import (
-    All,
-    Circles,
-    Compare,
-    CompareOptions,
-    Demo,
-    DetectorFlags,
-    DiscIdOptions,
-    Draw,
-    Explain,
-    Export,
-    Lines,
-    Markers,
-    Report,
-    RowFiles,
-    SourceOptions,
-    Tune,
-    View,
-)
 from detect.settings import PRESETS as CIRCLE_PRESETS
 from detect.settings import CircleSettings, MarkerSettings
 from detect.settings_files import SettingsFile, read_settings
@@ -51,19 +33,18 @@ from redetect.messages import is_quiet
 
 #: Flags that only `--help-all` shows.
 EXPERT: dict[type, frozenset[str]] = {
-    DetectorFlags: frozenset({"line_ends", "cluster", "strict"}),
-    SourceOptions: all_but(SourceOptions, "odometry", "times", "frames"),
-    DiscIdOptions: all_but(DiscIdOptions, "ids_from"),
+    options.DetectorFlags: frozenset({"line_ends", "cluster", "strict"}),
+    options.SourceOptions: all_but(options.SourceOptions, "odometry", "times", "frames"),
+    options.DiscIdOptions: all_but(options.DiscIdOptions, "ids_from"),
     CircleSettings: all_but(
         CircleSettings, "radius_m", "polarity", "evidence",
         "calibration_px", "tilt_sigma_deg",
     ),
     LineSettings: all_but(LineSettings, "threshold", "join_px"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
-    RowFiles: all_but(RowFiles, "rows", "reference"),
-    CompareOptions: all_but(CompareOptions, "only_identified"),
+    options.RowFiles: all_but(options.RowFiles, "rows", "reference"),
+    options.CompareOptions: all_but(options.CompareOptions, "only_identified"),
 }  # fmt: skip
-
 
 _QUALITY, _RESPONSE = "--quality-threshold", "--response-threshold"
 #: Former spellings of flags by command. In `detect all`, flags had the detector's name in front.
@@ -105,11 +86,11 @@ class DetectProgram(Program):
                 raise DetectError("--preset and --settings: expected one of them")
             values = read_settings(Path(file))
         known = (
-            Circles(run=MISSING, detector=values.circles),
-            Lines(run=MISSING, detector=values.lines),
-            Markers(run=MISSING, detector=values.markers),
-            All(run=MISSING, circles=values.circles, lines=values.lines),
-            Explain(image=MISSING, detector=values.circles),
+            options.Circles(run=MISSING, detector=values.circles),
+            options.Lines(run=MISSING, detector=values.lines),
+            options.Markers(run=MISSING, detector=values.markers),
+            options.All(run=MISSING, circles=values.circles, lines=values.lines),
+            options.Explain(image=MISSING, detector=values.circles),
         )
         return super().parsed(arguments, (*known, *defaults))
 
@@ -126,15 +107,17 @@ PROGRAM = DetectProgram(
     "detect",
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
-        **dict.fromkeys((Circles, Lines, Markers, All), "detect.runs.command"),
-        Compare: "detect.comparison.report",
-        Export: "detect.export",
-        Draw: "detect.drawing.command",
-        View: "detect.view_command",
-        Report: "detect.report.page",
-        Tune: "detect.tune",
-        Explain: "detect.explain_command",
-        Demo: "detect.demo_command",
+        **dict.fromkeys(
+            (options.Circles, options.Lines, options.Markers, options.All), "detect.runs.command"
+        ),
+        options.Compare: "detect.comparison.report",
+        options.Export: "detect.export",
+        options.Draw: "detect.drawing.command",
+        options.View: "detect.view_command",
+        options.Report: "detect.report.page",
+        options.Tune: "detect.tune",
+        options.Explain: "detect.explain_command",
+        options.Demo: "detect.demo_command",
     },
     EXPERT,
 )

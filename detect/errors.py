@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 from redetect.messages import OneLineError
 
 #: Exit code if some frames could not be processed; the others were.
@@ -24,17 +21,6 @@ class FrameError(OneLineError, ValueError):
 
 class WorkerError(OneLineError, RuntimeError):
     """Worker processes or machines are missing or failed; the message states what is missing."""
-
-
-@contextmanager
-def imported_for(
-    use: str, extra: str, otherwise: str = "", error: type[Exception] = DetectError
-) -> Iterator[None]:
-    """Import a package of an extra in a block; if missing, the error states how to install it."""
-    try:
-        yield
-    except ImportError:
-        raise error(f"{use}: install it by pip install 'redetect[{extra}]'{otherwise}") from None
 
 
 class CompareError(OneLineError, ValueError):

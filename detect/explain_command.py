@@ -6,8 +6,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from camera import Camera, camera_in, read_camera
-from detect.discs.unfound import DiscExplanation, explain_discs
+from camera import camera_in, read_camera
+from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, png_of
 from detect.errors import DetectError
 from detect.options import Explain
@@ -26,7 +26,14 @@ def perform(command: Explain) -> int:
             demand_place(path, overwrite=command.force)
     if not command.image.is_file():
         raise DetectError(f"{command.image}: no such image: expected one image of a run")
-    camera = _camera(command)
+    folders = command.image.absolute().parents[:2]
+    beside = next(filter(None, map(camera_in, folders)), None)
+    camera = beside if command.camera is None else read_camera(command.camera)
+    if camera is None:
+        raise DetectError(
+            f"{command.image}: no calibration: expected a .cam file in its folder or the one "
+            "above, or one named by --camera"
+        )
     image = read_image(RunFrame(still("image"), command.image), camera)
     found = explain_discs(image, camera, command.detector, command.at)
     _print(found)
@@ -36,19 +43,6 @@ def perform(command: Explain) -> int:
     if command.json is not None:
         write_bytes(command.json, f"{found.to_json()}\n".encode(), overwrite=command.force)
     return 0
-
-
-def _camera(command: Explain) -> Camera:
-    if command.camera is not None:
-        return read_camera(command.camera)
-    for folder in command.image.absolute().parents[:2]:
-        camera = camera_in(folder)
-        if camera is not None:
-            return camera
-    raise DetectError(
-        f"{command.image}: no calibration: expected a .cam file in its folder or the one above, or "
-        "one named by --camera"
-    )
 
 
 def _print(found: DiscExplanation) -> None:

@@ -19,13 +19,14 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from detect.errors import DetectError, imported_for
+from detect.errors import DetectError
 from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
 from redetect.landmarks.times import read_times
+from redetect.messages import imported_for
 from redetect.storage import demand_place, write_whole
 
 if TYPE_CHECKING:
@@ -91,15 +92,11 @@ def perform(command: Export) -> int:
 
 
 def _times(command: Export) -> dict[str, float] | None:
-    if command.times is not None:
-        return read_times(command.times)
-    if command.rate_hz is not None:
-        return None
-    for name in (f"{command.file.name}.times", f"{command.file.stem}.times"):
-        beside = command.file.with_name(name)
-        if beside.is_file():
-            return read_times(beside)
-    return None
+    names = command.file.name, command.file.stem
+    beside = [command.file.with_name(f"{name}.times") for name in names]
+    found = [] if command.rate_hz is not None else [path for path in beside if path.is_file()]
+    path = command.times or next(iter(found), None)
+    return None if path is None else read_times(path)
 
 
 def read_tables(
@@ -149,7 +146,7 @@ def write_csv(stream: BinaryIO, table: TableName, rows: Sequence[Row]) -> None:
 
 def required_pyarrow() -> Any:
     """The package; a DetectError if it is not installed."""
-    with imported_for("Parquet is written by the package pyarrow", "parquet", _OR_CSV):
+    with imported_for("Parquet is written by the package pyarrow", "parquet", DetectError, _OR_CSV):
         import pyarrow.parquet  # type: ignore[import-untyped]
     return pyarrow
 
@@ -181,7 +178,7 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
 
 def write_mcap(stream: BinaryIO, tables: Mapping[TableName, Sequence[Row]], source: str) -> int:
     """Write the messages of each frame, at its time; returns their number."""
-    with imported_for("MCAP is written by the package rosbags", "bags", _OR_CSV):
+    with imported_for("MCAP is written by the package rosbags", "bags", DetectError, _OR_CSV):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     store = get_typestore(Stores.ROS2_HUMBLE)

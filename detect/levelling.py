@@ -100,9 +100,8 @@ def common_covariance(
 ) -> FloatArray:
     """(N, 2, 2) covariances (m^2) of positions on the floor (N, 2) due to the calibration's errors.
 
-    `unstated_px` is the standard deviation of pixels of a camera without a covariance;
-    `by_verticals`, for each position (N,) or all of them, whether it is levelled by verticals of
-    the same camera.
+    `unstated_px` is the error of a camera without a covariance; `by_verticals`, for each (N,) or
+    all, whether positions are levelled by verticals of the same camera.
     """
     nothing = np.zeros((len(floor_xy), 2, 2))
     covariance = covariance_of(camera)

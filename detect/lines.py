@@ -26,7 +26,7 @@ from detect.grey_values import plain_image
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals.blur import median_sharpness, widened, width_for
 from detect.verticals.joining import Lines, lines_of_tracks
-from detect.verticals.judgement import FATES, Judgement, fit_and_judge
+from detect.verticals.judgement import FATES, JudgedTracks, fit_and_judge
 from detect.verticals.refinement import StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
@@ -49,7 +49,7 @@ class LineDetections(ByContent):
 
     lines: Lines  # the leftmost is the first, here and elsewhere
     tracks: LineTracks
-    judged: Judgement  # lines through all tracks, and their fates
+    judged: JudgedTracks  # lines through all tracks, and their fates
 
     def __len__(self) -> int:
         return len(self.lines.alpha_rad)

@@ -1,7 +1,5 @@
 """``camera level``: a camera's mounting from a run: its constant lean, and its height.
 
-The command is one of the program `camera`; it is implemented here because it needs detection.
-
 The lean is estimated from the verticals of all frames (`detect.run_tilt`), the height from the
 outlines of discs of known size: with a wrong height, their pitch differs from that of the verticals
 (`detect.discs.outline_tilt`). Both assume that the lens is calibrated correctly.
@@ -132,9 +130,8 @@ def mounting_of_run(
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    `height_m` is the calibrated height of the camera, `verticals` are the tilts of N frames, and
-    `outline_pitch_rad` (N, 3) the pitch from the outlines of discs, with the height changed by each
-    of `HEIGHT_STEPS`; NaN without outlines.
+    From the calibrated height of the camera, the tilts of N frames, and the pitch (N, 3) from the
+    outlines of discs with the height changed by each of `HEIGHT_STEPS`; NaN without outlines.
     """
     run = tilt_of_run(verticals)
     if run is None:

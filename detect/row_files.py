@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 
@@ -60,12 +61,9 @@ def read_head(path: Path) -> FileHead:
             start = stream.read(_LONGEST_BYTES)
     except OSError as error:
         raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
-    comments: list[str] = []
-    for line in start.decode("utf-8", "replace").splitlines():
-        text = line.strip()
-        if text and not text.startswith("#"):
-            break
-        comments.append(text.removeprefix("#").strip())
+    lines = map(str.strip, start.decode("utf-8", "replace").splitlines())
+    head = takewhile(lambda line: not line or line.startswith("#"), lines)
+    comments = [line.removeprefix("#").strip() for line in head]
     settings = tuple(
         (name, value)
         for text in comments

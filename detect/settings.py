@@ -149,7 +149,6 @@ REPORT = CircleSettings(
 
 PRESETS = {"default": CircleSettings(), "published": PUBLISHED, "report": REPORT}
 
-
 _LEAST_WIDTH = Bounds("4 or more", lambda x: 4.0 <= x < math.inf)
 _AREA_FACTOR = Bounds("above 1", lambda x: 1.0 < x < math.inf)
 

@@ -10,14 +10,16 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
+from redetect.bounds import expectation
 from redetect.messages import excerpt
+from redetect.storage.bounded import read_text
 
 _LONGEST_BYTES = 1 << 24
 Settings = TypeVar("Settings", CircleSettings, LineSettings, MarkerSettings)
@@ -40,11 +42,9 @@ def read_settings(path: Path) -> SettingsFile:
     DetectError
         If it cannot be read, has no settings, or an unknown or invalid one.
     """
+    text = read_text(path, _LONGEST_BYTES, "settings file", DetectError)
     try:
-        with path.open("rb") as stream:
-            document = json.loads(stream.read(_LONGEST_BYTES))
-    except OSError as error:
-        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
+        document = json.loads(text)
     except (ValueError, RecursionError):  # the latter if it is nested very deeply
         raise DetectError(f"{path}: not JSON: expected settings, as in a .log.json") from None
     given = document.get("settings") if isinstance(document, dict) else None
@@ -72,7 +72,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
 
     Raises DetectError if there is no such field, or the value has another type.
     """
-    hints = get_type_hints(kind)
+    hints = {each.name: get_type_hints(kind)[each.name] for each in fields(kind)}
     if name not in hints:
         raise DetectError(
             f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"
@@ -80,14 +80,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     try:
         return _of_type(hints[name], value)
     except (TypeError, OverflowError):
-        kinds: dict[Any, str] = {
-            bool: "True or False", int: "a whole number", float: "a number",
-            float | None: "a number or none",
-        }  # fmt: skip
-        words = ", ".join(map(str, get_args(hints[name])))
-        expected = kinds.get(hints[name], f"one of {words}")
-        if get_origin(hints[name]) is tuple:
-            expected = "a list of numbers, or of pairs of them"
+        expected = expectation(hints[name])
         raise DetectError(f"{name} is {excerpt(value)}: expected {expected}") from None
 
 

@@ -37,10 +37,8 @@ def say_compiling() -> None:
 def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
     """Call a function before this process compiles a kernel; the result of this ends that.
 
-    If the function raises, the kernel is not compiled.
-
-    The compiler creates many objects and keeps most of them. Garbage collection is off meanwhile,
-    since it would take a tenth of the time.
+    If it raises, the kernel is not compiled. Garbage collection is off meanwhile: the compiler
+    keeps most of the many objects that it creates, and it would take a tenth of the time.
     """
     from numba.core import event
 

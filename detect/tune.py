@@ -66,8 +66,10 @@ def perform(options: Tune) -> int:
     output = run.output("tune") if options.output is None else options.output
     frames = SomeFrames(run.frames, every=options.every)
     if options.serve:
-        from detect.tuning_page import TuningSession, serve  # nothing else needs a server
+        # Nothing else needs a server.
+        from detect.tuning_page import LABELS_NAME, SETTINGS_NAME, TuningSession, serve
 
+        demand_free([output / SETTINGS_NAME, output / LABELS_NAME], overwrite=options.force)
         return serve(TuningSession(run, list(frames), base, output, options.force), options.port)
 
     names = "table.json", "curve.png"
@@ -128,10 +130,9 @@ def _with_reference(frames: Iterable[RunFrame], path: Path) -> list[tuple[RunFra
 
 
 def parameter_values(name: str, text: str) -> tuple[Any, ...]:
-    """The values of a parameter to try, each once.
+    """The values of a parameter to try, each once; errors as those of `word_value`.
 
-    `text` is FROM:TO:STEP, both ends included, or comma-separated values; errors as those of
-    `word_value`.
+    `text` is FROM:TO:STEP, both ends included, or comma-separated values.
     """
     words = text.split(",")
     if ":" in text:
@@ -172,11 +173,10 @@ def tune_run(
     workers: Workers,
     on_progress: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[DiscComparison, list[str]]]:
-    """Detect discs in frames of a run with each setting, and compare them.
+    """Detect discs in frames of a run with each setting, and compare them with the reference.
 
-    `compare` compares their rows with the reference; `on_progress` is called after every frame of
-    every setting. Yields the comparison of each setting, and why frames could not be processed:
-    these count as frames without detections.
+    `on_progress` is called after every frame of every setting. Yields the comparison of each, and
+    why frames could not be processed: these count as frames without detections.
     """
     plans = [FramePlan(run.camera, circles=each) for each in settings]
     tasks = [FrameTask(frame) for frame in frames]

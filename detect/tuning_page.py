@@ -12,6 +12,7 @@ import hmac
 import json
 import math
 import secrets
+import sys
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,7 +24,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
-from detect.discs.unfound import explain_discs
+from detect.discs.explanation import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
 from detect.runs.frame import detect_batch
@@ -37,7 +38,7 @@ from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
 from redetect.messages import OneLineError
 from redetect.plane import ellipses
-from redetect.storage import OutputExistsError, write_bytes
+from redetect.storage import demand_free, write_bytes
 
 SETTINGS_NAME, LABELS_NAME = "tuned.json", "labels.circles"
 #: Longest request: some hundred settings, and labels of every frame.
@@ -56,7 +57,9 @@ class TuningSession:
     settings: CircleSettings  # that the page begins with
     output: Path  # the folder that settings and labels are saved in
     force: bool = False  #: Replace files that were there before the session.
-    _saved: set[Path] = field(default_factory=set)
+    #: Labels last saved, by number of the frame: a page that is loaded again begins with them.
+    labels: Mapping[str, Any] = field(default_factory=dict)
+    _saved: set[str] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,7 @@ class TuningSession:
             "name": self.run.name,
             "frames": [frame.step.prefix for frame in self.frames],
             "settings": asdict(self.settings),
+            "labels": self.labels,
             "width": camera.width,
             "height": camera.height,
             # Pixels need not be square: single fields of interlaced frames are half as high.
@@ -117,20 +121,20 @@ class TuningSession:
         settings = checked_settings("circles", values, CircleSettings)
         contents = {SETTINGS_NAME: settings_text(circles=settings).encode()}
         labelled = {int(number): [_label(one) for one in some] for number, some in labels.items()}
-        if any(labelled.values()):
+        if any(labelled.values()) or any(self.labels.values()):
             contents[LABELS_NAME] = format_head(_LABELS_HEAD) + b"".join(
                 format_frame(Frame(frame.step, tuple(labelled.get(number, ()))))
                 for number, frame in enumerate(self.frames)
             )
         with self._lock:
             self.output.mkdir(parents=True, exist_ok=True)
+            # Files written by the page itself may be replaced any time.
+            others = [self.output / name for name in contents if name not in self._saved]
+            demand_free(others, overwrite=self.force)
             for name, content in contents.items():
-                path = self.output / name
-                # Files written by the page itself may be replaced any time.
-                if path.exists() and path not in self._saved and not self.force:
-                    raise OutputExistsError(path)
-                write_bytes(path, content, overwrite=True)
-                self._saved.add(path)
+                write_bytes(self.output / name, content, overwrite=True)
+            self._saved.update(contents)
+            self.settings, self.labels = settings, labels
         return [str(self.output / name) for name in contents]
 
 
@@ -153,6 +157,11 @@ class TuningServer(ThreadingHTTPServer):
     def __init__(self, session: TuningSession, port: int = 0) -> None:
         self.session, self.token = session, secrets.token_urlsafe(24)
         super().__init__(("127.0.0.1", port), _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Keep off the terminal that a browser no longer waits for an answer."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
 
     @property
     def address(self) -> str:
@@ -196,8 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._try(lambda: ("application/json", json.dumps(self._carried_out(body)).encode()))
 
     def _carried_out(self, body: bytes) -> dict[str, Any]:
-        request = json.loads(body)
-        session = self.server.session
+        request, session = json.loads(body), self.server.session
         if self.path == "/detect":
             return session.detect(self._number(request["frame"]), request["settings"])
         if self.path == "/save":
@@ -205,11 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
         raise DetectError("no such request")
 
     def _number(self, word: Any) -> int:
-        number = int(word)
-        if not 0 <= number < len(self.server.session.frames):
-            raise DetectError(
-                f"no frame {number}: expected 0 to {len(self.server.session.frames) - 1}"
-            )
+        number, count = int(word), len(self.server.session.frames)
+        if not 0 <= number < count:
+            raise DetectError(f"no frame {number}: expected 0 to {count - 1}")
         return number
 
     def _allowed(self, token: str) -> bool:

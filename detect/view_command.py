@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from detect.drawing.frame import draw_rows
-from detect.errors import DetectError, FrameError, imported_for
+from detect.errors import DetectError, FrameError
 from detect.options import View
 from detect.row_files import SeenRows, open_rows
 from detect.seen import circle_on_floor, summed_steps
@@ -22,6 +22,7 @@ from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, circle_arrays
 from redetect.landmarks.map_file import read_map, read_path
+from redetect.messages import imported_for
 from redetect.storage import demand_place, write_bytes
 
 _EDGE, _LINE, _MAP = (255, 170, 0), (60, 220, 60), (80, 140, 220)
@@ -32,7 +33,7 @@ _EARLIEST_DATE_S = 1e8
 def perform(options: View) -> int:
     """Execute the command; returns the exit code."""
     os.environ.setdefault("RERUN_ANALYTICS_DISABLED", "1")
-    with imported_for("detect view needs the package rerun-sdk", "view"):
+    with imported_for("detect view needs the package rerun-sdk", "view", DetectError):
         import rerun as rr
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
@@ -73,12 +74,16 @@ def perform(options: View) -> int:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
+                    recording.log("camera/image", rr.Clear(recursive=False))
                 else:
                     picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
                     coloured = np.ascontiguousarray(picture[:, :, ::-1])
                     recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()
-        recording.flush()
+        try:
+            recording.flush()
+        except RuntimeError as error:
+            raise DetectError(f"{options.output or 'the viewer'}: {error}") from None
         recording.disconnect()
         if options.output is not None:
             write_bytes(options.output, raw.read_bytes(), overwrite=options.force)
@@ -110,10 +115,10 @@ def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius
     # Forward is -Y.
     arrow = rr.Arrows3D(origins=[[0, 0, 0]], vectors=[[0, -0.5, 0]], colors=_LINE)
     recording.log("world/robot/forward", arrow)
-    if rows.circles is not None:
-        rings = circle_on_floor(circle_arrays(rows.circles.circles).xy, radius_m)
-        strips = list(np.pad(rings, ((0, 0), (0, 0), (0, 1))))
-        recording.log("world/robot/discs", rr.LineStrips3D(strips, colors=_EDGE))
+    # Without rows none, instead of those of the frame before.
+    discs = () if rows.circles is None else rows.circles.circles
+    rings = np.pad(circle_on_floor(circle_arrays(discs).xy, radius_m), ((0, 0), (0, 0), (0, 1)))
+    recording.log("world/robot/discs", rr.LineStrips3D(list(rings), colors=_EDGE))
     if rows.tilt is not None:
         recording.log("tilt/pitch_deg", rr.Scalars([float(np.degrees(rows.tilt.pitch))]))
         recording.log("tilt/roll_deg", rr.Scalars([float(np.degrees(rows.tilt.roll))]))

@@ -2,11 +2,9 @@
 
 A cached table is a file named by the hash of everything that determines its content. It begins with
 a hash of that name and of the bytes that follow, so that damage and renamed files are detected.
-Since that does not detect forgery by another user, only files and folders are used that belong to
-the user and that no one else can write to. Rejected tables are computed again, with a warning.
-
-Files appear whole or not at all, so any number of processes may share a cache. A cache that cannot
-be written to is not an error: the next run just computes again.
+Against forgery, only files and folders are used that belong to the user and that no one else can
+write to. Rejected tables are computed again, with a warning. Files appear whole or not at all, so
+processes may share a cache; one that cannot be written to is not an error.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Table of the curves of vertical lines in the image: the horizon and the verticals through it.
 
-A vertical plane through the camera's centre appears as one curve in the image. All points on it
-have the same bearing, so the curve is identified by the pixel at which it crosses the horizon: for
-each image column the table has the row of the horizon and the vertical through that point, as a
-column for each row, including distortion (DLR Spatial Cognition data set report, line detection).
-
-A camera that looks down so far that it does not see the horizon still sees verticals. Then a line
-of constant elevation near the image border replaces the horizon; both are called *anchor*.
+A vertical plane through the camera's centre appears as one curve, all points of which have the same
+bearing. It is identified by the pixel at which it crosses the horizon: the table has, for each
+image column, the row of the horizon and the vertical through that point, as a column for each row,
+including distortion (DLR Spatial Cognition data set report, line detection). For a camera that does
+not see the horizon, a line of constant elevation near the image border replaces it; both are called
+*anchor*.
 """
 
 from __future__ import annotations
@@ -114,9 +113,8 @@ def _anchor(camera: Camera, normalised: FloatArray) -> tuple[float, FloatArray]:
 def anchor_rows(camera: Camera, normalised: FloatArray, elevation_rad: float) -> FloatArray:
     """(W,) rows at which a line of constant elevation (0: the horizon) crosses each column.
 
-    `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN if the line does not cross the
-    column inside the image; of several crossings (for a camera with a large roll), the one nearest
-    to the image's middle row.
+    `normalised` is `camera.undistort` of all pixels (H, W, 2). NaN if it does not cross the column
+    inside the image; of several crossings, the nearest to the image's middle row.
     """
     height, width = camera.height, camera.width
     above = _above(camera, normalised, math.sin(elevation_rad))

@@ -2,9 +2,8 @@
 
     demand(self, DetectError, radius_m=ABOVE_0, samples=whole(3, 128))
 
-A dataclass with many settings annotates its fields instead: `Bounded`, or `demand_fields`.
-
-NaN is always rejected; infinity is rejected unless it means "no limit".
+A dataclass with many settings annotates its fields instead: `Bounded`, or `demand_fields`. NaN is
+always rejected; infinity is rejected unless it means "no limit".
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ from functools import cache
 from math import inf
 from numbers import Integral
 from pathlib import Path
+from types import NoneType
 from typing import Annotated, Any, ClassVar, Literal, Optional, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
@@ -27,6 +27,14 @@ MaybeInt = Annotated[Optional[int], arg(metavar="INT")]  # noqa: UP045
 MaybeFloat = Annotated[Optional[float], arg(metavar="FLOAT")]  # noqa: UP045
 MaybeStr = Annotated[Optional[str], arg(metavar="STR")]  # noqa: UP045
 MaybePixel = Annotated[Optional[tuple[float, float]], arg(metavar="U V")]  # noqa: UP045
+
+_IN_WORDS: dict[Any, str] = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    NoneType: "none",
+    Path: "a path",
+}
 
 
 @dataclass(frozen=True)
@@ -86,8 +94,7 @@ Share = Annotated[float, SHARE]
 def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> None:
     """Reject settings with a number out of its bounds, which are given by attribute name.
 
-    Each number of a tuple is checked, None is skipped. The error states the setting, its value and
-    what was expected.
+    Each number of a tuple, but None. The error states the setting, its value, what is allowed.
     """
     for name, allowed in bounds.items():
         value = getattr(settings, name)
@@ -110,6 +117,21 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
         if value is not None and not isinstance(value, str | tuple):
             number = round(value) if bounds.whole else float(value)
             object.__setattr__(settings, name, number)
+
+
+def expectation(hint: Any) -> str:
+    """Which values a setting or flag of some type may have, in words."""
+    marks = getattr(hint, "__metadata__", ())
+    for mark in marks:
+        if isinstance(mark, Bounds):
+            return mark.expected
+    hint = hint.__origin__ if marks else hint
+    kinds = get_args(hint)
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(map(str, kinds))}"
+    if get_origin(hint) is tuple:
+        return "a list of numbers, or of pairs of them" if ... in kinds else f"{len(kinds)} numbers"
+    return " or ".join(map(expectation, kinds)) or _IN_WORDS.get(hint, "a word")
 
 
 class Bounded:

@@ -26,7 +26,6 @@ PROGRAMS = {
 #: Commands of `detect` that are also commands of `redetect`.
 DIRECT = ("compare", "draw", "view", "report", "tune", "export", "explain", "demo")
 
-
 _QUIET = ("-q", "--quiet")
 
 _HEAD = (
@@ -53,7 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
     if name in DIRECT:
         name, rest = "detect", words
     if name not in PROGRAMS:
-        end_with(_unknown(name))
+        for other, module in PROGRAMS.items():
+            if name in import_module(module).PROGRAM.commands:
+                end_with(f"redetect: no command {name!r}: did you mean redetect {other} {name}?")
+        end_with(no_such("redetect: no command", name, (*PROGRAMS, *DIRECT)))
     program = import_module(PROGRAMS[name])
     if arguments is not None:
         return int(program.main(rest))
@@ -91,14 +93,6 @@ def _write_completion(words: list[str]) -> None:
     }
     direct = {name: programs["detect"].commands[name] for name in DIRECT}
     tyro.cli(choice({**below, **direct}), prog="redetect", args=words)
-
-
-def _unknown(name: str) -> str:
-    """The message for an unknown command."""
-    for program, module in PROGRAMS.items():
-        if name in import_module(module).PROGRAM.commands:
-            return f"redetect: no command {name!r}: did you mean redetect {program} {name}?"
-    return no_such("redetect: no command", name, (*PROGRAMS, *DIRECT))
 
 
 if __name__ == "__main__":

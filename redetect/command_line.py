@@ -7,28 +7,31 @@ command ends with its exit code and, in case of an error, one line on the termin
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import reduce
 from importlib import import_module
 from inspect import cleandoc
 from io import StringIO
+from itertools import takewhile
 from operator import or_
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any, NoReturn, cast, get_type_hints
 
 import tyro
-from tyro.conf import Suppress, arg, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, Suppress, arg, subcommand
 
 from redetect import __version__
+from redetect.bounds import expectation
 from redetect.interrupts import interrupts_noted, say_interrupted
-from redetect.messages import QUIET, OneLineError, no_such, one_line
+from redetect.messages import QUIET, OneLineError, excerpt, no_such, one_line
 
 #: The command failed.
 EXIT_ERROR = 1
@@ -155,9 +158,7 @@ class Program:
                 if path.exists():
                     sys.stdout.write(path.read_text("utf-8"))
             return code
-        if len(words) == len(arguments):
-            return self.carry_out(command)
-        with _quietly():
+        with nullcontext() if len(words) == len(arguments) else _quietly():
             return self.carry_out(command)
 
     def parsed(self, arguments: Sequence[str], defaults: Sequence[object] = ()) -> Any:
@@ -169,24 +170,20 @@ class Program:
         if words == ["--version"]:
             print(f"{self.name} {__version__}")
             raise SystemExit(0)
-        if words and not words[0].startswith("-") and words[0] not in self.commands:
-            end_with(no_such(f"{self.name}: no command", words[0], self.commands))
-        known: dict[type, Any] = {type(c): {"default": c} for c in defaults}
-        brief = self.expert and _HELP_ALL not in words and {"-h", "--help"} & set(words)
-        if brief:
-            known = {}
-        commands: Any = tuple(
-            Annotated[self._brief(kind) if brief else kind, subcommand(name, **known.get(kind, {}))]
-            for name, kind in self.commands.items()
-        )
-        choice: Any = reduce(or_, commands)
-        with _settings_rejected_on_one_line():
-            return tyro.cli(
-                Annotated[choice, arg(name="")],
-                prog=self.name,
-                description=f"{self.description}\n\n{FOR_ALL}",
-                args=["--help" if word == _HELP_ALL else word for word in words],
-            )
+        asked = {_HELP_ALL, "-h", "--help"} & {*words}
+        words = ["--help" if word == _HELP_ALL else word for word in words]
+        first = words[0] if words else ""
+        if first in ("-h", "--help") or first.startswith("--tyro-"):
+            kinds: Any = (Annotated[k, subcommand(name)] for name, k in self.commands.items())
+            choice: Any = Annotated[reduce(or_, kinds), arg(name="")]
+            text = f"{self.description}\n\n{FOR_ALL}"
+            return tyro.cli(choice, prog=self.name, description=text, args=words)
+        if first not in self.commands:
+            end_with(no_such(f"{self.name}: no command", first, self.commands))
+        kind = self.commands[first]
+        shown = self._brief(kind) if asked and _HELP_ALL not in asked else kind
+        known = {type(each): {"default": _with_values_of(each, shown)} for each in defaults}
+        return _parsed_as(shown, known.get(kind, {}), f"{self.name} {first}", words[1:])
 
     def carry_out(self, command: Any) -> int:
         """Execute a command; returns the exit code."""
@@ -195,11 +192,23 @@ class Program:
 
     def _brief(self, kind: type) -> type:
         """The dataclass of a command without its expert flags, for its help."""
-        short = _without(kind, self.expert)
+        short: type = _without(kind, self.expert)
         if short is not kind:
             text, section, parameters = cleandoc(kind.__doc__ or "").partition("\n\nParameters\n")
             short.__doc__ = f"{text}\n\nMore flags are shown by {_HELP_ALL}.{section}{parameters}"
         return short
+
+
+def _with_values_of(values: Any, kind: Any) -> Any:
+    """The values of a dataclass's instance in one of its subclasses without expert flags."""
+    if not issubclass(kind, type(values)) or kind is type(values):
+        return values
+    hints, own = (
+        get_type_hints(kind),
+        {each.name: getattr(values, each.name) for each in fields(kind)},
+    )
+    nested = {name: hints[name] for name, value in own.items() if is_dataclass(value)}
+    return kind(**own | {name: _with_values_of(own[name], inner) for name, inner in nested.items()})
 
 
 def all_but(kind: type, *names: str) -> frozenset[str]:
@@ -207,27 +216,68 @@ def all_but(kind: type, *names: str) -> frozenset[str]:
     return frozenset(each.name for each in fields(kind)) - {*names}
 
 
-def end_with(words: str) -> None:
+def end_with(words: str) -> NoReturn:
     """Exit because of a wrong command line, with a message."""
     print(f"error: {words}", file=sys.stderr)
     raise SystemExit(EXIT_WRONG_COMMAND_LINE)
 
 
-@contextmanager
-def _settings_rejected_on_one_line() -> Iterator[None]:
-    """Show only the message of settings that reject a value, without tyro's own words around it."""
-    shown = StringIO()
+def _parsed_as(kind: type, default: Any, name: str, words: list[str]) -> Any:
+    """Parse the flags of a command; an error is one line that states what was expected."""
+    flags, boxes = dict(_flags(kind)), StringIO()
     try:
-        with redirect_stderr(shown):
-            yield
-    except SystemExit as end:
+        with redirect_stderr(boxes):
+            command, unknown = tyro.cli(
+                kind, prog=name, args=words, return_unknown_args=True, **default
+            )
+    except (SystemExit, OneLineError) as end:
+        if isinstance(end, SystemExit) and not end.code:
+            raise
         cause: BaseException | None = end
         while cause is not None and not isinstance(cause, OneLineError):
             cause = cause.__context__
-        if cause is not None:
-            end_with(str(cause))
-        sys.stderr.write(shown.getvalue())
-        raise
+        if cause is None:
+            end_with(f"{name}: {_misunderstood(kind, words, boxes.getvalue())}")
+        setting = str(cause).partition(" is ")[0]
+        named = {name: flag for flag, (name, _) in flags.items()}.get(setting, setting)
+        end_with(str(cause).replace(setting, named, 1))
+    for word in unknown:
+        if word.startswith("-"):
+            known = [flag for flag in flags if flag.startswith("-")]
+            end_with(no_such(f"{name}: no flag", word.partition("=")[0], known))
+        end_with(f"{name}: {excerpt(word)}: one word too many: {name} --help lists the flags")
+    return command
+
+
+def _flags(kind: Any, prefix: str = "--") -> Iterator[tuple[str, tuple[str, Any]]]:
+    """The flags of a dataclass, positional ones as NAME; field name and type of each."""
+    hints = get_type_hints(kind, include_extras=True)
+    for name in [each.name for each in fields(kind)]:
+        marks = getattr(hints[name], "__metadata__", ())
+        inner = hints[name].__origin__ if marks else hints[name]
+        if is_dataclass(inner):
+            yield from _flags(inner, prefix if OmitArgPrefixes in marks else f"{prefix}{name}.")
+        else:
+            own = next((mark.name for mark in marks if getattr(mark, "name", None)), name)
+            flag = name.upper() if Positional in marks else f"{prefix}{own}".replace("_", "-")
+            yield flag, (name, hints[name])
+
+
+def _misunderstood(kind: type, words: Sequence[str], said: str) -> str:
+    """What is wrong with words that tyro rejects; it says more than fits on a line."""
+    flags = dict(_flags(kind))
+    given = [word.partition("=")[0] for word in words]
+    for flag in re.findall(r"--[a-z][\w.-]*", said):
+        if flag in flags and "Required options" not in said:
+            expected = expectation(flags[flag][1])
+            own = max((k for k, word in enumerate(given) if word == flag), default=len(words))
+            after = takewhile(lambda word: not word.startswith("--"), words[own + 1 :])
+            values = [word.partition("=")[2] for word in words[own : own + 1]] + [*after]
+            shown = [flag, *filter(None, values)][: None if "numbers" in expected else 2]
+            return f"{' '.join(shown)}: expected {expected}"
+    bare = {each.name for each in fields(kind) if each.default is each.default_factory}
+    lacking = [flag for flag, (name, _) in flags.items() if name in bare and flag not in given]
+    return f"expected {' '.join([each for each in lacking if each[0] == '-'] or lacking)}"
 
 
 @contextmanager
@@ -242,7 +292,7 @@ def _quietly() -> Iterator[None]:
         os.environ.pop(QUIET) if before is None else os.environ.update({QUIET: before})
 
 
-def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
+def _without(kind: Any, expert: Mapping[type, frozenset[str]]) -> Any:
     """A dataclass whose expert fields are not flags; itself if it has none."""
     hidden = frozenset[str]().union(*(expert.get(base, ()) for base in kind.__mro__))
     hints = get_type_hints(kind, include_extras=True)
@@ -251,10 +301,9 @@ def _without(kind: type, expert: Mapping[type, frozenset[str]]) -> type:
         hint, own = hints[each.name], cast(Any, copy(each))
         marks = getattr(hint, "__metadata__", ())
         inner = hint.__origin__ if marks else hint
-        nested = is_dataclass(inner)
         if each.name in hidden:
             hint = Annotated[hint, Suppress]
-        elif nested and (brief := _without(inner, expert)) is not inner:
+        elif is_dataclass(inner) and (brief := _without(inner, expert)) is not inner:
             own.default_factory = hint = brief
             for mark in marks:
                 hint = Annotated[hint, mark]

@@ -9,7 +9,8 @@ from __future__ import annotations
 import difflib
 import os
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 #: Environment variable that is set if only warnings and errors are to be shown.
 QUIET = "REDETECT_QUIET"
@@ -74,3 +75,14 @@ class OneLineError(Exception):
 
     def __init__(self, message: str = "") -> None:
         super().__init__(one_line(message))
+
+
+@contextmanager
+def imported_for(
+    use: str, extra: str, error: type[Exception], otherwise: str = ""
+) -> Iterator[None]:
+    """Import a package of an extra in a block; if missing, the error states how to install it."""
+    try:
+        yield
+    except ImportError:
+        raise error(f"{use}: install it by pip install 'redetect[{extra}]'{otherwise}") from None

@@ -106,3 +106,34 @@ def test_json_alone_on_standard_output(
     assert main(["detect", "compare", str(run), "--detected", shipped, "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["missed"] == 0
     assert not Path("-").exists()
+
+
+@pytest.mark.lowest
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("detect all images/e --radius-n 1", "no flag '--radius-n': did you mean --radius-m?"),
+        ("detect circles images/e --radius-m x", "--radius-m x: expected above 0"),
+        ("detect circles images/e --jobs=x", "--jobs x: expected a whole number or none"),
+        ("detect circles images/e --threshold 7", "--quality-threshold is 7: expected above 0"),
+        ("detect explain e.jpg --at 1", "--at 1: expected 2 numbers"),
+        ("slam map images/e --loss x", "--loss x: expected one of none, huber"),
+        ("slam map images/e --camera", "slam map: --camera: expected a path"),
+        ("slam export images/e -o x y z", "slam export: '"),
+        ("camera calibrate a --rows 6", "camera calibrate: expected --output --columns --square-m"),
+        ("groundtruth laser --robot x", "groundtruth laser: expected SESSION"),
+        ("detect draw", "detect draw: expected RUN"),
+        ("slam", "slam: no command '': one of associate, audit"),
+        ("slam --loss huber", "slam: no command '--loss': one of"),
+    ],
+)
+def test_a_wrong_word_is_named_on_one_line(
+    words: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert said in err
+    assert not out
+    assert err.count("\n") == 1

@@ -1,13 +1,9 @@
 """``camera board``: calibration boards, their dimensions in metres, and PDF pages at true scale.
 
 A board's frame: origin in the middle of its points, x right, y up, z out of the print, held so that
-
-- the square in a checkerboard's top left corner is black;
-- a ChArUco board's first marker is at the top left, as OpenCV prints it;
-- the first of a circle grid's points is at the top left.
-
-A board's points are in rows from the top left. The print is a list of black shapes in metres, in
-the same frame.
+a checkerboard's top left square is black, or a ChArUco board's first marker (as OpenCV prints it)
+or a circle grid's first point is at the top left. Points are in rows from there; the print is a
+list of black shapes in metres, in the same frame.
 """
 
 from __future__ import annotations
@@ -36,12 +32,7 @@ _LARGEST_SQUARE_M = 10.0
 _MOST_COUNTED = 1000
 # Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
 _NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
-_WHAT_IS_COUNTED: dict[str, str] = {
-    "checkerboard": "inner corners",
-    "charuco": "squares",
-    "circles": "circles",
-    "asymmetric-circles": "circles",
-}
+_COUNTED = {"checkerboard": "inner corners", "charuco": "squares"}  # else circles
 #: Left blank by printers, and for the line of text at the bottom (m).
 _MARGIN_M, _TEXT_M = 0.004, 0.012
 # Length of the printed ruler, and the least width of a page (m).
@@ -70,7 +61,7 @@ class Board:
     circle_m: float = 0.0
 
     def __post_init__(self) -> None:
-        counts, counted = (self.columns, self.rows), _WHAT_IS_COUNTED[self.kind]
+        counts, counted = (self.columns, self.rows), _COUNTED.get(self.kind, "circles")
         if min(counts) < 3 or max(counts) > _MOST_COUNTED:
             expected = "at least 3 x 3" if min(counts) < 3 else f"at most {_MOST_COUNTED} each way"
             raise CalibrationError(
@@ -121,7 +112,8 @@ class Board:
         return self.kind == "circles"
 
     def __str__(self) -> str:
-        return f"{self.kind} board of {self.columns} x {self.rows} {_WHAT_IS_COUNTED[self.kind]}"
+        counted = _COUNTED.get(self.kind, "circles")
+        return f"{self.kind} board of {self.columns} x {self.rows} {counted}"
 
 
 def board_of(flags: BoardFlags) -> Board:

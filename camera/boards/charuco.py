@@ -21,15 +21,12 @@ from redetect.array_types import FloatArray, GreyImage, IntArray
 # Greatest length of the strips along the edges, in squares and in pixels: the lens bends edges.
 _ALONG, _LONGEST_PX = 0.4, 16.0
 # Largest and smallest half-width of a strip (px).
-_WIDEST_PX = 3.0
-_NARROWEST_PX = 1.2
+_WIDEST_PX, _NARROWEST_PX = 3.0, 1.2
 # By blur and the width of the gradient filter, the marker's edge reaches this far into the margin.
 _REACH_PX = 1.5
 # Largest distance from the predicted position, in squares; correlation with the printed pattern.
-_FARTHEST = 0.25
-_LEAST_AGREEMENT = 0.85
-_ITERATIONS = 40
-_STILL_PX = 1e-4
+_FARTHEST, _LEAST_AGREEMENT = 0.25, 0.85
+_ITERATIONS, _STILL_PX = 40, 1e-4
 # Number of neighbours from which a missing corner is predicted.
 _NEIGHBOURS = 12
 # Fewest corners that determine a plane.
@@ -75,8 +72,7 @@ def both_heights(
 ) -> Iterator[tuple[GreyImage, Callable[[FloatArray], FloatArray]]]:
     """The image, and the image stretched to twice its height, each with its map of pixels back.
 
-    Half-height images flatten squares and circles. Their row v is at 2 v + 0.5 in the stretched
-    image.
+    Half-height images flatten squares and circles; their row v is at 2 v + 0.5 when stretched.
     """
     yield image, lambda pixels: pixels
     height, width = image.shape
@@ -97,30 +93,27 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     cv2.Scharr(grey, cv2.CV_64F, 1, 0, dst=gradient[0])
     cv2.Scharr(grey, cv2.CV_64F, 0, 1, dst=gradient[1])
     white = 0.5 * (1.0 - marker_share)
-    rough, result = grid, np.full(grid.shape, np.nan)
-    tried = np.zeros(grid.shape[:2], dtype=bool)
-    while True:
-        # First the given corners, then, ring by ring, the neighbours of those found.
-        known = rough if not tried.any() else result
+    known, result = grid, np.full(grid.shape, np.nan)
+    wanted, tried = np.isfinite(grid[..., 0]), np.zeros(grid.shape[:2], dtype=bool)
+    # First the given corners, then, ring by ring, the neighbours of those found.
+    while wanted.any():
         present = np.isfinite(known[..., 0])
-        wanted = present if not tried.any() else binary_dilation(present, np.ones((3, 3)))
-        wanted = wanted & ~tried
-        if not wanted.any() or present.sum() < _FEWEST_FOUND:
-            return result
         # (3, 3) from (column, row) to pixels, by all corners; None if they are on a line.
-        places = np.argwhere(present)[:, ::-1].astype(np.float64)
-        homography: FloatArray | None = cv2.findHomography(places, known[present])[0]  # type: ignore[assignment]
+        places, pixels = np.argwhere(present)[:, ::-1].astype(np.float64), known[present]
+        if len(places) < _FEWEST_FOUND:
+            break
+        homography: FloatArray | None = cv2.findHomography(places, pixels)[0]  # type: ignore[assignment]
         if homography is None:
-            return result
-        found = result.copy()
+            break
         for row, column in np.argwhere(wanted):
-            tried[row, column] = True
-            at, axes = _expected(homography, places, known[present], np.array([column, row], float))
-            if np.isfinite(known[row, column, 0]):
+            at, axes = _expected(homography, places, pixels, np.array([column, row], float))
+            if present[row, column]:
                 at = known[row, column]
             parity = int(row + column) % 2
-            found[row, column] = _measured(grey, gradient, at, axes, white, parity)
-        result = found
+            result[row, column] = _measured(grey, gradient, at, axes, white, parity)
+        known, tried = result, tried | wanted
+        wanted = binary_dilation(np.isfinite(result[..., 0]), np.ones((3, 3))) & ~tried
+    return result
 
 
 def _expected(
@@ -157,8 +150,7 @@ def _measured(
     """A corner as the point that its edges' gradients are at right angles to (Foerstner 1987).
 
     The columns of `axes` are the pixels of one square to the right and one down; `white` is the
-    width between edge and marker in squares; `parity` is 0 where the square right below the corner
-    is black. NaN if there is no such corner.
+    margin's width in squares; `parity` is 0 where the square right below is black. NaN if none.
     """
     nothing = np.full(2, np.nan)
     area = abs(float(np.linalg.det(axes)))

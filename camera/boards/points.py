@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from camera.boards.board import Board
 from camera.boards.charuco import both_heights, find_charuco
 from camera.errors import CalibrationError
-from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.array_types import FloatArray, GreyImage, IntArray
 
 # Half the side of the window around a corner, as a share of its squares in the image.
 _WINDOW = 0.3
-_SMALLEST_HALF_WINDOW = 2
-_LARGEST_HALF_WINDOW = 9
+_SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW = 2, 9
 _FEWEST_POINTS = 8
 # Lengths of the longer side (px) to which an image is reduced, one after the other, to search a
 # checkerboard. The time of OpenCV's search grows faster than the image, especially without a board,
@@ -50,7 +49,14 @@ def find_board(
         If the board is not there, or too little of a ChArUco board is.
     """
     if board.kind == "charuco":
-        return _charuco(image, board)
+        indices, pixels = find_charuco(image, board)
+        if len(indices) < _FEWEST_POINTS:
+            raise CalibrationError(
+                f"{len(indices)} corners of a {board} in the image: expected at least "
+                f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
+                "sharp and large enough to be read?"
+            )
+        return indices, pixels
     if board.kind == "checkerboard":
         grid = _checkerboard(image, board, window)
     else:
@@ -164,26 +170,6 @@ def _from_the_front(grid: FloatArray) -> FloatArray:
     return grid
 
 
-def _charuco(image: GreyImage, board: Board) -> tuple[IntArray, FloatArray]:
-    indices, pixels = find_charuco(image, board)
-    if len(indices) < _FEWEST_POINTS:
-        raise CalibrationError(
-            f"{len(indices)} corners of a {board} in the image: expected at least "
-            f"{_FEWEST_POINTS}; is --dictionary {board.dictionary} right, and are the markers "
-            "sharp and large enough to be read?"
-        )
-    return indices, pixels
-
-
-def _least_spacing(grid: NDArray[np.float32]) -> float:
-    """Least distance of neighbours that were both seen, pixels."""
-    steps = np.concatenate(
-        [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)]
-    )
-    steps = steps[np.isfinite(steps)]
-    return float(steps.min()) if len(steps) else 10.0
-
-
 def _circles(image: GreyImage, board: Board) -> FloatArray:
     flag = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     size = (board.columns, board.rows)
@@ -209,12 +195,13 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 
     Places without a measurable circle are unchanged.
     """
-    spacing = _least_spacing(grid.astype(np.float32))
+    steps = [np.linalg.norm(np.diff(grid, axis=k), axis=-1) for k in (0, 1)]
+    reach = 0.5 * min(each.min(initial=np.inf) for each in steps)
     result = grid.copy()
     for index in np.ndindex(grid.shape[:2]):
         # Twice, because the first window is around the finder's centre.
         for _ in range(2):
-            moved = _centroid(image, result[index], 0.5 * spacing)
+            moved = _centroid(image, result[index], reach)
             if moved is None:
                 break
             result[index] = moved
@@ -224,33 +211,21 @@ def circle_centroids(image: GreyImage, grid: FloatArray) -> FloatArray:
 def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | None:
     """Centroid of the dark blob in the square window around `at`; None if there is none."""
     half = max(int(reach), 3)
-    u, v = int(np.rint(at[0])), int(np.rint(at[1]))
+    u, v = np.clip(np.rint(at).astype(int), 0, np.array(image.shape[::-1]) - 1).tolist()
     top, left = max(v - half, 0), max(u - half, 0)
     window = image[top : v + half + 1, left : u + half + 1].astype(np.float64)
     if min(window.shape) < 5:
         return None
-    light = np.percentile(window, 90.0)
-    dark = float(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
+    light, dark = np.percentile(window, 90.0), float(image[v, u])
     if light - dark < 20.0:
         return None
     # Paper and ink are uniform; only pixels on the circle's edge have fractional weights.
     weight = np.clip((light - window) / (light - dark), 0.0, 1.0)
     weight[weight < 0.15] = 0.0
-    connected = _blob(weight, v - top, u - left)
-    if connected is None:
-        return None
-    weight = np.where(connected, weight, 0.0)
-    total = weight.sum()
+    _, labels = cv2.connectedComponents((weight > 0.0).astype(np.uint8), connectivity=4)
+    blob = labels == labels[v - top, u - left]
+    if blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any():
+        return None  # it is cut off
+    weight[~blob] = 0.0
     rows, columns = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]]
-    return np.array([np.sum(weight * columns) / total, np.sum(weight * rows) / total])
-
-
-def _blob(weight: FloatArray, row: int, column: int) -> BoolArray | None:
-    """The blob at a place of the window, if it does not touch the window's edge."""
-    mask = (weight > 0.0).astype(np.uint8)
-    if not (0 <= row < mask.shape[0] and 0 <= column < mask.shape[1]) or not mask[row, column]:
-        return None
-    _, labels = cv2.connectedComponents(mask, connectivity=4)
-    blob = np.asarray(labels == labels[row, column])
-    edge = blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any()
-    return None if edge else blob
+    return np.array([np.sum(weight * each) / weight.sum() for each in (columns, rows)])

@@ -12,28 +12,14 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from camera.calibration.model import (
-    POWERS,
-    CalibrationSettings,
-    FreeLens,
-    corner_radius,
-    is_possible,
-    pixels_of_points,
-    project_points,
-)
+from camera.calibration import model
+from camera.calibration.model import CalibrationSettings, FreeLens
+from camera.distortion import polynomial_of, undistorted_radius
 from camera.rotations import cross_matrices, rotation_of
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.least_squares import solver
 from redetect.least_squares.covariance import diagonal_blocks
-from redetect.least_squares.solver import (
-    Block,
-    Linear,
-    Loss,
-    minimise,
-    normal_equations,
-    robust_cost,
-    stack,
-)
-from redetect.least_squares.solver import robust as robustified
+from redetect.least_squares.solver import Block, Linear, Loss
 
 #: Huber's constant, in standard deviations: the influence of larger residuals is constant.
 HUBER = 2.0
@@ -42,6 +28,11 @@ HUBER = 2.0
 #: the image's corner: far wider than any lens, but it bounds undetermined coefficients.
 PRIOR_SIGMA = 10.0
 
+# Standard deviation of what a term that is not free does in the farthest corner: a share of the
+# fitted distortion, and a part of the radius. Terms that do more are seen in most pictures.
+_UNFITTED_SHARE, _LEAST_UNFITTED = 0.15, 0.003
+# Standard deviation of p1 and p2: lenses are decentred by this much unnoticed.
+_TANGENTIAL_SIGMA = 5e-4
 _DAMPING = 1e-3
 
 _SMALLEST_DECREASE = 1e-10
@@ -113,7 +104,7 @@ class Adjusted:
     @property
     def rms_px(self) -> float:
         """Root of the mean squared distance (u and v together) between seen and projected."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+        return rms(self.residuals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +116,12 @@ class _Problem:
     sigma: float
     loss: Loss
 
-    def residuals(self, at: Estimate) -> FloatArray:
-        """(N, 2) seen less projected (px)."""
-        return self.points.pixels - project_estimate(at, self.points)[0]
-
     def cost(self, at: Estimate) -> float:
-        if not is_possible(at.intrinsics, self.points.width, self.points.height):
+        if not model.is_possible(at.intrinsics, self.points.width, self.points.height):
             return float("inf")
         with np.errstate(invalid="ignore"):
-            seen = self.residuals(at).reshape(-1, 1) / self.sigma
-            return robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
+            seen = residuals_of(at, self.points).reshape(-1, 1) / self.sigma
+            return solver.robust_cost([(seen, self.loss), (self._prior(at)[0], Loss())])
 
     def linear(self, at: Estimate) -> Linear:
         pixels, by_intrinsics, by_pose = project_estimate(at, self.points)
@@ -147,7 +134,7 @@ class _Problem:
             Block(error, [(of_pose, by_pose)], shared, self.loss),
             Block(prior, [], (weight[:, None] * self.span)[:, None, :]),
         ]
-        return stack(blocks, 6 * len(self.points.counts), self.span.shape[1])
+        return solver.stack(blocks, 6 * len(self.points.counts), self.span.shape[1])
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         poses = step.reshape(-1, 6)
@@ -159,8 +146,8 @@ class _Problem:
 
     def _prior(self, at: Estimate) -> tuple[FloatArray, FloatArray]:
         """Residuals (14, 1) of the prior, and their weights (per unit of coefficient)."""
-        reach = corner_radius(at.intrinsics, self.points.width, self.points.height)
-        weight = np.concatenate([np.zeros(4), max(reach, 1e-3) ** POWERS / PRIOR_SIGMA])
+        reach = model.corner_radius(at.intrinsics, self.points.width, self.points.height)
+        weight = np.concatenate([np.zeros(4), max(reach, 1e-3) ** model.POWERS / PRIOR_SIGMA])
         return (weight * at.intrinsics)[:, None], weight
 
 
@@ -175,11 +162,25 @@ def project_estimate(
     """
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
-    pixels, by_intrinsics, by_point = project_points(
+    pixels, by_intrinsics, by_point = model.project_points(
         estimate.intrinsics, turned + estimate.translations[view]
     )
     by_pose = np.concatenate([-by_point @ cross_matrices(turned), by_point], axis=-1)
     return pixels, by_intrinsics, by_pose
+
+
+def residuals_of(estimate: Estimate, points: Points, radius_m: float = 0.0) -> FloatArray:
+    """(N, 2) seen less projected (px); of circles with a radius, their centroids."""
+    residuals = points.pixels - project_estimate(estimate, points)[0]
+    if radius_m > 0.0:
+        shifts = circle_shifts(estimate, points, radius_m)
+        residuals = residuals - np.where(np.isfinite(shifts), shifts, 0.0)
+    return residuals
+
+
+def rms(residuals: FloatArray) -> float:
+    """Root of the mean squared length of residuals (N, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def adjust(
@@ -191,15 +192,12 @@ def adjust(
     sigma_px: float | None = None,
     tolerance: float = _SMALLEST_DECREASE,
 ) -> Adjusted:
-    """Fit intrinsics and poses by the reprojection error.
-
-    Takes `span` (14, K).
-    """
+    """Fit poses, and intrinsics along a (14, K) `span`, by the reprojection error."""
     estimate = start
     loss = Loss("huber", HUBER) if robust else Loss()
     problem = _Problem(points, span, sigma_px or _noise(start, points), loss)
     for _ in range(_SCALE_ROUNDS):
-        estimate = minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
+        estimate = solver.minimise(problem, estimate, tolerance=tolerance, damping=_DAMPING).at
         if sigma_px is not None:
             break
         found, before = _noise(estimate, points, span.shape[1]), problem.sigma
@@ -211,7 +209,7 @@ def adjust(
 
 def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
     """Standard deviation of a coordinate from the median residual, robust against outliers."""
-    residuals = points.pixels - project_estimate(estimate, points)[0]
+    residuals = residuals_of(estimate, points)
     unknown = free + 6 * len(points.counts)
     share = max(1.0 - unknown / residuals.size, 0.1)
     return max(float(1.4826 * np.median(np.abs(residuals)) / np.sqrt(share)), 1e-9)
@@ -219,8 +217,8 @@ def _noise(estimate: Estimate, points: Points, free: int = 0) -> float:
 
 def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adjusted:
     points, span, sigma = problem.points, problem.span, problem.sigma
-    residuals = problem.residuals(estimate)
-    _, weights = robustified((residuals / sigma) ** 2, problem.loss)
+    residuals = residuals_of(estimate, points)
+    _, weights = solver.robust((residuals / sigma) ** 2, problem.loss)
     # The covariance of an M-estimator: mean psi^2 / (mean psi')^2 (Huber, Robust Statistics, 7.6),
     # times the inverse of the unweighted normal matrix.
     psi = weights * residuals / sigma
@@ -228,7 +226,7 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     freedom = max(residuals.size - unknown, 1) / residuals.size
     counted = max(float(np.mean(weights == 1.0)), 0.05)
     spread = 1.0 if sigma_known else float(np.mean(psi**2)) / freedom / counted**2
-    plain = normal_equations(replace(problem, loss=Loss()).linear(estimate))
+    plain = solver.normal_equations(replace(problem, loss=Loss()).linear(estimate))
     (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.counts)))])
     return Adjusted(
         estimate=estimate,
@@ -240,29 +238,55 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     )
 
 
-def with_terms(
-    fit: Adjusted, points: Points, span: FloatArray, terms: FloatArray, sigmas: FloatArray
-) -> FloatArray:
-    """(14, 14) expected squared error of a fit's intrinsics if further terms are not exactly 0.
+def with_unfitted_terms(
+    fit: Adjusted, points: Points, lens: FreeLens, settings: CalibrationSettings
+) -> Adjusted:
+    """A fit whose covariance includes the terms that its lens leaves out.
 
-    The terms have a normal prior about 0. One step of Gauss and Newton from the fit, of `span` and
-    terms together, gives their posterior; it is C + d d^T about the fit, where C is its covariance
-    and d its step.
+    Pictures that do not reach the image's corners, or few pictures, do not show all terms of a
+    lens. The fit without a term is as good there, but its covariance would be far too small where
+    the distortion is extrapolated. These terms are the powers of the radius from the first one that
+    the lens does not have to the sixth, and p1 and p2; those that the settings exclude are 0.
 
-    Takes `span` (14, K), `terms` (14, m), and their priors' standard deviations (m,).
+    Terms have a normal prior about 0. One step of Gauss and Newton from the fit, of `span` and
+    terms together, gives their posterior; its expected square about the fit is C + d d^T, where C
+    is its covariance and d its step.
     """
-    both = np.hstack([span, terms])
+    sigmas: dict[str, float] = {}
+    if settings.coefficients is None:
+        corner, distortion = _corner(fit.estimate.intrinsics, points)
+        effect = _UNFITTED_SHARE * abs(distortion) + _LEAST_UNFITTED
+        # a3 and a3 b2 are r^2 and r^4; more rational terms do not span r^6.
+        first = max(lens.polynomial, min(lens.coefficients, len(model.POLYNOMIAL) - 1))
+        for power, name in list(enumerate(model.POLYNOMIAL, start=1))[first:]:
+            sigmas[name] = effect / corner ** (2 * power)
+    if settings.tangential is None and not lens.tangential:
+        sigmas |= dict.fromkeys(model.TANGENTIAL, _TANGENTIAL_SIGMA)
+    if not sigmas:
+        return fit
+    span = lens.span(settings.aspect)
+    both = np.hstack([span, np.eye(model.COUNT)[:, [*map(model.INTRINSICS.index, sigmas)]]])
     linear = _Problem(points, both, fit.sigma_px, Loss()).linear(fit.estimate)
     # As in `_summary`: psi / mean psi'.
     influence = linear.residual.copy()
     counted = max(float(np.mean(fit.weights == 1.0)), 0.05)
     influence[: fit.weights.size] *= fit.weights.ravel() / counted
-    equations = normal_equations(linear._replace(residual=influence))
-    prior = np.diag(np.concatenate([np.zeros(span.shape[1]), sigmas**-2.0]))
+    equations = solver.normal_equations(linear._replace(residual=influence))
+    of_terms = np.array([*sigmas.values()]) ** -2.0
+    prior = np.diag(np.concatenate([np.zeros(span.shape[1]), of_terms]))
     equations = replace(equations, corner=equations.corner + prior)
     _, covariance = diagonal_blocks(equations, [])
     step = both @ equations.step(0.0)[1]
-    return np.asarray(both @ covariance @ both.T + np.outer(step, step))
+    return replace(fit, covariance=both @ covariance @ both.T + np.outer(step, step))
+
+
+def _corner(intrinsics: FloatArray, points: Points) -> tuple[float, float]:
+    """Undistorted normalised radius of the farthest corner, and its relative distortion there."""
+    seen = model.corner_radius(intrinsics, points.width, points.height)
+    coef, brown = model.lens_of(intrinsics)
+    there = float(undistorted_radius(np.array(seen), coef, polynomial_of(brown)))
+    # Beyond the fold, if decentring alone moves the corner to before it.
+    return (there, seen / there - 1.0) if np.isfinite(there) else (seen, 1.0)
 
 
 def fit_points(
@@ -283,8 +307,7 @@ def fit_to_centres(
 ) -> tuple[Adjusted, Points]:
     """Fit to points; with circles, repeatedly, corrected for the shifts by the previous fit.
 
-    `adjusted` fits points, starting from an estimate. Also returns the corrected points
-    (`circle_shifts`).
+    `adjusted` fits points, starting from an estimate; corrected points are returned, too.
     """
     fit = adjusted(start, points)
     corrected = points
@@ -304,7 +327,7 @@ def _within(
     inside = np.where(np.any(span != 0.0, axis=1), intrinsics, 0.0)
     if aspect is not None:
         inside[1] = aspect * inside[0]
-    return inside if is_possible(inside, points.width, points.height) else intrinsics
+    return inside if model.is_possible(inside, points.width, points.height) else intrinsics
 
 
 def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatArray:
@@ -315,7 +338,7 @@ def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatA
     on_board = points.board[:, None, :] + ring
     in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], on_board)
     in_camera += estimate.translations[view][:, None, :]
-    outline = pixels_of_points(estimate.intrinsics, in_camera.reshape(-1, 3))
+    outline = model.pixels_of_points(estimate.intrinsics, in_camera.reshape(-1, 3))
     outline = outline.reshape(len(view), _OUTLINE_POINTS, 2)
     centre = project_estimate(estimate, points)[0]
     relative = outline - centre[:, None, :]

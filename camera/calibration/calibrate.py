@@ -14,8 +14,8 @@ from camera.calibration.adjustment import (
     Adjusted,
     Estimate,
     Points,
-    circle_shifts,
-    project_estimate,
+    residuals_of,
+    with_unfitted_terms,
 )
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
@@ -26,15 +26,13 @@ from camera.calibration.consensus import (
 )
 from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
-from camera.calibration.unfitted import with_unfitted_terms
 from camera.errors import CalibrationError, CameraError
 from camera.uncertainty import UNPOSED, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
 FEWEST_VIEWS = 3
-_LARGEST_RMS_PX = 1.0
-_LARGEST_RMS_WIDTHS = 1.0 / 2000.0
+_LARGEST_RMS_PX, _LARGEST_RMS_WIDTHS = 1.0, 1.0 / 2000.0
 # Calibrations are warned about if the usual standard deviation of the projection is above this.
 _LARGEST_SIGMA_PX = 0.5
 # Residual, in standard deviations, beyond which a point is an outlier.
@@ -264,11 +262,7 @@ def _without_wrong_points(
     """Exclude points that were found wrongly; the second result is their number."""
     if not settings.robust:
         return points, 0
-    seen = points.pixels
-    if radius_m > 0.0:
-        shifts = circle_shifts(estimate, points, radius_m)
-        seen = seen - np.where(np.isfinite(shifts), shifts, 0.0)
-    residuals = seen - project_estimate(estimate, points)[0]
+    residuals = residuals_of(estimate, points, radius_m)
     right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
     # A picture with too few remaining points is unchanged: the robust loss handles it.
     right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]

@@ -13,9 +13,9 @@ from camera.calibration.adjustment import (
     Estimate,
     Points,
     adjust,
-    circle_shifts,
     fit_points,
-    project_estimate,
+    residuals_of,
+    rms,
 )
 from camera.calibration.model import (
     COUNT,
@@ -93,11 +93,10 @@ def _chosen_of_a_kind(
 ) -> tuple[FreeLens, Candidates]:
     """`choose_lens` among rational functions, or polynomials."""
     counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
-    if settings.tangential is True:
-        decentred = [settings.lens(count, tangential=True) for count in counts]
-        tried = fitted(start, decentred)
+    fixed = settings.tangential is True
+    tried = fitted(start, [settings.lens(count, tangential=fixed) for count in counts])
+    if fixed:
         return _fewest_needed(tried), tried
-    tried = fitted(start, [settings.lens(count) for count in counts])
     return _with_tangential(fitted, start, settings, tried)
 
 
@@ -131,7 +130,7 @@ def _fitted(
 ) -> Candidates:
     """Each lens fitted from where the last ended, or from the fullest fit if that got stuck."""
     tried: Candidates = {}
-    much = _STUCK * _rms_px(full, points, radius_m)
+    much = _STUCK * rms(residuals_of(full, points, radius_m))
     for lens in lenses:
         adjusted, seen = fit_points(estimate, points, settings, lens, radius_m)
         if lens.coefficients >= _CAN_BE_STUCK and adjusted.rms_px > much:
@@ -148,13 +147,6 @@ def _fitted(
         )
         tried[lens] = Candidate(adjusted, seen, error)
     return tried
-
-
-def _rms_px(estimate: Estimate, points: Points, radius_m: float) -> float:
-    residuals = points.pixels - project_estimate(estimate, points)[0]
-    if radius_m > 0.0:
-        residuals = residuals - circle_shifts(estimate, points, radius_m)
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def _fewest_needed(tried: Candidates) -> FreeLens:
@@ -185,8 +177,7 @@ def holdout_error(
 ) -> float:
     """RMS reprojection error in views that the intrinsics were not fitted to, pixels.
 
-    For held-out points only the poses are fitted. Each view is in one of the `folds`, by default
-    every `_FOLDS`-th.
+    Only poses are fitted to held-out views: each of the `folds`, by default every `_FOLDS`-th.
     """
     every = np.arange(len(points.counts))
     if folds is None:

@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 
@@ -21,7 +22,7 @@ from camera.calibration.calibrate import (
     calibrate_freely,
 )
 from camera.calibration.consensus import view_rms
-from camera.calibration.floor import file_name, write_picture
+from camera.calibration.floor import write_picture
 from camera.calibration.images import calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
@@ -82,7 +83,7 @@ def perform(options: Calibrate) -> int:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
-                place = options.pictures / f"{file_name(name)}.corners.png"
+                place = options.pictures / f"{name.replace(':', '-')}.corners.png"
                 write_picture(picture, place, force=options.force)
     for name, drawn in pictures(calibration, camera).items():
         write_bytes(names[name], drawn, overwrite=options.force)
@@ -138,8 +139,10 @@ def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     if counted == given or count < _VOTES:
         return board
     is_larger = counted[0] >= given[0] and counted[1] >= given[1]
-    if not is_larger and any(_has_board(image, board) for image in seen):
-        return board
+    for image in () if is_larger else seen:
+        with suppress(CalibrationError):
+            find_board(image, board)
+            return board
     columns, rows = counted if board.columns >= board.rows else counted[::-1]
     print(
         f"the board has {columns} x {rows} inner corners, by {count} of the first {len(seen)} "
@@ -147,14 +150,6 @@ def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
         file=sys.stderr,
     )
     return replace(board, columns=columns, rows=rows)
-
-
-def _has_board(image: GreyImage, board: Board) -> bool:
-    try:
-        find_board(image, board)
-    except CalibrationError:
-        return False
-    return True
 
 
 def find_views(
@@ -211,12 +206,11 @@ def describe(calibration: Calibration, camera: Camera) -> str:
     """Human-readable summary of the result."""
     sigma = np.sqrt(np.diag(calibration.adjusted.covariance))
     free = np.any(calibration.lens.span(None) != 0.0, axis=1)
-    lines = [
-        f"  {name:8s} {value:12.6g}{_plus_minus(s, is_free=is_free)}"
-        for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free)
-    ]
     count, views = len(calibration.points.board), len(calibration.names)
-    lines.insert(0, f"intrinsics from {count} points in {views} pictures:")
+    lines = [f"intrinsics from {count} points in {views} pictures:"]
+    for name, value, s, is_free in zip(INTRINSICS, calibration.intrinsics, sigma, free):
+        uncertain = f" +- {s:.2g}{'' if is_free else '  (not fitted)'}" if s else "  (fixed)"
+        lines.append(f"  {name:8s} {value:12.6g}{uncertain}")
     ratio = aspect_of(calibration)
     if ratio.sigma > 0.0:
         lines.append(f"scaleY / scaleX {ratio.value:.5f} +- {ratio.sigma:.5f}")
@@ -241,10 +235,3 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         )
     lines += [f"warning: {text}" for text in calibration.warnings]
     return "\n".join(lines)
-
-
-def _plus_minus(sigma: float, *, is_free: bool) -> str:
-    """How uncertain a parameter is."""
-    if sigma == 0.0:
-        return "  (fixed)"
-    return f" +- {sigma:.2g}" + ("" if is_free else "  (not fitted)")

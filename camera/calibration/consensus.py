@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, project_estimate
+from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, residuals_of
 from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
 from camera.errors import CalibrationError
@@ -122,7 +122,7 @@ def _fitted(
         rest = points.of(others)
         posed = best_poses(found.of(others), rest)
         found = found.with_poses(others, posed)
-        residuals[~used[points.views]] = rest.pixels - project_estimate(posed, rest)[0]
+        residuals[~used[points.views]] = residuals_of(posed, rest)
     typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))
     return Consensus(
         fit=fit,

@@ -6,7 +6,6 @@ Y backward, Z up), its x axis rotated from the robot's X axis.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from functools import partial
 from math import degrees, radians
@@ -32,15 +31,10 @@ from camera.rotations import cross_matrices
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
 from redetect.bounds import FINITE, demand
-from redetect.messages import excerpt
 from redetect.storage import demand_place, write_bytes
-from redetect.storage.bounded import read_text
-
-#: Columns of a file of floor points: pixel, and position in the robot frame (m).
-FLOOR_COLUMNS = ("u", "v", "x", "y")
+from redetect.storage.bounded import rows_of_numbers
 
 _FEWEST_POINTS = 4
-_LARGEST_FILE_BYTES = 1 << 24
 
 
 def perform(options: Floor) -> int:
@@ -76,10 +70,9 @@ class FloorPose:
 
 
 def on_floor(board_points: FloatArray, origin_xy: tuple[float, float], yaw: float) -> FloatArray:
-    """(N, 3) positions in the robot frame of a board's (N, 3) points.
+    """(N, 3) positions in the robot frame of a board's (N, 3) points, its middle at `origin_xy`.
 
-    The board's middle lies at `origin_xy`; `yaw` is the angle from the robot's X axis to the
-    board's x axis, counterclockwise seen from above (rad).
+    `yaw` (rad) is from the robot's X axis to the board's, counterclockwise seen from above.
     """
     c, s = np.cos(yaw), np.sin(yaw)
     turned = board_points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
@@ -191,29 +184,8 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:
     """(N, 2) pixels and (N, 2) floor places of a CSV file with the header ``u,v,x,y``."""
-    text = read_text(path, _LARGEST_FILE_BYTES, "file of floor points", CalibrationError)
-    try:
-        rows = list(csv.reader(text.splitlines()))
-    except csv.Error as error:
-        raise CalibrationError(f"{path}: {error}: expected floor points") from None
-    header = tuple(name.strip().lower() for name in rows[0]) if rows else ()
-    if header != FLOOR_COLUMNS:
-        raise CalibrationError(
-            f"{path}:1: the header is {excerpt(','.join(header))}: expected u,v,x,y (pixels; "
-            "metres, X left and Y backward of the robot)"
-        )
-    numbers = []
-    for line, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        try:
-            values = [float(cell) for cell in row]
-        except ValueError:
-            values = []
-        if len(values) != 4 or not np.all(np.isfinite(values)):
-            raise CalibrationError(f"{path}:{line}: expected four numbers u,v,x,y")
-        numbers.append(values)
-    table = np.array(numbers, dtype=np.float64).reshape(-1, 4)
+    rows = rows_of_numbers(path, "file of floor points", "u v x y", CalibrationError, head=True)
+    table = np.array([numbers for _, numbers in rows], dtype=np.float64).reshape(-1, 4)
     return table[:, :2], table[:, 2:]
 
 
@@ -277,7 +249,7 @@ def write_floor_pictures(options: Floor, camera: Camera) -> None:
         return
     image = read_grey(floor)
     for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
-        place = options.pictures / f"{file_name(floor.name)}.{name}.png"
+        place = options.pictures / f"{floor.name}.{name}.png"
         write_picture(draw(image, camera), place, force=options.force)
 
 
@@ -286,8 +258,3 @@ def write_picture(picture: NDArray[np.uint8], place: Path, *, force: bool) -> No
     place.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(place, cv2.imencode(".png", picture)[1].tobytes(), overwrite=force)
     print(f"written: {place}")
-
-
-def file_name(name: str) -> str:
-    """Of a picture, or a frame of a video."""
-    return name.replace(":", "-")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,9 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
     videos: list[Path] = []
     for path in inputs:
         if path.is_dir():
-            images += sorted(p for p in path.iterdir() if _is_image(p))
+            # Hidden files are skipped: some systems keep metadata in ones named ._ and the image.
+            visible = [each for each in path.iterdir() if not each.name.startswith(".")]
+            images += sorted(p for p in visible if p.suffix.lower() in IMAGE_SUFFIXES)
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -45,7 +49,10 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
             f"no pictures in {', '.join(str(path) for path in inputs)}: expected files ending in "
             f"{' '.join(IMAGE_SUFFIXES)}, or a video"
         )
-    for path in _evenly(_each_once(images), most):
+    images = _each_once(images)
+    if len(images) > most:
+        images = [images[i] for i in np.linspace(0, len(images) - 1, most).round().astype(int)]
+    for path in images:
         yield path.name, read_grey(path)
     for path in _each_once(videos):
         yield from _frames(path, most)
@@ -57,16 +64,7 @@ def read_grey(path: Path) -> GreyImage:
         content = read_bounded(path, _LARGEST_FILE_BYTES)
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
-    size = claimed_size(content)
-    if size is not None and size[0] * size[1] > MOST_PIXELS:
-        raise CalibrationError(
-            f"{path}: claims {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels"
-        )
-    image = None if size is None else decoded_image(content)
-    if image is None:
-        raise CalibrationError(
-            f"{path}: not an image that can be read: expected JPEG, PNG, PNM, BMP or TIFF"
-        )
+    image = decoded_image(content, path, CalibrationError)
     if image.dtype not in (np.uint8, np.uint16):
         raise CalibrationError(f"{path}: holds {image.dtype}: expected images of 8 or 16 bits")
     if image.dtype == np.uint8:
@@ -76,42 +74,59 @@ def read_grey(path: Path) -> GreyImage:
     return np.asarray(np.rint(image.astype(np.float64) * (255.0 / brightest)), dtype=np.uint8)
 
 
-def decoded_image(content: bytes) -> NDArray[Any] | None:
-    """(H, W) grey values of an image file's content, of any depth; None if they cannot be decoded.
+def decoded_image(content: bytes, name: object, error: type[Exception]) -> NDArray[Any]:
+    """(H, W) grey values of an image file's content, of any depth.
 
-    How a camera was held, which telephones write beside a picture (Exif), turns nothing: a
-    calibration is of the sensor's pixels, whichever way up they are shown. The memory that the
-    image takes is not checked here: see `redetect.storage.bounded`.
+    Orientation in metadata (Exif) turns nothing: a calibration is of the sensor's pixels. Raises an
+    `error`, before memory is allocated if the image is too large.
     """
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    size, image = claimed_size(content), None
+    if size is not None:
+        if size[0] * size[1] > MOST_PIXELS:
+            claim = f"claims {size[0]}x{size[1]} px: expected at most {MOST_PIXELS} pixels"
+            raise error(f"{name}: cannot be decoded: {claim}")
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        with suppress(cv2.error):  # sizes beyond OpenCV's bounds
+            image = cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
+    if image is None:
+        raise error(f"{name}: cannot be decoded: expected an image: JPEG, PNG, PNM, BMP or TIFF")
+    return image
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Suppress messages of OpenCV and its FFmpeg on errors that are reported here."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
+    before = levels.getLogLevel()
+    levels.setLogLevel(0)  # silent
     try:
-        return cv2.imdecode(np.frombuffer(without_orientation(content), np.uint8), flags)
-    except cv2.error:  # sizes beyond OpenCV's bounds
-        return None
+        yield
+    finally:
+        levels.setLogLevel(before)
 
 
-def _is_image(path: Path) -> bool:
-    # Hidden files are skipped: some systems keep metadata in files named ._ and the image's name.
-    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+@contextmanager
+def opened_video(path: Path, error: Exception) -> Iterator[cv2.VideoCapture]:
+    """Open a video, of the sensor's pixels, however a player would rotate them; else an error."""
+    with quiet_opencv():
+        capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise error
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        yield capture
+    finally:
+        capture.release()
 
 
 def _each_once(paths: list[Path]) -> list[Path]:
     return list({path.resolve(): path for path in reversed(paths)}.values())[::-1]
 
 
-def _evenly(paths: list[Path], most: int) -> list[Path]:
-    if len(paths) <= most:
-        return paths
-    return [paths[i] for i in np.linspace(0, len(paths) - 1, most).round().astype(int)]
-
-
 def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
-    video = cv2.VideoCapture(str(path))
-    try:
-        if not video.isOpened():
-            raise CalibrationError(f"{path}: not a video that OpenCV can read")
-        # The sensor's pixels, as with photographs: orientation metadata is ignored.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    refused = CalibrationError(f"{path}: not a video that OpenCV can read")
+    with opened_video(path, refused) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         # The frames are spread over the whole video.
         step = max(1, -(-count // most))
@@ -125,9 +140,7 @@ def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
                 yield f"{path.name}:{number}", np.asarray(grey, dtype=np.uint8)
                 taken += 1
             number += 1
-        if taken == 0:
-            raise CalibrationError(f"{path}: a video without frames")
-        if taken < most and number < count:
-            print(f"{path}: only {number} of {count} frames can be read", file=sys.stderr)
-    finally:
-        video.release()
+    if taken == 0:
+        raise CalibrationError(f"{path}: a video without frames")
+    if taken < most and number < count:
+        print(f"{path}: only {number} of {count} frames can be read", file=sys.stderr)

@@ -16,10 +16,11 @@ from camera.distortion import (
     RADIUS_LIMIT,
     Brown,
     Coef,
-    brown_shift,
     distorted_jacobian,
     one_to_one_radius,
+    polynomial_of,
     radial_factor,
+    tangential_shift,
 )
 from camera.errors import CalibrationError
 from camera.model_checks import border_pixels
@@ -90,7 +91,8 @@ def _seen(coef: Coef, brown: Brown, points_camera: FloatArray) -> _Seen:
     r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
     ratio = r * (a2 + r * a3) / denominator
-    distorted = xy * (1.0 + ratio)[:, None] + brown_shift(xy, brown)
+    factor = radial_factor(r, coef, polynomial_of(brown))
+    distorted = xy * factor[:, None] + tangential_shift(xy, brown[2:4])
     return _Seen(z, xy, r, denominator, ratio, distorted)
 
 
@@ -164,11 +166,11 @@ def _is_within(
 
 def _reach(r: float, coef: Coef, brown: Brown, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
-    factor = radial_factor(np.array(r), coef)
-    if not any(brown):  # the same in all directions
+    factor = radial_factor(np.array(r), coef, polynomial_of(brown))
+    if not any(brown[2:4]):  # the same in all directions
         return np.asarray(r * factor)
     edge = r * _DIRECTIONS
-    edge = edge * factor + brown_shift(edge, brown)
+    edge = edge * factor + tangential_shift(edge, brown[2:4])
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),
         np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
@@ -188,18 +190,14 @@ def corner_radius(intrinsics: FloatArray, width: int, height: int) -> float:
 class FreeLens(NamedTuple):
     """Which of the distortion's coefficients are free."""
 
-    coefficients: int
-    """Number of the rational ones, 0 to 5 (`FREE_COEFFICIENTS`)."""
-    tangential: bool = False
-    """Whether p1 and p2 are."""
-    polynomial: int = 0
-    """Number of k1, k2, k3 that are."""
+    coefficients: int  #: Number of the rational ones, 0 to 5 (`FREE_COEFFICIENTS`)
+    tangential: bool = False  #: Whether p1 and p2 are
+    polynomial: int = 0  #: Number of k1, k2, k3 that are
 
     def span(self, aspect: float | None) -> FloatArray:
-        """(14, K) directions in which intrinsics may change.
+        """(14, K) directions in which intrinsics may change: scales, principal point, coefficients.
 
-        Free are the scales (`aspect` is scaleY / scaleX; None: each by itself), the principal
-        point, and these coefficients.
+        `aspect` is scaleY / scaleX; None: the scales are independent.
         """
         names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[self.coefficients]]
         names += [*(TANGENTIAL if self.tangential else ()), *POLYNOMIAL[: self.polynomial]]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from camera.calibration.adjustment import project_estimate
+from camera.calibration.adjustment import project_estimate, rms
 from camera.calibration.calibrate import Calibration, coverage
 from camera.model import Camera
 from camera.uncertainty import projection_sigma
@@ -18,7 +18,6 @@ from redetect.reporting.page import figure_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 _ARROW_SHARE = 0.05
 #: Blue, green, red.
@@ -114,10 +113,8 @@ def drawn_corners(image: GreyImage, calibration: Calibration, view: int) -> Byte
         cv2.drawMarker(
             picture, _place(place, scale), _PROJECTED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA
         )
-    rms = float(np.sqrt(np.mean(np.sum((found - projected) ** 2, axis=1))))
-    return _captioned(
-        picture, f"{calibration.names[view]}: found (o), projected (+), RMS {rms:.2f} px"
-    )
+    size = f"RMS {rms(found - projected):.2f} px"
+    return _captioned(picture, f"{calibration.names[view]}: found (o), projected (+), {size}")
 
 
 def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
@@ -125,12 +122,11 @@ def drawn_floor(image: GreyImage, camera: Camera) -> ByteArray:
     picture, scale = _enlarged(image)
     along = np.linspace(-_ASIDE_M, _ASIDE_M, _POINTS_PER_LINE)
     ahead = -np.linspace(0.0, _AHEAD_M, _POINTS_PER_LINE)
-    for y in -np.arange(0.0, _AHEAD_M + 0.01, _GRID_M):
-        line = camera.project_floor(np.column_stack([along, np.full(_POINTS_PER_LINE, y)]))
-        _polyline(picture, line, scale, _GRID, 2 if y % 1.0 == 0.0 else 1)
-    for x in np.arange(-_ASIDE_M, _ASIDE_M + 0.01, _GRID_M):
-        line = camera.project_floor(np.column_stack([np.full(_POINTS_PER_LINE, x), ahead]))
-        _polyline(picture, line, scale, _GRID, 2 if x % 1.0 == 0.0 else 1)
+    lines = [(y, (along, along * 0.0 + y)) for y in -np.arange(0.0, _AHEAD_M + 0.01, _GRID_M)]
+    lines += [(x, (ahead * 0.0 + x, ahead)) for x in np.arange(-_ASIDE_M, _ASIDE_M + 0.01, _GRID_M)]
+    for at, line in lines:
+        seen = camera.project_floor(np.column_stack(line))
+        _polyline(picture, seen, scale, _GRID, 2 if at % 1.0 == 0.0 else 1)
     for y in range(1, int(_AHEAD_M) + 1):
         place = camera.project_floor([0.0, -float(y)])
         if np.isfinite(place).all() and np.abs(place).max() < 1e4:

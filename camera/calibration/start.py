@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, project_estimate
+from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, residuals_of
 from camera.calibration.model import COUNT, FreeLens, lens_of
 from camera.distortion import one_to_one_radius, straightened
 from camera.rotations import rotation_of
@@ -111,7 +111,7 @@ def _fitted_where_seen(
 
 def view_errors(estimate: Estimate, points: Points) -> FloatArray:
     """(V,) mean absolute residual (px); infinite where a view is not projected."""
-    error = np.abs(points.pixels - project_estimate(estimate, points)[0]).sum(axis=1)
+    error = np.abs(residuals_of(estimate, points)).sum(axis=1)
     error = np.where(np.isnan(error), np.inf, error)
     return np.asarray(np.bincount(points.views, error) / points.counts)
 

@@ -6,25 +6,10 @@ from pathlib import Path
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
+from camera.formats import conversion, yaml_files
 from camera.formats.colmap import format_colmap, parse_colmap
-from camera.formats.conversion import (
-    AnyCamera,
-    Converted,
-    contained,
-    convert_to_camera,
-    convert_to_foreign,
-    nearer,
-)
+from camera.formats.conversion import AnyCamera, Converted
 from camera.formats.models import ForeignCamera, Model
-from camera.formats.yaml_files import (
-    format_kalibr,
-    format_opencv,
-    format_ros,
-    parse_kalibr,
-    parse_opencv,
-    parse_ros,
-    parse_yaml,
-)
 from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded, demand_place, write_bytes
@@ -128,7 +113,7 @@ def format_of_text(path: Path, text: str) -> Format:
         )
     if text.startswith("%YAML:") or "!!opencv-matrix" in text:
         return "opencv"
-    content = parse_yaml(text, str(path))
+    content = yaml_files.parse_yaml(text, str(path))
     if any(isinstance(value, dict) and "intrinsics" in value for value in content.values()):
         return "kalibr"
     if "distortion_model" in content:
@@ -145,19 +130,25 @@ def format_of_text(path: Path, text: str) -> Format:
 def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
     """A camera of the text of a file."""
     if from_format == "kalibr":
-        return parse_kalibr(text, name, camera_name)
+        return yaml_files.parse_kalibr(text, name, camera_name)
     if from_format == "colmap":
         return parse_colmap(text, name, camera_name)
     if from_format == "cam":
         return parse_camera(text, name)
-    return (parse_ros if from_format == "ros" else parse_opencv)(text, name)
+    if from_format == "ros":
+        return yaml_files.parse_ros(text, name)
+    return yaml_files.parse_opencv(text, name)
 
 
 def format_of(camera: AnyCamera, to_format: Format) -> str:
     """The text of a file of a camera."""
     if isinstance(camera, Camera):
         return format_camera(camera)
-    formats = {"opencv": format_opencv, "ros": format_ros, "kalibr": format_kalibr}
+    formats = {
+        "opencv": yaml_files.format_opencv,
+        "ros": yaml_files.format_ros,
+        "kalibr": yaml_files.format_kalibr,
+    }
     return formats.get(to_format, format_colmap)(camera)
 
 
@@ -168,7 +159,7 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
     """
     if to_format == "cam":
         pose = read_camera(options.pose_from) if options.pose_from is not None else None
-        return convert_to_camera(source, options.rows, pose)
+        return conversion.convert_to_camera(source, options.rows, pose)
     models = MODELS[to_format]
     if options.model != "auto":
         if options.model not in models:
@@ -178,10 +169,9 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
         models = {options.model: models[options.model]}
     own = source.model if isinstance(source, ForeignCamera) else None
     found: list[Converted] = []
-    for model, free in sorted(
-        models.items(), key=lambda item: (contained(source, *item) is None, item[0] != own)
-    ):
-        found.append(convert_to_foreign(source, model, options.rows, free=free))
+    exact = [model for model in models if conversion.contained(source, model, models[model])]
+    for model in sorted(models, key=lambda each: (each not in exact, each != own)):
+        found.append(conversion.convert_to_foreign(source, model, options.rows, free=models[model]))
         if found[-1].deviation_px <= options.limit_px:
             break
-    return nearer(*found)
+    return conversion.nearer(*found)

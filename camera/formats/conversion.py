@@ -23,11 +23,9 @@ EXACT_PX = 1e-6
 
 # Number of rounds of Lawson's reweighting, which minimises the largest deviation.
 _LAWSON_ROUNDS = 25
-_STEPS = 60
-_LAWSON_STEPS = 5
+_STEPS, _LAWSON_STEPS = 60, 5
 # Cost of parameters that are impossible or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
-
 
 AnyCamera = Camera | ForeignCamera
 Rows = Literal["same", "halve", "double"]
@@ -36,8 +34,7 @@ Rows = Literal["same", "halve", "double"]
 _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 
 # Grids of pixels: for the fit, and for the largest deviation.
-_FIT_GRID = (41, 31)
-_CHECK_GRID = (129, 97)
+_FIT_GRID, _CHECK_GRID = (41, 31), (129, 97)
 # Largest deviation after least squares above which a fuller model is tried.
 _NEAR_PX = 0.02
 
@@ -213,11 +210,8 @@ def convert_to_camera(
 
     A polynomial and tangential terms without a denominator are copied. Otherwise the rational part
     is fitted with the source's tangential terms and, if that is not close enough, all terms and a
-    polynomial together.
-
-    Source, rows, result and errors are those of `convert_to_foreign`. The result gets the
-    ``sensor2World``, ``sensor2Tcp`` and ``mountIndex`` of `pose`; by default those of the source if
-    it has them, else the identity.
+    polynomial. Source, rows, result and errors are those of `convert_to_foreign`. The pose,
+    ``sensor2Tcp`` and ``mountIndex`` are those of `pose`, else of the source, else the identity.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)

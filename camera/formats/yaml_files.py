@@ -309,18 +309,11 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     model = entry.get("distortion_model", "none")
     label = model if isinstance(model, str) else excerpt(model)
     d = numbers(entry.get("distortion_coeffs", []), "distortion_coeffs", where)
-    if label == "none":
-        if any(d):
-            raise ConversionError(
-                f"{where}: distortion_coeffs without a distortion_model: expected one of "
-                f"{', '.join(_KALIBR_MODELS)}"
-            )
+    if label == "none" and not any(d):
         label, d = "radtan", [0.0] * _KALIBR_COEFFICIENTS
     if label not in _KALIBR_MODELS:
-        raise ConversionError(
-            f"{where}: distortion_model {label[:40]!r}: expected {', '.join(_KALIBR_MODELS)} or "
-            "none"
-        )
+        known = f"{', '.join(_KALIBR_MODELS)}, or none without distortion_coeffs"
+        raise ConversionError(f"{where}: distortion_model {label[:40]!r}: expected {known}")
     intrinsics = numbers(first_of(entry, ("intrinsics",), where), "intrinsics", where)
     resolution = first_of(entry, ("resolution",), where)
     if len(intrinsics) != 4 or len(d) != _KALIBR_COEFFICIENTS:

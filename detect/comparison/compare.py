@@ -1,11 +1,8 @@
 """Compares detected discs, or lines, with reference rows of the same run.
 
-Discs are paired at their positions in the image, or on the floor; lines by bearing. Differences of
-paired discs on the floor are computed twice: for the rows as written, and after levelling both by
-the tilt of the detected ones.
-
-A detected line can represent several that were joined: unpaired reference lines within its sigma
-count as found, too.
+Discs are paired in the image, or on the floor; lines by bearing. Differences of paired discs on the
+floor are computed for the rows as written, and after levelling both by the tilt of the detected
+ones. A detected line can represent several: unpaired reference lines within its sigma are found.
 """
 
 from __future__ import annotations

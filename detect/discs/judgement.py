@@ -64,7 +64,7 @@ _SAME = 0.1
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
-class Judgement(NamedTuple):
+class JudgedCandidates(NamedTuple):
     """N candidates and their fates; `step` and later fields are valid for judged rims only."""
 
     fate: NDArray[np.int8]  #: (N,) indices of `FATES`
@@ -83,12 +83,12 @@ class Judgement(NamedTuple):
     quality: FloatArray  #: (N,) Otsu's quality of the disc against that floor
     log_odds: FloatArray  #: (N,) that the candidate is a disc
 
-    def where(self, chosen: NDArray[Any]) -> Judgement:
+    def where(self, chosen: NDArray[Any]) -> JudgedCandidates:
         """The candidates that indices or a mask select."""
-        return Judgement(*(values[chosen] for values in self))
+        return JudgedCandidates(*(values[chosen] for values in self))
 
 
-NO_CANDIDATES = Judgement._make(
+NO_CANDIDATES = JudgedCandidates._make(
     [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), *np.empty((2, 0)),
      *np.empty((3, 0, 2)), *np.empty((4, 0))]
 )  # fmt: skip
@@ -108,7 +108,7 @@ def judge(
     least_step: float,
     camera_numbers: FloatArray,
     networks: Networks,
-) -> Judgement:
+) -> JudgedCandidates:
     """Judge candidates, the best first.
 
     Parameters
@@ -171,7 +171,7 @@ def judge(
         seen_from[i, 0], seen_from[i, 1] = x, y
         judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
         count += 1
-    return Judgement(
+    return JudgedCandidates(
         fate, value, candidates.sign, features, agreeing, radius, place, seen_from, doubt, step,
         floor_grey, quality, log_odds,
     )  # fmt: skip

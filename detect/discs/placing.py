@@ -22,7 +22,7 @@ from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
-    from detect.discs.judgement import Judgement
+    from detect.discs.judgement import JudgedCandidates
 
 #: Pixels that the fit of a whole disc uses, and those of the fit by parts.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
@@ -68,13 +68,13 @@ class Size(NamedTuple):
 
 
 @kernel()
-def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, FloatArray]:
+def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[FloatArray, FloatArray]:
     """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
     Parameters
     ----------
     scene : Scene
-    discs : Judgement
+    discs : JudgedCandidates
         N discs.
     work : WORK
         Working space (`detect.discs.fit`).
@@ -135,7 +135,12 @@ def place_discs(scene: Scene, discs: Judgement, work: Any) -> tuple[FloatArray, 
 
 @kernel(inline="always")
 def _start_of(
-    scene: Scene, discs: Judgement, k: int, stage: int, fits: tuple[Fit, Fit], radii: FloatArray
+    scene: Scene,
+    discs: JudgedCandidates,
+    k: int,
+    stage: int,
+    fits: tuple[Fit, Fit],
+    radii: FloatArray,
 ) -> tuple[bool, Start, Size]:
     """Whether a disc is fitted in a stage, from where, and its size; by its fits so far."""
     fit, by_parts = fits
@@ -196,7 +201,7 @@ def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
 
 
 @kernel(inline="always")
-def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
+def _explains(fit: Fit, discs: JudgedCandidates, k: int) -> bool:
     """Whether the fit of a whole disc explains the image."""
     least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
     same_sign = fit.contrast * discs.step[k] > 0.0
@@ -204,7 +209,7 @@ def _explains(fit: Fit, discs: Judgement, k: int) -> bool:
 
 
 @kernel(inline="always")
-def _place_by_rim(scene: Scene, discs: Judgement, k: int, fit: Fit, size: Size) -> Place:
+def _place_by_rim(scene: Scene, discs: JudgedCandidates, k: int, fit: Fit, size: Size) -> Place:
     """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, size.radius)
     if fit.arrived:
@@ -216,7 +221,7 @@ def _place_by_rim(scene: Scene, discs: Judgement, k: int, fit: Fit, size: Size) 
 
 
 @kernel(inline="always")
-def _rim_of(scene: Scene, discs: Judgement, k: int, radius: float) -> Rim:
+def _rim_of(scene: Scene, discs: JudgedCandidates, k: int, radius: float) -> Rim:
     x, y = discs.seen_from[k, 0], discs.seen_from[k, 1]
     seen = profiles(scene.image, scene.camera_numbers, x, y, radius)
     return follow_rim(scene.image, scene.camera_numbers, seen, discs.step[k])

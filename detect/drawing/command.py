@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -11,18 +13,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, picture_name, png_of
+from camera.calibration.images import quiet_opencv
+from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
+from detect.sources.image_files import demand_pictures, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.sources.poses import SomeFrames
-from detect.sources.video import quiet_opencv
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage
+from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
 
 Video = Callable[[ByteArray], None]
@@ -44,13 +48,13 @@ def perform(options: Draw) -> int:
     if options.video is not None:
         demand_place(options.video, overwrite=options.force)
     if options.output is not None:
-        options.output.mkdir(parents=True, exist_ok=True)
+        demand_pictures(run.frames, options.output, overwrite=options.force)
     force, path = options.force, options.video
     with nullcontext() if path is None else mp4(path, options.fps, overwrite=force) as video:
         drawn, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:
-            print(f"{where}: {drawn} pictures of {', '.join(rows.detected)}")
+            print(f"{where}: {counted(drawn, 'picture')} of {', '.join(rows.detected)}")
     return report_failures(len(failures), failures)
 
 
@@ -102,24 +106,25 @@ def _with_rejected(
 def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
     """A video file, written once it is complete; yields a function that adds a picture.
 
-    Raises DetectError if OpenCV cannot write such videos, or pictures differ in size.
+    Raises DetectError if OpenCV cannot write such videos, or pictures differ in size, and OSError
+    if there is no space for the video.
     """
     writer = cv2.VideoWriter()
     size: tuple[int, int] | None = None
+    count = 0
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, quiet_opencv():
         raw = Path(folder) / "video.mp4"
 
         def add(picture: ByteArray) -> None:
-            nonlocal size
+            nonlocal size, count
             # The encoder needs even numbers of rows and columns.
             height, width = picture.shape[:2]
             even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
             even_size = (even.shape[1], even.shape[0])
             if size is None:
                 size = even_size
-                with quiet_opencv():
-                    writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+                writer.open(str(raw), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
                 if not writer.isOpened():
                     raise DetectError(
                         f"{path}: this OpenCV cannot write MP4 videos of {fps:g} frames per "
@@ -128,6 +133,7 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
             if even_size != size:
                 raise DetectError(f"{path}: pictures differ in size: expected one size for a video")
             writer.write(even)
+            count += 1
 
         try:
             yield add
@@ -135,4 +141,7 @@ def mp4(path: Path, fps: float, *, overwrite: bool) -> Iterator[Video]:
             writer.release()
         if size is None:
             raise DetectError(f"{path}: no pictures: expected at least one for a video")
+        # OpenCV does not say whether it could write.
+        if cv2.VideoCapture(str(raw)).get(cv2.CAP_PROP_FRAME_COUNT) != count:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(raw))
         write_bytes(path, raw.read_bytes(), overwrite=overwrite)

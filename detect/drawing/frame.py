@@ -1,9 +1,8 @@
 """Drawing of a frame's rows into its image: discs, verticals, markers, tilt, and their residuals.
 
-Outlines of discs are projected through the lens, and through the frame's tilt if rows are corrected
-for it; verticals through the lens, with error bars of one standard deviation at the horizon (the
-report's figures 5, 6 and 8). With reference rows, the missed ones are drawn as well, and unmatched
-rows have a different colour.
+Outlines of discs are projected through the lens, and through the tilt by which rows are levelled;
+verticals have error bars of one standard deviation at the horizon (the report's figures 5, 6, 8).
+With reference rows, missed ones are drawn as well, and unmatched rows in another colour.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import apart_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
-from detect.discs.unfound import DiscExplanation, Stage
+from detect.discs.explanation import DiscExplanation, Stage
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
@@ -28,7 +27,6 @@ from detect.options import CompareOptions
 from detect.row_files import KINDS, SeenRows
 from detect.seen import Sight, circle_on_floor
 from detect.settings import CircleSettings
-from detect.sources.image_files import image_name
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
@@ -40,6 +38,8 @@ _POINTS = 33
 #: Size of the ellipses of markers' corners, in standard deviations.
 _SIGMAS = 20.0
 Colour = tuple[int, int, int]
+#: Upper left and lower right corner, pixels.
+Box = tuple[FloatArray, FloatArray]
 LINE_COLOUR: Colour = (60, 220, 60)
 SIGMA_COLOUR: Colour = (0, 170, 255)
 _OUTLINE_COLOUR: Colour = (60, 200, 60)
@@ -53,6 +53,8 @@ _SUBPIXEL_BITS = 4
 _FARTHEST_PX = 1e6
 # Text and strokes are enlarged in proportion to pictures of this width.
 _COLUMNS = 750
+# A label is moved down by at most this many of its heights.
+_LABELS_DOWN = 2
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
@@ -70,20 +72,20 @@ def draw_rows(
     scale = 2 if image.shape[1] < _SMALL_PX else 1
     canvas = canvas_of(image, None if sight is None else sight.camera)
     canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
-    words = [title] if title else []
+    words, labels = [title] if title else [], list[Box]()
     if not processed(rows):
         words.append("not processed")
     options = CompareOptions()
     if sight is not None and rows.lines is not None:
         match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
-        _draw_lines(canvas, sight.camera, match, compared, scale)
+        _draw_lines(canvas, sight.camera, match, compared, scale, labels)
         words.append(_count("verticals", match, compared))
     if sight is not None and rows.circles is not None:
         discs = rows.reference_circles, rows.circles, rows.unlisted
         match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
         compared = rows.reference_circles is not None
-        _draw_discs(canvas, match, settings, compared, scale)
+        _draw_discs(canvas, match, settings, compared, scale, labels)
         words.append(_count("discs", match, compared))
     if rows.markers is not None:
         _draw_markers(canvas, rows.markers.markers, scale)
@@ -141,7 +143,12 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: ByteArray, match: FrameMatch, settings: CircleSettings, compared: bool, scale: int
+    canvas: ByteArray,
+    match: FrameMatch,
+    settings: CircleSettings,
+    compared: bool,
+    scale: int,
+    taken: list[Box],
 ) -> None:
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
     view = match.view
@@ -161,34 +168,50 @@ def _draw_discs(
             outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
             rims.append(_scaled(outline, scale))
             draw_curve(canvas, rims[-1], colour, closed=True)
-    _draw_labels(canvas, [f"{row.quality:.2f}{text}" for row, text, _ in drawn], rims[2::3])
+    gap = np.array([3.0 * enlargement(canvas), 0.0])
+    for (row, text, _), rim in zip(drawn, rims[2::3]):
+        if np.all(np.abs(rim) < _FARTHEST_PX):
+            (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
+            middle = 0.5 * (top + bottom)
+            beside = [(np.array([right, middle]) + gap, 0.0), (np.array([left, middle]) - gap, 1.0)]
+            _draw_label(canvas, f"{row.quality:.2f}{text}", beside, _TEXT_COLOUR, 0.35, taken)
 
 
-def _draw_labels(canvas: ByteArray, texts: Sequence[str], rims: Sequence[FloatArray]) -> None:
-    """Labels to the right of rims, or else to the left, or else moved down until on no other."""
+def _draw_label(
+    canvas: ByteArray,
+    text: str,
+    places: Sequence[tuple[FloatArray, float]],
+    colour: Colour,
+    size: float,
+    taken: list[Box],
+) -> None:
+    """Draw a label at the first place where it is on no other, or a little below the last one.
+
+    A place is a point at half the label's height, and the share of its width to the left of it. If
+    none is free, the label is left out: further away, it would seem to be another one's. `taken`
+    are the corners of the labels drawn before; those of this one are added.
+    """
     times = enlargement(canvas)
-    taken = np.zeros((0, 2))
-
-    def free(place: FloatArray) -> bool:
-        return not np.any(np.all(np.abs(taken - place) < size, axis=1))
-
-    for text, rim in zip(texts, rims):
-        if not np.all(np.abs(rim) < _FARTHEST_PX):
-            continue
-        wide, high = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.35 * times, times)[0]
-        size = np.array([wide, high]) + 2.0 * times
-        (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
-        place = np.array([right + 3.0 * times, 0.5 * (top + bottom + high)])
-        if place[0] + wide > canvas.shape[1] or not free(place):
-            place[0] = left - 3.0 * times - wide
-        while not free(place):
-            place[1] += size[1]
-        taken = np.vstack([taken, place])
-        draw_text(canvas, text, place, _TEXT_COLOUR)
+    extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
+    wide, high = np.array(extent) + 2.0 * times
+    corners = [place - np.array([share * wide, 0.5 * high]) for place, share in places]
+    corners += [corners[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
+    for least in corners:
+        most = np.add(least, (wide, high))
+        within = least[0] >= 0.0 and most[0] <= canvas.shape[1]
+        if within and not any(np.all((least < b) & (a < most)) for a, b in taken):
+            taken.append((least, most))
+            draw_text(canvas, text, (least[0], most[1] - times), colour, size)
+            return
 
 
 def _draw_lines(
-    canvas: ByteArray, camera: Camera, match: FrameMatch, compared: bool, scale: int
+    canvas: ByteArray,
+    camera: Camera,
+    match: FrameMatch,
+    compared: bool,
+    scale: int,
+    taken: list[Box],
 ) -> None:
     for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
         draw_curve(canvas, curve, MISSED_COLOUR)
@@ -206,7 +229,10 @@ def _draw_lines(
         draw_curve(canvas, curve, colour)
         for points in (bar, bar[0] + tick, bar[1] + tick):
             draw_curve(canvas, points, SIGMA_COLOUR)
-        draw_text(canvas, text, curve[-1], SIGMA_COLOUR, 0.3, (-8, 9))
+        if text:
+            below = curve[-1] + 2.5 * tick[1]
+            places = [(below, 0.5), (below, 1.0), (below, 0.0)]
+            _draw_label(canvas, text, places, SIGMA_COLOUR, 0.3, taken)
 
 
 def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
@@ -239,11 +265,6 @@ def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
         canvas[unseen] //= 3
         canvas[unseen] += np.array([0, 0, 80], np.uint8)
     return canvas
-
-
-def picture_name(prefix: str) -> str:
-    """Name of an image's picture without its ending, which cannot lead out of a folder."""
-    return image_name(prefix) or "frame"
 
 
 def png_of(picture: ByteArray) -> bytes:

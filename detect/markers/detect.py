@@ -1,12 +1,10 @@
 """The detector of square markers: one image in, markers with their corners out.
 
-`detect_markers` processes one image from top to bottom: the three phases of RAWSEEDS deliverable
-D2.1 part 2 (candidates, filtering, refinement and identification), the last by a fit of the whole
-marker, which makes the corners more accurate and rejects false markers.
-
-The homography of the refined corners gives the centres of the cells, whose grey values are compared
-with all patterns in all four rotations; the best matches are fitted. The nearest one is accepted if
-it is near enough and the second nearest clearly farther.
+`detect_markers` has the three phases of RAWSEEDS deliverable D2.1 part 2 (candidates, filtering,
+refinement and identification), the last by a fit of the whole marker, which makes the corners more
+accurate and rejects false markers. The homography of the refined corners gives the centres of the
+cells, whose grey values are compared with all patterns in all four rotations; the best matches are
+fitted. The nearest one is accepted if it is near enough and the second nearest clearly farther.
 """
 
 from __future__ import annotations
@@ -21,21 +19,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from camera import Camera
+from detect.markers import geometry
 from detect.markers.candidates import candidate_regions
 from detect.markers.dictionaries import Templates, templates_of
 from detect.markers.edges import RefinedQuadrangle, refine_quadrangle
-from detect.markers.geometry import (
-    NO_QUADRANGLE,
-    NOT_FOUR_CORNERS,
-    Picture,
-    count_same,
-    covered,
-    is_convex,
-    picture_of,
-    rough_corners,
-    signed_area,
-    square_homography,
-)
+from detect.markers.geometry import Picture
 from detect.markers.pattern_fit import PatternFit, fit_marker
 from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage, IntArray
@@ -99,9 +87,7 @@ _CLEAR_MISFIT, _CLEAR_AGREEMENT = 0.12, 0.85
 _BLURRED_MISFIT = (0.06, 0.03)
 _BLURRED_AGREEMENT = (0.92, 0.95)
 #: The same for patterns that also occur on other objects, and their largest error of a cell.
-_PLAIN_LARGEST_MISFIT = 0.04
-_PLAIN_LEAST_AGREEMENT = 0.95
-_PLAIN_LARGEST_CELL_ERROR = 0.25
+_PLAIN_MISFIT, _PLAIN_AGREEMENT, _PLAIN_CELL_ERROR = 0.04, 0.95, 0.25
 
 
 @dataclass(frozen=True)
@@ -170,7 +156,7 @@ def detect_markers(
         If the image is not an 8-bit grey image of the camera's size.
     """
     templates = templates_of(settings.dictionary, settings.ids)
-    picture = picture_of(image, camera)
+    picture = geometry.picture_of(image, camera)
 
     # Phases 1 and 2: dark regions that may be markers.
     regions, rejected = candidate_regions(
@@ -189,13 +175,13 @@ def detect_markers(
             rejected[rough] += 1
             continue
         outline = picture.bend(rough)
-        if markers and covered(rough, np.array([marker.corners for marker in markers])):
+        if markers and geometry.covered(rough, np.array([marker.corners for marker in markers])):
             candidates.append(Candidate(outline, SAME_MARKER))
             continue
-        if count_same(rough, tried) >= _TRIES:
+        if geometry.count_same(rough, tried) >= _TRIES:
             continue
         tried = np.concatenate([tried, rough[None]])
-        side = math.sqrt(signed_area(rough))
+        side = math.sqrt(geometry.signed_area(rough))
         capture_px = _CAPTURE_LAYER_PX * region.scale + _CAPTURE_PX + _CAPTURE_WIDTHS * side
         found = _marker_at(picture, rough, capture_px, templates, settings)
         if isinstance(found, str):
@@ -221,11 +207,12 @@ def detect_markers(
 
 def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
     """Rough corners of a region from its straight hull, or the reason for rejection."""
-    corners = rough_corners(hull)
-    if corners is None or not is_convex(corners):
-        return NOT_FOUR_CORNERS
-    if signed_area(corners) < settings.least_square * cv2.contourArea(hull.astype(np.float32)):
-        return NO_QUADRANGLE
+    corners = geometry.rough_corners(hull)
+    if corners is None or not geometry.is_convex(corners):
+        return geometry.NOT_FOUR_CORNERS
+    area = cv2.contourArea(hull.astype(np.float32))
+    if geometry.signed_area(corners) < settings.least_square * area:
+        return geometry.NO_QUADRANGLE
     return corners
 
 
@@ -245,7 +232,7 @@ def _marker_at(
         return OUTSIDE
 
     # Fit the whole marker with each likely pattern.
-    side = math.sqrt(signed_area(refined.corners))
+    side = math.sqrt(geometry.signed_area(refined.corners))
     blur_cells = refined.blur_px / (templates.dictionary.cell * side)
     if blur_cells > _HOPELESS_BLUR_CELLS:
         return TOO_SMALL
@@ -313,7 +300,8 @@ def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -
     centres, cell = templates.dictionary.centres, templates.dictionary.cell
     along = (centres[:, None] + _SPREAD_CELLS * cell * np.array([-1.0, 0.0, 1.0])).ravel()
     x, y = np.meshgrid(along, along)
-    straight = cv2.perspectiveTransform(np.stack([x, y], axis=-1), square_homography(corners))
+    homography = geometry.square_homography(corners)
+    straight = cv2.perspectiveTransform(np.stack([x, y], axis=-1), homography)
     u, v = picture.bend(np.asarray(straight, np.float64).reshape(-1, 2)).T
     height, width = picture.grey.shape
     if not np.all((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)):
@@ -348,9 +336,9 @@ def verified_quality(
     agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
     allowed = settings.largest_cell_error
     if templates.plain[template]:
-        misfit = min(misfit, _PLAIN_LARGEST_MISFIT)
-        agreement = max(agreement, _PLAIN_LEAST_AGREEMENT)
-        allowed = min(allowed, _PLAIN_LARGEST_CELL_ERROR)
+        misfit = min(misfit, _PLAIN_MISFIT)
+        agreement = max(agreement, _PLAIN_AGREEMENT)
+        allowed = min(allowed, _PLAIN_CELL_ERROR)
     if fit.explained < settings.least_explained or fit.misfit > misfit:
         return UNEXPLAINED
     error = np.abs(fit.cells - templates.cells[template])
@@ -388,8 +376,7 @@ def _nearest(whiteness: FloatArray, templates: Templates) -> tuple[int, float, f
 def _log_odds(fit: PatternFit, template: int, templates: Templates) -> tuple[float, float]:
     """Log-odds of a template against the most likely other one and the most likely decoy.
 
-    Cells are treated as independent, with their stated precision, reduced for the mixing of
-    neighbouring cells by blur.
+    Cells count as independent, with their stated precision, less by the mixing due to blur.
     """
     mixing = 1.0 + 4.0 * float(np.exp(-0.25 / fit.blur_cells**2))
     sigma = np.hypot(mixing * fit.cell_sigma, _LEAST_CELL_SIGMA)

@@ -62,9 +62,9 @@ def refine_quadrangle(
 ) -> RefinedQuadrangle | str:
     """Find the edges of a quadrangle (4, 2), clockwise at straight pixels, in the image.
 
-    `border` is the black border's thickness in widths of the marker; edges are searched within
-    `capture_px` of the rough ones. With three or more parts per edge, the covariance is computed
-    from the residuals of the steps. Returns the reason for rejection if there are no edges.
+    `border` is the black border's thickness in widths of the marker; edges are within `capture_px`
+    of the rough ones. Three or more parts per edge give the covariance from the residuals of the
+    steps. Returns the reason for rejection if there are no edges.
     """
     found = _edges_near(picture, rough, border, capture_px, settings, parts)
     if not isinstance(found, str):

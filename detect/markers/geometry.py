@@ -2,12 +2,9 @@
 
 Edges of markers are straight only in a pinhole image. All fits to edges therefore use *straight*
 positions, ``(scale x + offset)`` of the undistorted normalised coordinates, and their results are
-distorted again. Without a camera both are the same.
-
-The rough corners of a region are those of the quadrangle of largest area in its hull (algorithm B
-of RAWSEEDS deliverable D2.1 part 2); the report searches it by coordinate ascent, this module
-exhaustively over all diagonals. A marker's square is (0, 0) top left, (1, 0), (1, 1) bottom right,
-(0, 1).
+distorted again. The rough corners of a region are those of the quadrangle of largest area in its
+hull (algorithm B of RAWSEEDS deliverable D2.1 part 2, which searches by coordinate ascent, this
+module over all diagonals). A square is (0, 0) top left, (1, 0), (1, 1) bottom right, (0, 1).
 """
 
 from __future__ import annotations
@@ -78,8 +75,7 @@ def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
 
 @functools.lru_cache(maxsize=4)
 def _straight_positions(camera: Camera | None, width: int, height: int) -> Float32Array:
-    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-    pixels = np.stack([u, v], axis=-1)
+    pixels = np.moveaxis(np.mgrid[:height, :width][::-1], 0, -1).astype(np.float64)
     straight = pixels if camera is None else _straightened(camera, pixels)
     if not np.all(np.isfinite(straight)):
         raise FrameError("the calibration has no direction for some pixels of the image")

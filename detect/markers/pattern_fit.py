@@ -13,15 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from detect.markers import geometry
 from detect.markers.dictionaries import Templates
 from detect.markers.edges import RefinedQuadrangle
-from detect.markers.geometry import (
-    Picture,
-    corners_by_homography,
-    corners_of,
-    signed_area,
-    square_homography,
-)
+from detect.markers.geometry import Picture
 from detect.markers.pattern_model import (
     BLACK,
     BLUR,
@@ -121,7 +116,7 @@ def fit_marker(
     energy = left.weight * left.residual**2
     variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
     homography = _homography_of(p)
-    by_homography = corners_by_homography(homography)
+    by_homography = geometry.corners_by_homography(homography)
     whole = by_homography @ inverse[HOMOGRAPHY, HOMOGRAPHY] @ by_homography.T
     whole *= variance * _inflation(samples.pixel, left)
     if not (np.all(np.isfinite(whole)) and np.all(np.diag(whole) > 0.0)):
@@ -140,7 +135,7 @@ def fit_marker(
     contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
     unexplained = float(np.mean(left.residual**2)) - picture.noise**2
     return PatternFit(
-        corners=corners_of(homography) + centre,
+        corners=geometry.corners_of(homography) + centre,
         covariance=np.einsum("kikj->kij", whole.reshape(4, 2, 4, 2)),
         cells=cells[templates.grid, templates.grid].ravel(),
         cell_sigma=sigma[templates.grid, templates.grid].ravel(),
@@ -150,7 +145,7 @@ def fit_marker(
         blur_px=math.sqrt(0.5 * (p[BLUR][0] + p[BLUR][2])),
         blur_cells=float(blur.max()) / templates.dictionary.cell,
         surrounded=surrounded,
-        toned=corners_of(homography @ inner) - corners_of(homography),
+        toned=geometry.corners_of(homography @ inner) - geometry.corners_of(homography),
     )
 
 
@@ -172,7 +167,7 @@ def _solved(
     p = np.zeros(PARAMETERS)
     p[BLUR] = blur_guess, 0.0, blur_guess
     expected = p.copy()
-    p[HOMOGRAPHY] = square_homography(corners).flat[:8]
+    p[HOMOGRAPHY] = geometry.square_homography(corners).flat[:8]
     p[WHITE.start], p[BLACK.start] = np.median(start.light), np.median(start.dark)
     sigma = np.full(PARAMETERS, np.inf)
     sigma[BLUR] = blur_guess + 0.1, 0.5 * blur_guess + 0.05, blur_guess + 0.1
@@ -191,10 +186,10 @@ def _solved(
         if step == steps or moved < _CLOSE_ENOUGH_PX:
             break
         change = inverse @ (weighted @ left.residual + prior * (expected - p))
-        moved = float(np.abs(corners_by_homography(homography) @ change[HOMOGRAPHY]).max())
+        moved = float(np.abs(geometry.corners_by_homography(homography) @ change[HOMOGRAPHY]).max())
         change[HOMOGRAPHY] *= min(1.0, _STEP_REACHES * reach_px / max(moved, 1e-9))
         p = p + change
-        off = corners_of(_homography_of(p)) - corners
+        off = geometry.corners_of(_homography_of(p)) - corners
         if not np.hypot(*off.T).max() <= reach_px:
             return None
         p[TONE] = min(max(p[TONE], _TONES[0]), _TONES[1])
@@ -236,9 +231,8 @@ def _homography_of(p: FloatArray) -> FloatArray:
 def _inflation(pixel: IntArray, left: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
-    A residual with correlation rho to its neighbours in a row (decaying geometrically) counts as
-    (1 - rho) / (1 + rho) of an independent one; rows and columns alike. Only significant
-    correlation is considered.
+    With a significant correlation rho to its neighbours in a row (decaying geometrically), each
+    counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike.
     """
     weighted = left.residual * np.sqrt(left.weight)
     energy = max(float(np.mean(weighted**2)), 1e-12)
@@ -271,7 +265,7 @@ def _samples(
     pad = 1.5 * max(reach, 0.0) + 2.0
     begin, end = np.maximum(0, (low - pad).astype(int)), np.minimum(last, (high + pad).astype(int))
     # Every n-th pixel is used, and far from boundaries every 10 n-th, chosen by a hash.
-    area = abs(signed_area(corners))
+    area = abs(geometry.signed_area(corners))
     side = math.sqrt(area)
     expected = area + reach * 4.0 * side
     share = 1.0 - (1.0 - min(1.0, 2.0 * near * len(lines) / side)) ** 2
@@ -281,7 +275,7 @@ def _samples(
     some = hashed % every == 0
     pixel, hashed = np.stack([u[some], v[some]], axis=-1), hashed[some]
     straight = picture.straight[pixel[:, 1], pixel[:, 0]].astype(np.float64)
-    inverse = _inverse(square_homography(corners))
+    inverse = _inverse(geometry.square_homography(corners))
     projected = straight @ inverse[:, :2].T + inverse[:, 2]
     q = projected[:, 2:]
     place = projected[:, :2] / q

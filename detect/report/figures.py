@@ -29,8 +29,6 @@ from redetect.reporting.page import Part, figure_file, image_part
 
 #: Colours distinguishable in print and by the colour-blind; line styles differ as well.
 DATA, SECOND, REFERENCE, MARK, BAND = "#1f5f99", "#b8560f", "#777777", "#a8321e", "#2a78b5"
-
-
 SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _MOST_DOTS = 4000
@@ -60,7 +58,6 @@ def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -
         axes.plot(least, precision, color=SECOND, lw=1.4, ls="--", label="precision")
         axes.set_ylim(0.0, 1.05)
         _finish(axes, "least quality", "share")
-        axes.legend(fontsize=8)
     return _part("Recall and precision of the rows of a least quality.", content, 2.8)
 
 
@@ -83,7 +80,6 @@ def whitened_figure(residuals: FloatArray, what: str) -> Part:
             fontsize=9,
         )
         _finish(axes, f"residual / {SIGMA}", "density")
-        axes.legend(fontsize=8)
     words = (
         f"Residuals in units of the covariance that the rows state, {what}: standard normal if "
         "the covariances are right, wider if they are too small."
@@ -116,9 +112,8 @@ def floor_figure(pairs: DiscPairs) -> Part:
             if ends:
                 margin = 0.1 * np.ptp(ends) + 1e-3
                 axes.set_ylim(min(ends) - margin, max(ends) + margin)
-            _finish(axes, "distance / m", "difference / mm")
+            _finish(axes, "distance / m", "difference / mm", legend=axes is both[0])
             axes.set_title(name, fontsize=9)
-        both[0].legend(fontsize=8)
     words = (
         "Positions of the same disc on the floor, detected minus reference: each pair, and medians "
         "in bins of equal counts."
@@ -151,7 +146,6 @@ def _spread(words: str, x: str, y: str, at: FloatArray, values: FloatArray) -> P
         if (values > 0.0).any():
             axes.set_yscale("log")
         _finish(axes, x, y)
-        axes.legend(fontsize=8)
     words += " medians and 95 % quantiles in bins of equal counts."
     return _part(words, content, 2.8)
 
@@ -174,8 +168,7 @@ def tilt_figure(rows: Sequence[SeenRows]) -> Part:
             axes.fill_between(at, *band, color=BAND, alpha=0.3, lw=0, label=f"±1 {SIGMA}")
             axes.plot(at, angle, ".-", color=DATA, lw=0.9, ms=3)
             axes.axhline(0.0, color=REFERENCE, lw=0.6)
-            _finish(axes, "", name)
-        both[0].legend(fontsize=8)
+            _finish(axes, "", name, legend=axes is both[0])
         both[1].set_xlabel("frame")
     words = "Pitch and roll that level measured directions, with one standard deviation."
     return _part(words, content, 3.4)
@@ -188,9 +181,11 @@ def _dots(axes: Axes, at: FloatArray, values: FloatArray, colour: str) -> None:
     axes.plot(at[::thin], values[::thin], ".", color=colour, ms=size, alpha=alpha)
 
 
-def _finish(axes: Axes, x: str, y: str) -> None:
+def _finish(axes: Axes, x: str, y: str, *, legend: bool = True) -> None:
     axes.set(xlabel=x, ylabel=y)
     axes.grid(alpha=0.25, lw=0.6)
+    if legend:
+        axes.legend(fontsize=8)
 
 
 def _part(words: str, content: BytesIO, height: float) -> Part:
@@ -230,7 +225,6 @@ def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
         axes.set_aspect("equal", adjustable="datalim")
         axes.invert_xaxis()
         _finish(axes, "to the left / m", "forward / m")
-        axes.legend(fontsize=8)
     along = "along the path summed from the odometry" if poses.any() else "as seen from the robot"
     words = f"The floor from above: the ellipse of {_SIGMAS:g} standard deviations of each disc of "
     return _part(f"{words}each frame, {along}.{unmatched}", content, _WIDE)
@@ -240,8 +234,7 @@ def repeated(rows: Sequence[SeenRows]) -> Repeatability | None:
     """How well discs in successive frames agree, the latter moved by the odometry's step.
 
     Discs are paired within five standard deviations, unless these are too large to identify them.
-    The step's error is common to all pairs of two frames, and estimated from them. None without
-    pairs, or if all steps are zeros.
+    The step's error, common to the pairs of two frames, is estimated. None without pairs or steps.
     """
     left, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
     frames = [each.circles for each in rows]

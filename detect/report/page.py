@@ -12,14 +12,14 @@ import numpy as np
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
-from detect.drawing.frame import draw_rows, picture_name, processed
+from detect.drawing.frame import draw_rows, processed
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight, summed_steps
-from detect.sources.image_files import image_name
+from detect.sources.image_files import image_name, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect import __version__
@@ -225,9 +225,6 @@ def _uncertainty(inputs: ReportInputs) -> list[Part]:
     return parts
 
 
-# -- against the reference --------------------------------------------------------------------
-
-
 def _discs(result: DiscComparison | None) -> list[Part]:
     """Rates and errors of discs, and consistency of the covariances."""
     if result is None:
@@ -270,9 +267,6 @@ def _consistency(result: DiscComparison | LineComparison, what: str) -> list[Par
         share = np.mean(np.abs(residuals) <= k)
         rows.append((f"within {k} {figures.SIGMA} (normal: {normal:.3f})", f"{share:.3f}"))
     return [figures.whitened_figure(residuals, what), Part("figures", rows=tuple(rows))]
-
-
-# -- frames, tilt, settings -------------------------------------------------------------
 
 
 def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[str, str]]:

@@ -25,6 +25,7 @@ from detect.runs.plan import (
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
+from detect.sources.image_files import demand_pictures
 from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
@@ -45,7 +46,7 @@ def perform(command: DetectorFlags) -> int:
     pictures = getattr(command, "draw", None)
     if pictures is not None:
         demand_recording(command.run)
-        pictures.mkdir(parents=True, exist_ok=True)
+        demand_pictures(job.run.frames, pictures, overwrite=command.force)
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:

@@ -19,9 +19,10 @@ from redetect.messages import counted
 
 #: Approximate number of images from which the radius of the discs is estimated.
 _RADIUS_IMAGES = 12
-#: Runs of at least `_FEWEST_FRAMES` frames get a warning if few discs are found and the logarithms
-#: of the likely and the given radius differ by `_OTHER_RADIUS`.
-_FEWEST_FRAMES, _OTHER_RADIUS = 10, 0.15
+#: Runs of at least `_FEWEST_FRAMES` frames get a warning if less than `_FEW_DISCS` per frame are
+#: found (parts of larger discs are, or look-alikes) and the logarithms of the likely and the given
+#: radius differ by `_OTHER_RADIUS`.
+_FEWEST_FRAMES, _FEW_DISCS, _OTHER_RADIUS = 10, 3, 0.15
 #: Other settings are worth mentioning if they find this many times as many discs.
 _MANY = 3
 #: Number of images in which the discs' size is compared with their radius, and the difference of
@@ -73,9 +74,11 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
     leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
-    if not found["discs"] or (found["discs"] < seen >= _FEWEST_FRAMES):
-        yield from _hints_on_discs(run, leaning, settings, summary)
-    elif seen >= _FEWEST_FRAMES:
+    given, few = list[str](), found["discs"] < _FEW_DISCS * seen and seen >= _FEWEST_FRAMES
+    if few or not found["discs"]:
+        given = list(_hints_on_discs(run, leaning, settings, summary))
+    yield from given
+    if not given and found["discs"] >= seen >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii
 
         ratio = ratio_of_radii(list(some_images(run, _COMPARED_IMAGES)), leaning, settings)
@@ -91,9 +94,9 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
 def _hints_on_discs(
     run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
 ) -> Iterator[str]:
-    """Why a run has less than one disc per frame; nothing if no other settings find more."""
+    """Why a run has few discs per frame; nothing if no other settings find more."""
+    from detect.discs.explanation import why_none
     from detect.discs.radius import find_radius
-    from detect.discs.unfound import why_none
 
     images, number = list(some_images(run)), summary.found["discs"]
     in_images = f"in {len(images)} of the images"
@@ -120,7 +123,7 @@ def _hints_on_discs(
             "another height or pitch, or the calibration is not its own (`detect draw` shows "
             "outlines)."
         )
-    elif likely and settings.polarity != "any":
+    elif likely and settings.polarity != "any" and number < summary.frames:
         yield discs + f"--polarity any finds {likely.discs} {in_images}."
     elif _MANY * number < summary.frames:
         yield discs + (

@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 import cv2
 
-from detect.errors import WorkerError, imported_for
+from detect.errors import WorkerError
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, rows_of_failure
 from detect.terminal import on_compilation, say_compiling, show_announcements
 from redetect.interrupts import interrupts_deferred, raise_if_interrupt_waits
-from redetect.messages import excerpt
+from redetect.messages import excerpt, imported_for
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -217,7 +217,7 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     """
     if not re.fullmatch(r"[a-z]+://\S+:[0-9]+", address):
         raise WorkerError(f"cluster is {address!r}: expected the scheduler's tcp://host:port")
-    with imported_for("a cluster needs the package distributed", "cluster", error=WorkerError):
+    with imported_for("a cluster needs the package distributed", "cluster", WorkerError):
         from distributed import KilledWorker
     clients: list[Client] = []
 

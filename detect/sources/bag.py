@@ -25,11 +25,11 @@ from camera import Camera
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
-from detect.errors import DetectError, FrameError, imported_for
+from detect.errors import DetectError, FrameError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
-from redetect.messages import OneLineError, excerpt, one_line
+from redetect.messages import OneLineError, excerpt, imported_for, one_line
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -61,7 +61,7 @@ _INDEFINITE = 1e-9
 @contextmanager
 def opened_bag(path: Path) -> Iterator[AnyReader]:
     """Open a bag."""
-    with imported_for(f"{path}: bags are read by the package rosbags", "bags"):
+    with imported_for(f"{path}: bags are read by the package rosbags", "bags", DetectError):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     # Bags of older ROS 2 do not contain the definitions of their messages.
@@ -184,8 +184,7 @@ def content_of_message(message: Any, name: object) -> bytes | GreyImage:
 class Bag(Source):
     """Images of a bag, named ``<bag>.0000`` and so on.
 
-    The bag is a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; the topic as in
-    `SourceOptions`.
+    A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag; the topic as in `SourceOptions`.
     """
 
     def __init__(self, path: Path, image_topic: str = "") -> None:
@@ -231,10 +230,9 @@ class Bag(Source):
             found = next(messages(reader, self.path, topic), None)
         name = f"{self.path}: {one_line(topic, LONGEST_NAME)}"
         with understood(name):
-            # Drivers that are not calibrated publish a matrix of zeros.
-            if found is None or not np.any(_field(found[1], "k")):
-                return None
-            return _camera_of_info(found[1], name)
+            # ROS 1 has capital letters. Drivers that are not calibrated publish a matrix of zeros.
+            info = {} if found is None else {k.lower(): v for k, v in vars(found[1]).items()}
+            return _camera_of_info(info, name) if info and np.any(info["k"]) else None
 
     def poses(self, topic: str | None) -> PoseStream | None:
         """The odometry of a topic, or of the only one that has any."""
@@ -297,14 +295,10 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
         before = pose
 
 
-def _camera_of_info(message: Any, name: str) -> Camera:
+def _camera_of_info(info: dict[str, Any], name: str) -> Camera:
     """The camera of a whole image's camera_info, without its pose, in the project's model."""
-    fields = {letter: _field(message, letter).tolist() for letter in "dk"} | {
-        key: getattr(message, key)
-        for key in ("width", "height", "distortion_model", "binning_x", "binning_y")
-    }
     try:
-        foreign = camera_of_info({**fields, "roi": vars(message.roi)}, name)
+        foreign = camera_of_info({**info, "roi": vars(info["roi"])}, name)
     except ConversionError as error:
         raise DetectError(f"{error}: name a calibration by --camera") from None
     converted = convert_to_camera(foreign)
@@ -316,9 +310,3 @@ def _camera_of_info(message: Any, name: str) -> Camera:
         )
     assert isinstance(converted.camera, Camera)
     return converted.camera
-
-
-def _field(message: Any, letter: str) -> FloatArray:
-    """The numbers of a field of camera_info, which ROS 1 calls by a capital letter."""
-    name = letter.upper() if hasattr(message, letter.upper()) else letter
-    return np.array(getattr(message, name), dtype=np.float64)

@@ -13,16 +13,16 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
+from redetect.storage import demand_free
 from redetect.storage.bounded import leads_out, link_out
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
-
 WILDCARDS = frozenset("*?[")
 
 
@@ -32,6 +32,19 @@ def image_name(prefix: str) -> str:
     # Image suffixes only: the data set's prefixes end in a number, as in e.0067.
     stem, dot, extension = name.rpartition(".")
     return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
+
+
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending, which cannot lead out of a folder."""
+    return image_name(prefix) or "frame"
+
+
+def demand_pictures(frames: Frames, folder: Path, *, overwrite: bool) -> None:
+    """Make the folder for pictures of frames; reject existing pictures if names are known now."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not frames.ships_images:
+        names = (picture_name(frame.step.prefix) for frame in frames)
+        demand_free((folder / f"{name}.png" for name in names), overwrite=overwrite)
 
 
 def last_part(prefix: str) -> str:
@@ -70,8 +83,7 @@ class ImageNames:
     def image_of(self, prefix: str) -> Path | None:
         """A step's image, by the last part of its prefix; None if there is none.
 
-        A prefix that leads out of the run is a FrameError, so that a file of steps cannot cause
-        other files to be read.
+        FrameError if the prefix leads out of the run: steps cannot cause other files to be read.
         """
         name = prefix.strip('"')
         why = leads_out(name, *map(str, self._homes))
@@ -185,12 +197,10 @@ class ImageFiles(Source):
 
 def _matching_images(pattern: Path) -> ImageNames:
     """The images that a pattern matches, or one image, whose name may look like a pattern."""
-    if WILDCARDS & set(str(pattern.parent)) and not pattern.parent.is_dir():
-        raise DetectError(
-            f"{pattern}: wildcards in a folder's name: expected them in the last part only"
-        )
     if not pattern.parent.is_dir():
-        raise DetectError(f"{pattern}: no such folder: {pattern.parent}")
+        wild = "wildcards in a folder's name: expected them in the last part only"
+        missing = f"no such folder: {pattern.parent}"
+        raise DetectError(f"{pattern}: {wild if WILDCARDS & {*str(pattern.parent)} else missing}")
     name = glob.escape(pattern.name) if pattern.is_file() else pattern.name
     found = ImageNames(pattern.parent, name)
     if not found.names:

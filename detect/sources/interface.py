@@ -1,13 +1,10 @@
 """A run, its frames and their grey images, and the base classes of all image sources.
 
-A frame is a STEP row with its image; without odometry, an image with a STEP row of zeros. A run may
-be long: frames are made on demand.
-
-All images are converted to 8-bit grey images. Colour becomes 0.299 R + 0.587 G + 0.114 B, as in
-OpenCV (for a JPEG, its luminance). Of 16-bit images, the 8 highest of the bits that their values
-need are kept: values of a 12-bit camera are stored in 16-bit files, and would be nearly black
-otherwise. No image takes more memory than the images of its run do, whatever its file contains or
-claims.
+A frame is a STEP row, of zeros without odometry, with its image; frames are made on demand. Images
+become 8-bit grey ones. Colour is 0.299 R + 0.587 G + 0.114 B, as in OpenCV (for a JPEG, its
+luminance). Of 16-bit images, the 8 highest of the bits that their values need are kept: values of a
+12-bit camera in 16-bit files would be nearly black otherwise. No image takes more memory than the
+images of its run do, whatever its file contains or claims.
 """
 
 from __future__ import annotations
@@ -56,10 +53,7 @@ class RunFrame:
 
 
 class Frames(ABC):
-    """The frames of a run, made on demand.
-
-    Iterating again starts over (with a live camera: from then on).
-    """
+    """The frames of a run, made on demand; iterating again starts over (live: from then on)."""
 
     ships_images = True  # yields contents of images, not files
     expected: int | None = None  # approximate number of frames, if known
@@ -140,9 +134,8 @@ def read_image(
 ) -> GreyImage:
     """The grey image (H, W) of a frame; 16 bits become 8 (see `detect.sources.interface`).
 
-    It must have the size of the camera, if any. Paths are relative to `working_folder`, by default
-    the process's own. Raises FrameError if there is no image, it cannot be read, or has another
-    size.
+    Paths are relative to `working_folder`, by default the process's own. FrameError if there is no
+    image, it cannot be read, or has another size than the camera.
     """
     name: object = frame.image or frame.step.prefix
     size = None if camera is None else (camera.width, camera.height)
@@ -173,25 +166,16 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
     if content.startswith(b"\xff\xd8") and content.rfind(b"\xff\xd9", len(content) // 2) < 0:
         raise FrameError(f"{name}: the JPEG is truncated: its end is missing")
     claimed = claimed_size(content)
-    if claimed is not None and claimed[0] * claimed[1] > MOST_PIXELS:
-        raise FrameError(
-            f"{name}: cannot be decoded: claims {claimed[0]}x{claimed[1]} px: "
-            f"expected at most {MOST_PIXELS} pixels"
-        )
-    if claimed is not None and size is not None and size != claimed:
+    if claimed and size and size != claimed and claimed[0] * claimed[1] <= MOST_PIXELS:
         raise wrong_size(name, claimed, size)
-    image = None if claimed is None else decoded_image(content)
-    if image is None:
-        raise FrameError(f"{name}: cannot be decoded: expected an image")
-    return gray_of_pixels(image, name)
+    return gray_of_pixels(decoded_image(content, name, FrameError), name)
 
 
 def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
     """Convert pixels to (H, W) uint8 grey values, contiguous and writable.
 
-    Pixels are (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps
-    opacity, of 8 or 16 bits, any byte order and strides; else FrameError is raised. `name` as in
-    `decode_gray`.
+    From (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps opacity, of
+    8 or 16 bits, any byte order and strides; else FrameError, `name` as in `decode_gray`.
     """
     dtype = pixels.dtype.newbyteorder("=")
     if dtype not in (np.uint8, np.uint16):

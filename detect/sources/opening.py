@@ -7,9 +7,10 @@ import re
 from pathlib import Path
 
 from camera import Camera, read_camera
+from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.sources.image_files import IMAGE_SUFFIXES, WILDCARDS, ImageFiles
+from detect.sources.image_files import WILDCARDS, ImageFiles
 from detect.sources.interface import Frames, ImageRun, Run, Source
 from detect.sources.poses import (
     FramesAlongPoses,

@@ -9,17 +9,16 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import os
 import signal
 import threading
 import time
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import cv2
 
+from camera.calibration.images import opened_video, quiet_opencv
 from detect.errors import DetectError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from redetect.interrupts import interrupts_call
@@ -34,12 +33,12 @@ class VideoFile(Source):
         self.path = path
         self.name, self.beside = str(path), (path.parent, path.stem)
         self.output_base = path.with_name(f"{path.stem}.detected")
-        with _opened(path) as capture:
+        with self._opened() as capture:
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.expected = int(count) if math.isfinite(count) and 0 < count < 2**31 else None
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
-        with _opened(self.path) as capture:
+        with self._opened() as capture:
             per_second = capture.get(cv2.CAP_PROP_FPS)
             last_s = -math.inf
             for number in itertools.count():
@@ -56,35 +55,12 @@ class VideoFile(Source):
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
 
-
-@contextmanager
-def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    with quiet_opencv():
-        capture = cv2.VideoCapture(str(path))
-    try:
-        if not capture.isOpened():
-            raise DetectError(
-                f"{path}: no video that OpenCV can read: expected a run folder, images, a video "
-                "(avi, mp4, mkv), or a bag (.bag, .mcap, or the folder of a ROS 2 bag)"
-            )
-        # A calibration refers to the sensor's pixels, however a player would rotate them.
-        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        yield capture
-    finally:
-        capture.release()
-
-
-@contextmanager
-def quiet_opencv() -> Iterator[None]:
-    """Suppress messages of OpenCV and its FFmpeg on errors that are reported here."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    levels: Any = getattr(cv2.utils, "logging", cv2)  # where OpenCV 4 has them
-    before = levels.getLogLevel()
-    levels.setLogLevel(0)  # silent
-    try:
-        yield
-    finally:
-        levels.setLogLevel(before)
+    def _opened(self) -> AbstractContextManager[cv2.VideoCapture]:
+        error = DetectError(
+            f"{self.path}: no video that OpenCV can read: expected a run folder, images, a video "
+            "(avi, mp4, mkv), or a bag (.bag, .mcap, or the folder of a ROS 2 bag)"
+        )
+        return opened_video(self.path, error)
 
 
 class LiveCamera(Source):

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import JoiningNumbers
-from detect.verticals.judgement import Fate, Judgement, accepted_tracks
+from detect.verticals.judgement import Fate, JudgedTracks, accepted_tracks
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
 from detect.verticals.tilt import level_matrix, strongest_first
@@ -43,7 +43,7 @@ class Lines(NamedTuple):
 
 
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: Judgement, numbers: JoiningNumbers
+    strip: Strip, tracks: LineTracks, judged: JudgedTracks, numbers: JoiningNumbers
 ) -> Lines:
     """Lines of accepted tracks; updates the fates of tracks that are suppressed or joined."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)

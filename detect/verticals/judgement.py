@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from detect.line_settings import JudgementNumbers, LineNumbers
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines
 from detect.verticals.response import Strip
-from detect.verticals.tilt import TiltEstimate, Verticals, agree_on_tilt, gather, strongest_first
+from detect.verticals.tilt import (
+    TiltEstimate,
+    Verticals,
+    agree_on_tilt,
+    group_around_strongest,
+    strongest_first,
+)
 from detect.verticals.tracking import LineTracks
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
@@ -52,7 +58,7 @@ _DOUBTFUL = (Fate.NO_MAXIMUM, Fate.OFF_THE_TRACK, Fate.NOT_STRAIGHT, Fate.UNCERT
 _NEARLY = 0.7
 
 
-class Judgement(NamedTuple):
+class JudgedTracks(NamedTuple):
     """Lines through tracks, and their fates."""
 
     fits: LineFits  # a line for each track, unless that is too short or too faint
@@ -70,9 +76,13 @@ class Judgement(NamedTuple):
 
 
 def fit_and_judge(
-    image: GreyImage, strip: Strip, tracks: LineTracks, filters: StepFilters,
-    numbers: LineNumbers, before: Judgement | None = None,
-) -> Judgement:  # fmt: skip
+    image: GreyImage,
+    strip: Strip,
+    tracks: LineTracks,
+    filters: StepFilters,
+    numbers: LineNumbers,
+    before: JudgedTracks | None = None,
+) -> JudgedTracks:
     """Fit lines to tracks, select them individually, and estimate the consensus tilt.
 
     If only the doubtful tracks of an earlier pass were tracked again, only these are fitted.
@@ -89,7 +99,7 @@ def fit_and_judge(
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = Fate.NOT_VERTICAL
     consensus = tilt if tilt.lines > 0 else None
-    return Judgement(fits, evidence, fate, doubtful, consensus, lines, edge)
+    return JudgedTracks(fits, evidence, fate, doubtful, consensus, lines, edge)
 
 
 # Kernels that are launched one after the other compile faster than nested ones.
@@ -120,7 +130,7 @@ def _judge(
         near[k] = numbers.same_edge_px * fits.pixel_rad[t]
         own_evidence[k], polarity[k] = evidence[t], tracks.polarity[t]
     lines = _weigh(fits, accepted, votes, numbers)
-    edge = gather(place, near, own_evidence, polarity)
+    edge = group_around_strongest(place, near, own_evidence, polarity)
     share_edges(lines, edge)
     return evidence, fate, doubtful, accepted, lines, edge
 

@@ -245,7 +245,7 @@ def level_matrix(pitch: float, roll: float) -> FloatArray:
 
 
 @kernel()
-def gather(
+def group_around_strongest(
     place: FloatArray, reach: FloatArray, strength: FloatArray, kind: FloatArray
 ) -> IntArray:
     """Group lines of one kind around the strongest line that is in no group yet.
@@ -301,7 +301,9 @@ def _error_of_tilt(
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])
-    together = gather(bearing, np.full(count, TOGETHER_RAD), lines.weight, np.zeros(count))
+    together = group_around_strongest(
+        bearing, np.full(count, TOGETHER_RAD), lines.weight, np.zeros(count)
+    )
     edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
     xx, xy, yy = _stretch(groups, tilt, prior)
     n = grid.shape[1]

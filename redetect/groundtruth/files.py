@@ -22,6 +22,9 @@ from redetect.messages import excerpt, one_line
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_content
 
+#: A file or folder by name.
+PathLike = str | os.PathLike[str]
+
 _LARGEST_FILE_BYTES = 1 << 26
 _ROUNDING = 1e-6
 _DIGITS = re.compile(r"[-+0-9.eE]*")
@@ -29,11 +32,8 @@ _DIGITS = re.compile(r"[-+0-9.eE]*")
 NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 
-def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file with a JSON object.
-
-    Raises `GroundTruthError` if it cannot be read or is not one.
-    """
+def read_json(path: PathLike) -> dict[str, Any]:
+    """Read a file with a JSON object; raises `GroundTruthError` if it cannot be read or is none."""
     text = read_text(path, _LARGEST_FILE_BYTES, "JSON")
     try:
         content = json.loads(text)
@@ -51,8 +51,7 @@ def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
 class JsonObject:
     """An object of a JSON file, whose values are read by their names.
 
-    Missing or wrong values raise a `GroundTruthError` that states the place, the value and what was
-    expected.
+    Missing or wrong values raise a `GroundTruthError` with place, value and what was expected.
     """
 
     def __init__(self, place: str, value: Any) -> None:
@@ -61,7 +60,7 @@ class JsonObject:
         self.place, self.values = place, value
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> JsonObject:
+    def read(cls, path: PathLike) -> JsonObject:
         """The object in a file."""
         return cls(os.fspath(path), read_json(path))
 
@@ -173,9 +172,7 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
     return all(_has_shape(part, shape[1:]) for part in value)
 
 
-def write_json(
-    path: str | os.PathLike[str], content: Mapping[str, Any], *, overwrite: bool = False
-) -> None:
+def write_json(path: PathLike, content: Mapping[str, Any], *, overwrite: bool = False) -> None:
     """Write a JSON object with a line per entry of its objects, whole or not at all.
 
     Numbers that are not finite, which JSON does not have, are null.
@@ -197,7 +194,7 @@ def _laid_out(value: Any, indent: str = "") -> str:
     return json.dumps(value if finite else None, allow_nan=False)
 
 
-def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -> str:
+def read_text(path: PathLike, largest_bytes: int, expected: str) -> str:
     """The text of a file (UTF-8, perhaps with a byte order mark), packed (``.gz``) or not.
 
     `largest_bytes`: larger files are rejected. `expected`: the expected content, for the message
@@ -217,9 +214,7 @@ def read_text(path: str | os.PathLike[str], largest_bytes: int, expected: str) -
         raise GroundTruthError(f"{path}: not text: expected {expected}") from None
 
 
-def read_rows(
-    path: str | os.PathLike[str], largest_bytes: int = 1 << 28
-) -> Iterator[tuple[int, list[str]]]:
+def read_rows(path: PathLike, largest_bytes: int = 1 << 28) -> Iterator[tuple[int, list[str]]]:
     """Yield line numbers and words, without commas, comments and blank lines."""
     text = read_text(path, largest_bytes, "rows of numbers")
     for number, line in enumerate(text.split("\n"), 1):
@@ -238,14 +233,11 @@ class TableRow(NamedTuple):
     numbers: list[float]  # Of the others; finite
 
 
-def read_table(
-    path: str | os.PathLike[str], head: str, words: Collection[str] = ()
-) -> list[TableRow]:
+def read_table(path: PathLike, head: str, words: Collection[str] = ()) -> list[TableRow]:
     """Rows separated by commas or blanks after an optional head.
 
     `head` are the comma-separated names of the columns, `words` those with words; the others have
-    finite numbers. Raises `GroundTruthError` if the file cannot be read or a row is malformed; it
-    names file and line.
+    finite numbers. Raises `GroundTruthError` with file and line if a row is malformed.
     """
     names = head.split(",")
     rows: list[TableRow] = []
@@ -260,7 +252,7 @@ def read_table(
     return rows
 
 
-def known_name(path: str | os.PathLike[str], line: int, name: str, known: Collection[str]) -> str:
+def known_name(path: PathLike, line: int, name: str, known: Collection[str]) -> str:
     """A word of a row, which must be one of those known."""
     if name not in known:
         raise GroundTruthError(
@@ -270,7 +262,7 @@ def known_name(path: str | os.PathLike[str], line: int, name: str, known: Collec
 
 
 def parse_numbers(
-    path: str | os.PathLike[str], line: int, words: list[str], below: float = LARGEST_NUMBER
+    path: PathLike, line: int, words: list[str], below: float = LARGEST_NUMBER
 ) -> list[float]:
     """The words of a row as finite numbers, within a bound."""
     try:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.unfound import DiscExplanation, explain_discs
+from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
@@ -240,7 +240,8 @@ def detect(
     Parameters
     ----------
     image : (H, W) uint8, or path
-        Grey values of the camera's size, or an image file.
+        Grey values of the camera's size (an array, or a grey image of PIL or PyTorch), or an image
+        file.
     camera : Camera, or path
         The calibrated camera, or its `.cam` file.
     radius_m : float, optional
@@ -310,15 +311,10 @@ class RecordedFrame:
 
     @keywords_named()
     def detect(
-        self,
-        radius_m: float | None = None,
-        polarity: Polarity | None = None,
-        *,
-        level: bool = True,
-        axes: Axes = "dataset",
-        settings: CircleSettings | None = None,
+        self, radius_m: float | None = None, polarity: Polarity | None = None, *,
+        level: bool = True, axes: Axes = "dataset", settings: CircleSettings | None = None,
         line_settings: LineSettings | None = None,
-    ) -> Detection:
+    ) -> Detection:  # fmt: skip
         """Detect discs, verticals and tilt: see `detect`."""
         if axes not in MEANING:
             meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())
@@ -345,6 +341,8 @@ def settings_of(
             f"radius_m is {excerpt(radius_m)}: expected metres, which `detect all --radius-m auto` "
             "and detect.discs.radius.find_radius estimate from images"
         )
+    if not isinstance(settings, CircleSettings | None):
+        raise DetectError(f"settings is {excerpt(settings)}: expected rd.CircleSettings(...)")
     given: dict[str, Any] = {"radius_m": radius_m, "polarity": polarity}
     given = {name: value for name, value in given.items() if value is not None}
     return replace(settings or CircleSettings(), **given)
@@ -359,8 +357,10 @@ def camera_of(camera: CameraLike) -> Camera:
 
 def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
-    if isinstance(image, np.ndarray):
-        return RunFrame(still("image"), None, content=plain_image(image))
+    # Arrays of NumPy and PyTorch, and PIL's images but for those whose values refer to a palette.
+    arrays = hasattr(image, "__array__") or hasattr(image, "__array_interface__")
+    if arrays and getattr(image, "mode", "L") != "P":
+        return RunFrame(still("image"), None, content=plain_image(np.asarray(image)))
     path = path_of(image, "an array of grey values, or the name of an image file", FrameError)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
@@ -409,7 +409,7 @@ class Explanation(DiscExplanation):
     Attributes
     ----------
     image, camera, settings, at, candidates, place, suggestions
-        Those of `detect.discs.unfound.DiscExplanation`.
+        Those of `detect.discs.explanation.DiscExplanation`.
     """
 
     def picture(self) -> NDArray[np.uint8]:

@@ -12,15 +12,8 @@ import numpy as np
 
 from redetect.bounds import demand_fields
 from redetect.interface.inputs import keywords_named, path_of
-from redetect.landmarks.map_file import (
-    LandmarkMap,
-    Landmarks,
-    Path2D,
-    read_map,
-    with_joint_covariance,
-    write_map,
-    write_path,
-)
+from redetect.landmarks import map_file
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.messages import excerpt
 from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
 from redetect.slam.commands.filters import localized_run_of, path_distance
@@ -117,8 +110,8 @@ class RunMap(Table):
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        write_map(place / MAP_NAME, self.result.landmarks_jointly(), overwrite=overwrite)
-        write_path(place / PATH_NAME, self.path, overwrite=overwrite)
+        map_file.write_map(place / MAP_NAME, self.result.landmarks_to_write(), overwrite=overwrite)
+        map_file.write_path(place / PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:
         """(2 M, 2 M) covariance of all positions, discs first (m^2)."""
@@ -223,7 +216,7 @@ def localize(
     if isinstance(landmarks, RunMap):
         places = landmarks.result.landmarks_jointly()
     else:
-        places = with_joint_covariance(read_map(in_file), in_file)
+        places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
     result = localized_run_of(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
 

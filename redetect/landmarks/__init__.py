@@ -19,7 +19,6 @@ from redetect.landmarks.files import format_head as format_head
 from redetect.landmarks.files import format_levelling as format_levelling
 from redetect.landmarks.files import format_record as format_record
 from redetect.landmarks.files import frames_of_rows as frames_of_rows
-from redetect.landmarks.files import parse_record as parse_record
 from redetect.landmarks.files import parse_rows as parse_rows
 from redetect.landmarks.files import read_frames as read_frames
 from redetect.landmarks.files import read_rows as read_rows

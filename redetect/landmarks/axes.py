@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import FloatArray
 
 Axes = Literal["robotics", "dataset"]
 
@@ -39,8 +39,8 @@ def from_dataset(values: ArrayLike, axes: Axes = "robotics", *, back: bool = Fal
     old = np.array(values, dtype=np.float64)
     if axes == "dataset":
         return old
-    order, sign = _turn(old.shape[-1], back)
-    return np.asarray(old[..., order] * sign)
+    order = _ORDER[: old.shape[-1]]
+    return np.asarray(old[..., order] * (_SIGNS[order] if back else _SIGNS[: len(order)]))
 
 
 def to_dataset(values: ArrayLike) -> FloatArray:
@@ -55,10 +55,5 @@ def covariance_from_dataset(
     old = np.array(covariance, dtype=np.float64)
     if axes == "dataset":
         return old
-    order, sign = _turn(old.shape[-1], back)
+    order, sign = _ORDER[: old.shape[-1]], from_dataset(np.ones(old.shape[-1]), back=back)
     return np.asarray(old[..., order[:, None], order] * np.outer(sign, sign))
-
-
-def _turn(size: int, back: bool) -> tuple[IntArray, FloatArray]:
-    order = _ORDER[:size]
-    return order, (_SIGNS[order] if back else _SIGNS[:size])

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from redetect.landmarks.records import (
     CIRCLE_NUMBERS,
@@ -37,6 +37,7 @@ from redetect.landmarks.records import (
 )
 from redetect.messages import excerpt
 from redetect.storage import write_whole
+from redetect.storage.bounded import FilePath
 
 _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
@@ -53,7 +54,7 @@ _CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
 _LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
 
 
-def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
+def read_rows(path: FilePath) -> Iterator[Row]:
     """Read a landmark file row by row, comments and blank lines included.
 
     Written back with `write_rows`, unchanged rows are byte-identical.
@@ -76,19 +77,13 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[Row]:
         yield from parse_rows(stream, name=os.fspath(path))
 
 
-def read_frames(path: str | os.PathLike[str]) -> Iterator[Frame]:
-    """Read a landmark file frame by frame: each STEP with the landmarks after it.
-
-    Parameters, errors and laziness are those of `read_rows`.
-    """
+def read_frames(path: FilePath) -> Iterator[Frame]:
+    """Read a landmark file frame by frame: each STEP with the landmarks after it (`read_rows`)."""
     return frames_of_rows(read_rows(path))
 
 
-def read_steps(path: str | os.PathLike[str]) -> Iterator[Step]:
-    """Read a run's odometry: the STEP rows of a ``.txt``, ``.circles`` or ``.lines`` file.
-
-    Parameters, errors and laziness are those of `read_rows`; landmarks are checked and skipped.
-    """
+def read_steps(path: FilePath) -> Iterator[Step]:
+    """Read the STEP rows of a file of landmarks or odometry; errors as of `read_rows`."""
     return (row.record for row in read_rows(path) if isinstance(row.record, Step))
 
 
@@ -125,16 +120,8 @@ def parse_rows(stream: BinaryIO, name: str = "<stream>") -> Iterator[Row]:
         yield Row(record, source, line)
 
 
-def parse_record(text: str) -> Record | None:
-    """Parse the text of one row; None for a comment, a blank line or detector settings.
-
-    Raises LandmarkError if the row is malformed; the message states what was expected.
-    """
-    return _record(_words(text.encode("utf-8", "surrogateescape")))
-
-
 @contextmanager
-def opened(path: str | os.PathLike[str], kind: str) -> Iterator[BinaryIO]:
+def opened(path: FilePath, kind: str) -> Iterator[BinaryIO]:
     """Open a file of some kind for reading; system errors become `LandmarkFileError`."""
     try:
         with Path(path).open("rb") as stream:
@@ -188,12 +175,17 @@ def _record(words: list[bytes]) -> Record | None:
         _demand_count(words, 1 + len(STEP_NUMBERS), "prefix", *STEP_NUMBERS)
         return Step(decode(words[1]), *_numbers(words[2:], STEP_NUMBERS))
     # LANDMARK is the row's name in the comments at the head of the data set's files of circles.
-    if keyword in (b"LANDMARK_C", b"LANDMARK"):
-        px, py, quality, cxx, cxy, cyy = _numbers_before_ids(words, CIRCLE_NUMBERS)
-        return CircleLandmark(px, py, quality, cxx, cxy, cyy, _ids(words[7:]))
-    if keyword == b"LANDMARK_L":
-        xt, yt, xb, yb, alpha, beta, quality, sigma = _numbers_before_ids(words, LINE_NUMBERS)
-        return LineLandmark(xt, yt, xb, yb, alpha, beta, quality, sigma, _ids(words[9:]))
+    if keyword in (b"LANDMARK_C", b"LANDMARK", b"LANDMARK_L"):
+        is_line = keyword == b"LANDMARK_L"
+        names = LINE_NUMBERS if is_line else CIRCLE_NUMBERS
+        if len(words) < 1 + len(names):
+            raise LandmarkError(
+                f"{decode(keyword)} with {len(words) - 1} values: expected at least {len(names)}: "
+                f"{' '.join(names)} and any IDs"
+            )
+        kind: Any = LineLandmark if is_line else CircleLandmark
+        found: Landmark = kind(*_numbers(words[1:], names), _ids(words[1 + len(names) :]))
+        return found
     if keyword == b"LANDMARK_M":
         named = " ".join(MARKER_CORNER_NUMBERS)
         _demand_count(words, 23, "dictionary ID quality and four times", named)
@@ -217,15 +209,6 @@ def _demand_count(words: list[bytes], count: int, *names: str) -> None:
         raise LandmarkError(
             f"{decode(words[0])} with {len(words) - 1} values: expected {count}: {' '.join(names)}"
         )
-
-
-def _numbers_before_ids(words: list[bytes], names: tuple[str, ...]) -> list[float]:
-    if len(words) < 1 + len(names):
-        raise LandmarkError(
-            f"{decode(words[0])} with {len(words) - 1} values: expected at least {len(names)}: "
-            f"{' '.join(names)} and any IDs"
-        )
-    return _numbers(words[1:], names)
 
 
 def _numbers(words: list[bytes], names: tuple[str, ...]) -> list[float]:
@@ -285,16 +268,11 @@ def format_frame(frame: Frame) -> bytes:
 
 
 def write_frames(
-    path: str | os.PathLike[str],
-    frames: Iterable[Frame],
-    *,
-    head: str = "",
-    overwrite: bool = False,
+    path: FilePath, frames: Iterable[Frame], *, head: str = "", overwrite: bool = False
 ) -> None:
     """Write frames to a landmark file, whole or not at all, with a text as comments at its head.
 
-    Frames are written as they are iterated, so they need not all be in memory. If the file exists
-    and `overwrite` is false, raises `redetect.storage.OutputExistsError`.
+    They are written as they are iterated. OutputExistsError if it exists, unless `overwrite`.
     """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(format_head(head))
@@ -302,9 +280,7 @@ def write_frames(
             stream.write(format_frame(frame))
 
 
-def write_rows(
-    path: str | os.PathLike[str], rows: Iterable[Row], *, overwrite: bool = False
-) -> None:
+def write_rows(path: FilePath, rows: Iterable[Row], *, overwrite: bool = False) -> None:
     """Write rows to a landmark file, whole or not at all; unchanged ones are byte-identical.
 
     Rows with their text are copied; others are formatted by `format_record`, with the line end of

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,9 +18,8 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import FINITE, LARGEST_NUMBER
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_bytes
-from redetect.storage.bounded import read_bounded, read_plain_array
+from redetect.storage.bounded import FilePath, read_bounded, read_plain_array
 
-FilePath = str | os.PathLike[str]
 N = TypeVar("N", int, float)
 
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
@@ -117,11 +115,9 @@ def write_map(
 def read_map(path: FilePath) -> LandmarkMap:
     """Read a map written by `write_map`, or one made by hand with the same columns.
 
-    The columns may also be `SHORT_MAP_COLUMNS`: discs with covariances of 0. The joint
-    covariance is not read (see `with_joint_covariance`).
-
-    Raises LandmarkFileError if the file cannot be read, a row is malformed, a landmark is listed
-    twice or a covariance is negative; names file and line.
+    The columns may also be `SHORT_MAP_COLUMNS`: discs with covariances of 0. The joint covariance
+    is read by `with_joint_covariance`. Raises LandmarkFileError, with file and line, if the file
+    cannot be read, a row is malformed, a landmark is listed twice or a covariance is negative.
     """
     found: dict[str, dict[int, tuple[list[float], int]]] = {"disc": {}, "line": {}}
     what = "a map: map.csv of `slam map`"
@@ -170,13 +166,9 @@ def with_joint_covariance(landmark_map: LandmarkMap, map_file: Path) -> Landmark
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise LandmarkFileError(path, None, f"cannot be read: {reason}") from None
-    if found.shape != shape or found.dtype != np.float64:
-        raise LandmarkFileError(
-            path,
-            None,
-            f"{found.dtype} of shape {found.shape}: expected float64 of {shape}, x and y of each "
-            f"landmark of {map_file}",
-        )
+    if found.shape != shape:
+        words = f"is of shape {found.shape}: expected {shape}, x and y of each one of {map_file}"
+        raise LandmarkFileError(path, None, words)
     k = np.arange(len(own))
     blocks = found.reshape(len(own), 2, len(own), 2)[k, :, k, :]
     nearly = _SAME * float(np.max(np.abs(own), initial=0.0))
@@ -250,7 +242,7 @@ def _read(
         raise LandmarkFileError(path, None, f"cannot be read: {reason}: expected {what}") from None
     head: list[str] = []
     empty = True
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):  # names may have other line ends
         if not line.strip() or line.startswith("#"):
             continue
         try:

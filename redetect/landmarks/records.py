@@ -1,9 +1,8 @@
 """The rows of landmark files as values.
 
 Robot frame: X left, Y backward (forward is -Y), origin on the floor below the robot's centre;
-metres and radians. The field names are those of the format. Values that could not be read back from
-a file raise `LandmarkError`: numbers that are enormous or not finite, identifiers of more than 64
-bits, names that are not one word.
+metres and radians. Values that could not be read back from a file raise `LandmarkError`: numbers
+that are enormous or not finite, identifiers of more than 64 bits, names that are not one word.
 """
 
 from __future__ import annotations

@@ -98,18 +98,14 @@ def numbered_tilts(path: str | os.PathLike[str]) -> Iterator[tuple[int, FrameTil
 
 def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
     if words[0] != "TILT" or len(words) != 8:
-        raise LandmarkFileError(
-            name,
-            line,
-            f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count",
-        )
+        found = f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count"
+        raise LandmarkFileError(name, line, found)
     try:
-        pitch, roll, cpp, cpr, crr = map(float, words[2:7])
+        pitch, roll, cpp, cpr, crr = numbers = [float(word) for word in words[2:7]]
         lines = int(words[7])
     except ValueError:
-        pitch = roll = cpp = cpr = crr = math.nan
-        lines = 0
-    if not all(map(math.isfinite, (pitch, roll, cpp, cpr, crr))) or not 0 <= lines < 1 << 31:
+        numbers, lines = [math.nan], 0
+    if not all(map(math.isfinite, numbers)) or not 0 <= lines < 1 << 31:
         raise LandmarkFileError(name, line, "expected 5 finite numbers and a whole one")
     if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):
         raise LandmarkFileError(name, line, "the tilt's covariance is not positive definite")

@@ -29,11 +29,8 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
             except (IndexError, ValueError):
                 prefix, seconds = "", float("nan")
             if len(words) != 2 or not isfinite(seconds):
-                raise LandmarkFileError(
-                    path,
-                    line,
-                    f"{excerpt(' '.join(words))}: expected an image's prefix and seconds",
-                )
+                found = f"{excerpt(' '.join(words))}: expected an image's prefix and seconds"
+                raise LandmarkFileError(path, line, found)
             if prefix in times:
                 raise LandmarkFileError(path, line, f"{excerpt(prefix)} is listed a second time")
             times[prefix] = seconds

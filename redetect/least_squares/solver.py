@@ -93,8 +93,7 @@ class NormalEquations:
     border: FloatArray  # (K, s), between shared and other unknowns
     corner: FloatArray  # (s, s)
     corner_gradient: FloatArray  # (s,)
-    # (s, s): covariance of shared unknowns that are not estimated, but add to the others' errors.
-    considered: FloatArray | None = None
+    considered: FloatArray | None = None  # (s, s): covariance of shared ones, not estimated
 
     def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """Steps of both kinds of unknowns, with the diagonal scaled by 1 + damping (Marquardt).
@@ -107,9 +106,8 @@ class NormalEquations:
             return step, np.zeros(0)
         eliminated = factored.solve(self.border)
         corner = self.corner + damping * np.diag(np.diag(self.corner))
-        shared = scaled_inverse(corner - self.border.T @ eliminated) @ (
-            -self.corner_gradient - self.border.T @ step
-        )
+        inverse = scaled_inverse(corner - self.border.T @ eliminated)
+        shared = inverse @ (-self.corner_gradient - self.border.T @ step)
         return step - eliminated @ shared, shared
 
 

@@ -81,8 +81,7 @@ def figure_file(
 ) -> Iterator[tuple[Figure, io.BytesIO]]:
     """An empty figure of a given width and height (inches) to draw into, and its file afterwards.
 
-    `framed` axes have a line on all four sides. `new` creates the figure; for a window, it is
-    `matplotlib.pyplot.figure`.
+    `framed` axes have a line on all four sides; `new` is `matplotlib.pyplot.figure` for a window.
     """
     with mpl.rc_context():
         mpl.rcdefaults()

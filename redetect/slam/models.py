@@ -55,9 +55,8 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     Takes `pose` (..., 3), `step` (..., 3); returns (..., 3).
     """
     before, moved = np.broadcast_arrays(pose, step)
-    return np.concatenate(
-        [apply(before, moved[..., :2]), (before + moved)[..., 2:]], axis=-1, dtype=np.float64
-    )
+    xy, theta = apply(before, moved[..., :2]), (before + moved)[..., 2:]
+    return np.concatenate([xy, theta], axis=-1, dtype=np.float64)
 
 
 def with_heading(matrices: FloatArray) -> FloatArray:
@@ -151,8 +150,8 @@ def bearing_jacobians(
     squared = np.sum(seen**2, axis=-1)
     # d atan2(x, -y) = (-y dx + x dy) / (x^2 + y^2)
     by_seen = np.stack([-seen[..., 1], seen[..., 0]], axis=-1) / squared[..., None]
-    by_pose, by_line = disc_jacobians(pose, line_xy)
-    return (
-        np.asarray(np.einsum("...i,...ij->...j", by_seen, by_pose)),
-        np.asarray(np.einsum("...i,...ij->...j", by_seen, by_line)),
+    by_pose, by_line = (
+        np.asarray(np.einsum("...i,...ij->...j", by_seen, by))
+        for by in disc_jacobians(pose, line_xy)
     )
+    return by_pose, by_line

@@ -38,9 +38,8 @@ def rows_through_mounting(
 
 
 def _on_floor(ray: FloatArray, height_m: float) -> tuple[FloatArray, FloatArray]:
-    """Slopes (n, 2) of rays (n, 3), NaN if one does not go down.
-
-    Also the derivatives (n, 2, 3) of their points on the floor, ``-height_m * slope``, by the rays.
+    """Slopes (n, 2) of rays (n, 3), NaN if one does not go down, and the derivatives (n, 2, 3) by
+    the rays of their points on the floor, ``-height_m * slope``.
     """
     ray = np.where(ray[:, 2:] < 0.0, ray, np.nan)
     slope = ray[:, :2] / ray[:, 2:]
@@ -72,9 +71,8 @@ def rows_as_recorded(
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:
-    """Rotation vector in the robot frame (rad) and position (m), true minus calibrated.
-
-    Takes `mounting` (3, 4); returns (6,).
+    """(6,) rotation vector in the robot frame (rad) and position (m) of a mounting (3, 4), true
+    minus calibrated.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), mounting[:, 3] - camera.centre])

@@ -9,16 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from redetect.landmarks import (
-    CircleLandmark,
-    LineLandmark,
-    Record,
-    Row,
-    Step,
-    read_rows,
-    wrap_angle,
-    write_rows,
-)
+from redetect import landmarks
 from redetect.slam.options import Noise
 from redetect.slam.recording import Recording, landmark_files
 from redetect.slam.settings import AddedNoise
@@ -26,36 +17,36 @@ from redetect.slam.settings import AddedNoise
 
 def perform(options: Noise) -> int:
     """Execute the command; returns the exit code."""
-    noise = options.noise
-    (source,) = landmark_files(
-        options.run, circles=not options.lines, lines=options.lines, stem=options.stem
-    )
+    noise, lines = options.noise, options.lines
+    (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
     target = options.output or source.with_name(f"noisy{source.suffix}")
-    write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
+    rows = noisy_rows(landmarks.read_rows(source), noise)
+    landmarks.write_rows(target, rows, overwrite=options.force)
     print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
     return 0
 
 
-def noisy_rows(rows: Iterable[Row], noise: AddedNoise) -> Iterator[Row]:
-    """Rows of a landmark file with noise added.
+def noisy_rows(rows: Iterable[landmarks.Row], noise: AddedNoise) -> Iterator[landmarks.Row]:
+    """Rows of a landmark file with noise added; without noise they are unchanged.
 
-    Values are changed, covariances become the sum of both; IDs, qualities and comments stay. A
-    comment at the head states what was added. Without noise the rows are unchanged.
+    Covariances become the sum of both; a comment at the head states what was added.
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])
     for number, row in enumerate(rows):
         if number == 0 and not noise.nothing:
             line_end = b"\r\n" if (row.source or b"").endswith(b"\r\n") else b"\n"
-            yield Row(None, b"# " + noise.comment.encode() + line_end)
+            yield landmarks.Row(None, b"# " + noise.comment.encode() + line_end)
         record = row.record
-        rng = of_steps if isinstance(record, Step) else of_landmarks
+        rng = of_steps if isinstance(record, landmarks.Step) else of_landmarks
         yield row if record is None else row.with_record(_noisy(record, noise, rng))
 
 
-def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Record:
+def _noisy(
+    record: landmarks.Record, noise: AddedNoise, rng: np.random.Generator
+) -> landmarks.Record:
     """A row with noise; unchanged if its kind gets none."""
-    if isinstance(record, Step) and (noise.step_sigma or noise.turn_sigma):
+    if isinstance(record, landmarks.Step) and (noise.step_sigma or noise.turn_sigma):
         x, y, turn = rng.standard_normal(3).tolist()
         return replace(
             record,
@@ -66,7 +57,7 @@ def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Recor
             cyy=record.cyy + noise.step_sigma**2,
             cphiphi=record.cphiphi + noise.turn_sigma**2,
         )
-    if isinstance(record, CircleLandmark) and noise.sigma:
+    if isinstance(record, landmarks.CircleLandmark) and noise.sigma:
         x, y = rng.standard_normal(2).tolist()
         return replace(
             record,
@@ -75,10 +66,10 @@ def _noisy(record: Record, noise: AddedNoise, rng: np.random.Generator) -> Recor
             cxx=record.cxx + noise.sigma**2,
             cyy=record.cyy + noise.sigma**2,
         )
-    if isinstance(record, LineLandmark) and noise.bearing_sigma:
+    if isinstance(record, landmarks.LineLandmark) and noise.bearing_sigma:
         alpha = record.alpha + noise.bearing_sigma * float(rng.standard_normal())
         sigma = math.hypot(record.sigma, noise.bearing_sigma)
-        return replace(record, alpha=float(wrap_angle(alpha)), sigma=sigma)
+        return replace(record, alpha=float(landmarks.wrap_angle(alpha)), sigma=sigma)
     return record
 
 
@@ -101,7 +92,7 @@ def with_relative_noise(recording: Recording, factor: float, seed: int) -> Recor
         ),
         lines=replace(
             lines,
-            bearing_rad=wrap_angle(lines.bearing_rad + factor * turned),
+            bearing_rad=landmarks.wrap_angle(lines.bearing_rad + factor * turned),
             sigma_rad=lines.sigma_rad * math.sqrt(1.0 + factor**2),
         ),
     )

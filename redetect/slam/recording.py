@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks import (
-    Frame,
-    Step,
-    circle_arrays,
-    circle_landmarks,
-    is_positive_definite,
-    read_frames,
-)
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
@@ -37,7 +30,8 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
 # In the head of files by `detect`: the covariances of their discs include that of a tilt.
-_TILTED, _HEAD_BYTES = b" tilt_sigma_deg=", 1 << 16
+_TILTED = re.compile(rb" refine=True .*tilt_sigma_deg=(?!0(\.0*)?\s)")
+_HEAD_BYTES = 1 << 16
 # Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
@@ -49,8 +43,7 @@ class CircleRows:
     frame: IntArray  # (n,): of each row, ascending from 0: it was seen after step `frame`
     xy: FloatArray  # (n, 2): centres in the robot frame (m)
     covariance: FloatArray  # (n, 2, 2): of `xy` (m^2), positive definite
-    # (n,): -1 if unknown, as are all below 0; the first known one of a row with several.
-    ids: IntArray
+    ids: IntArray  # (n,): the first known one of each row; below 0 if there is none
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -64,17 +57,6 @@ class CircleRows:
         """The chosen rows."""
         return CircleRows(*(each[chosen] for each in vars(self).values()))
 
-    @classmethod
-    def of(cls, rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
-        """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
-        table = list(rows)
-        return cls(
-            np.array([row[0] for row in table], dtype=np.int64),
-            np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
-            np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
-            np.array([row[3] for row in table], dtype=np.int64),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class LineRows:
@@ -83,8 +65,7 @@ class LineRows:
     frame: IntArray  # (n,): of each row, ascending from 0
     bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
     sigma_rad: FloatArray  # (n,): its standard deviation, above 0
-    # All lines of each row (joined rows have several); empty if unknown.
-    ids: tuple[tuple[int, ...], ...]
+    ids: tuple[tuple[int, ...], ...]  # all lines of each row (joined ones); empty if unknown
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -174,12 +155,7 @@ def joined(runs: Sequence[Recording]) -> Recording:
         np.concatenate([part for run in runs for part in (np.zeros((1, 3)), run.steps)])[1:],
         np.concatenate([part for run in runs for part in (lost, run.step_covariance)])[1:],
         CircleRows(*map(np.concatenate, zip(*(vars(some).values() for some in circles)))),
-        LineRows(
-            np.concatenate([some.frame for some in lines]),
-            np.concatenate([some.bearing_rad for some in lines]),
-            np.concatenate([some.sigma_rad for some in lines]),
-            tuple(ids for some in lines for ids in some.ids),
-        ),
+        LineRows.of(row for some in lines for row in zip(*vars(some).values())),
         sum(run.unstated_steps for run in runs),
         any(run.tilted for run in runs),
     )
@@ -256,18 +232,18 @@ def read_recording(
         positive definite; the message names file, step and row.
     """
     files = landmark_files(Path(run), circles=circles, lines=lines, stem=stem)
-    frames = list(read_frames(files[0]))
+    frames = list(landmarks.read_frames(files[0]))
     for other in files[1:]:
-        frames = _merged(frames, list(read_frames(other)), files[0], other)
+        frames = _merged(frames, list(landmarks.read_frames(other)), files[0], other)
     found = recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
     with files[0].open("rb") as stream:
-        return replace(found, tilted=_TILTED in stream.read(_HEAD_BYTES))
+        return replace(found, tilted=bool(_TILTED.search(stream.read(_HEAD_BYTES))))
 
 
 def recording_of_frames(
-    frames: Sequence[Frame], name: str, noise: OdometryNoise = ASSUMED
+    frames: Sequence[landmarks.Frame], name: str, noise: OdometryNoise = ASSUMED
 ) -> Recording:
     """Gather frames to arrays."""
     if not frames:
@@ -282,7 +258,7 @@ def recording_of_frames(
         )
     unstated = ~np.any(covariance, axis=(1, 2))
     covariance[unstated] = noise.covariance(numbers[unstated, :3])
-    for bad in np.flatnonzero(~is_positive_definite(covariance)):
+    for bad in np.flatnonzero(~landmarks.is_positive_definite(covariance)):
         raise SlamError(
             f"{name}: step {bad + 1} ({steps[bad].prefix}): its covariance is not positive "
             "definite: expected a covariance of dx, dy and dphi of full rank"
@@ -297,29 +273,23 @@ def recording_of_frames(
     )
 
 
-def frames_of_discs(recording: Recording) -> list[Frame]:
-    """Steps and rows of discs as frames, the inverse of `recording_of_frames`.
-
-    The rows' quality is 1.
-    """
+def frames_of_discs(recording: Recording) -> list[landmarks.Frame]:
+    """Steps and rows of discs, of quality 1, as frames: the inverse of `recording_of_frames`."""
     circles, spread = recording.circles, recording.step_covariance.reshape(-1, 9)
-    quality = np.ones(len(circles))
     starts = np.searchsorted(circles.frame, np.arange(len(recording) + 1))
     numbers = np.column_stack([recording.steps, spread[:, [0, 1, 4, 2, 5, 8]]])
     frames = []
     for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers.tolist())):
-        some = slice(starts[k], starts[k + 1])
-        seen = circle_landmarks(
-            circles.xy[some], quality[some], circles.covariance[some], circles.ids[some]
-        )
-        frames.append(Frame(Step(prefix, *row), seen))
+        own = circles.only(slice(starts[k], starts[k + 1]))
+        seen = landmarks.circle_landmarks(own.xy, np.ones(len(own)), own.covariance, own.ids)
+        frames.append(landmarks.Frame(landmarks.Step(prefix, *row), seen))
     return frames
 
 
-def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
+def _circle_rows(frames: Sequence[landmarks.Frame], name: str) -> CircleRows:
     seen = [(k, row) for k, frame in enumerate(frames) for row in frame.circles]
-    rows = circle_arrays([row for _, row in seen])
-    for bad in np.flatnonzero(~is_positive_definite(rows.covariance)):
+    rows = landmarks.circle_arrays([row for _, row in seen])
+    for bad in np.flatnonzero(~landmarks.is_positive_definite(rows.covariance)):
         k, row = seen[bad]
         raise SlamError(
             f"{name}: step {k + 1} ({frames[k].step.prefix}): the disc at ({row.px:g}, {row.py:g}) "
@@ -329,7 +299,7 @@ def _circle_rows(frames: Sequence[Frame], name: str) -> CircleRows:
     return CircleRows(frame, rows.xy, rows.covariance, rows.ids)
 
 
-def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
+def _line_rows(frames: Sequence[landmarks.Frame], name: str) -> LineRows:
     seen = [(k, row) for k, frame in enumerate(frames) for row in frame.lines]
     for k, row in seen:
         if not row.sigma > 0.0:
@@ -342,7 +312,9 @@ def _line_rows(frames: Sequence[Frame], name: str) -> LineRows:
     )
 
 
-def _merged(first: list[Frame], second: list[Frame], one: Path, other: Path) -> list[Frame]:
+def _merged(
+    first: list[landmarks.Frame], second: list[landmarks.Frame], one: Path, other: Path
+) -> list[landmarks.Frame]:
     """Frames with the landmarks of both files, whose steps must be the same."""
     if len(first) != len(second):
         raise SlamError(f"{other}: {len(second)} steps: expected {len(first)}, as in {one}")
@@ -353,5 +325,5 @@ def _merged(first: list[Frame], second: list[Frame], one: Path, other: Path) -> 
                 f"{other}: step {k + 1} ({b.step.prefix}) is not that of {one} "
                 f"({a.step.prefix}): expected files of one run"
             )
-        merged.append(Frame(a.step, a.landmarks + b.landmarks))
+        merged.append(landmarks.Frame(a.step, a.landmarks + b.landmarks))
     return merged

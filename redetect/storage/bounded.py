@@ -25,10 +25,11 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from redetect.messages import one_line
+from redetect.messages import excerpt, one_line
+
+FilePath = str | os.PathLike[str]
 
 _LARGEST_TEXT_BYTES = 1 << 28
-
 _DRIVE = re.compile(r"[A-Za-z]:")
 #: Names that denote a device on Windows, in any folder and with any ending.
 _DEVICE = re.compile(
@@ -51,7 +52,7 @@ _TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
 _ORDINARY_TILE = 1 << 22
 
 
-def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool = False) -> bytes:
+def read_bounded(path: FilePath, largest_bytes: int, *, own: bool = False) -> bytes:
     """The content of a regular file, or a link to one, of at most `largest_bytes`.
 
     Pipes and devices are rejected, never waited for; if it must be the user's `own`, so are links,
@@ -84,9 +85,7 @@ def read_bounded(path: str | os.PathLike[str], largest_bytes: int, *, own: bool 
     return content
 
 
-def read_content(
-    path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
-) -> bytes:
+def read_content(path: FilePath, largest_bytes: int, kind: str, error: type[Exception]) -> bytes:
     """The content of a file of some kind; raises an `error` if `read_bounded` rejects it."""
     try:
         return read_bounded(path, largest_bytes)
@@ -96,9 +95,7 @@ def read_content(
         raise error(f"{path}: cannot be read as a {kind}: {why.strerror}") from None
 
 
-def read_text(
-    path: str | os.PathLike[str], largest_bytes: int, kind: str, error: type[Exception]
-) -> str:
+def read_text(path: FilePath, largest_bytes: int, kind: str, error: type[Exception]) -> str:
     """The text of a file (UTF-8, perhaps with a byte order mark); errors as in `read_content`."""
     try:
         return read_content(path, largest_bytes, kind, error).decode("utf-8-sig")
@@ -107,17 +104,24 @@ def read_text(
 
 
 def rows_of_numbers(
-    path: str | os.PathLike[str], kind: str, columns: str, error: type[Exception]
+    path: FilePath, kind: str, columns: str, error: type[Exception], *, head: bool = False
 ) -> Iterator[tuple[str, list[float]]]:
     """The place and the finite numbers of each row of a text file with the given columns.
 
-    They are separated by blanks or commas; ``#`` begins a comment. Other files raise an `error`.
+    They are separated by blanks or commas; ``#`` begins a comment. With a `head`, the names of the
+    columns come first. Other files raise an `error`.
     """
     count = len(columns.split())
     lines = read_text(path, _LARGEST_TEXT_BYTES, kind, error).split("\n")
     for number, line in enumerate(lines, start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
+            continue
+        if head:
+            if " ".join(words).lower() != columns:
+                found, expected = excerpt(line.strip()), columns.replace(" ", ",")
+                raise error(f"{path}:{number}: the header is {found}: expected {expected}")
+            head = False
             continue
         try:
             values = [float(word) for word in words]

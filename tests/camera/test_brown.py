@@ -18,8 +18,7 @@ from camera.distortion import (
     Coef,
     Polynomial,
     Tangential,
-    brown_jacobian,
-    brown_shift,
+    distorted_jacobian,
     fold_radius,
     one_to_one_radius,
     radial_factor,
@@ -28,7 +27,7 @@ from camera.distortion import (
 )
 from camera.formats.conversion import convert_to_camera, convert_to_foreign
 from camera.formats.models import ForeignCamera
-from camera.kernels import brown_shift_point, has_brown
+from camera.kernels import camera_numbers, project_direction
 from camera.model_checks import border_pixels
 from redetect.array_types import FloatArray
 from tests.camera.strategies import coefficients, pixel_grid
@@ -118,20 +117,22 @@ def test_with_a_denominator_all_terms_are_fitted_together() -> None:
     assert any(found.camera.polynomial)
 
 
-def test_the_compiled_terms_are_the_same() -> None:
-    for x, y in np.random.default_rng(2).normal(size=(20, 2)):
-        shift = brown_shift(np.array([x, y]), BROWN)
-        assert brown_shift_point(*BROWN, x, y) == pytest.approx(tuple(shift), rel=1e-13)
-    for place in range(5):
-        terms = np.zeros(5)
-        assert not has_brown(terms)
-        terms[place] = 1e-9
-        assert has_brown(terms)
+@pytest.mark.parametrize("place", range(5))
+def test_each_term_is_compiled_alike(published_camera: Camera, place: int) -> None:
+    term = [0.01 * (k == place) for k in range(5)]
+    tangential, polynomial = (term[0], term[1]), (term[2], term[3], term[4])
+    camera = replace(published_camera, tangential=tangential, polynomial=polynomial)
+    for direction in ([0.2, -1.0, -0.6], [-0.4, -1.0, -0.3]):
+        seen = project_direction(camera_numbers(camera), *direction)
+        at = camera.centre + direction
+        assert seen == pytest.approx(tuple(camera.project_robot(at)), rel=1e-12)
+        assert np.abs(seen - published_camera.project_robot(at)).max() > 1e-9
 
 
-def test_a_derivative_of_the_terms_is_symmetric() -> None:
-    derivative = brown_jacobian(np.random.default_rng(5).normal(size=(50, 2)), BROWN)
-    np.testing.assert_array_equal(derivative, derivative.swapaxes(-1, -2))
+def test_the_derivative_is_symmetric() -> None:
+    places = np.random.default_rng(5).normal(size=(50, 2))
+    derivative = distorted_jacobian(places, PUBLISHED, BROWN)
+    np.testing.assert_allclose(derivative, derivative.swapaxes(-1, -2), rtol=1e-12)
 
 
 # -- where it is one-to-one -----------------------------------------------------------------------

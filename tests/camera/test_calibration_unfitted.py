@@ -7,9 +7,14 @@ import pytest
 
 from camera import Camera
 from camera.boards.board import Board
-from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points
+from camera.calibration.adjustment import (
+    Adjusted,
+    Estimate,
+    Points,
+    fit_points,
+    with_unfitted_terms,
+)
 from camera.calibration.model import COUNT, CalibrationSettings, FreeLens
-from camera.calibration.unfitted import with_unfitted_terms
 from camera.rotations import rotation_of
 from camera.uncertainty import (
     IDENTITY,

@@ -292,9 +292,9 @@ def test_wrong_command_lines(small_run: Path, capsys: Captured, wrong: list[str]
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        (["circles", "images/e", "--radius-m", "-1"], "radius_m is -1: expected above 0"),
-        (["lines", "images/e", "--join-threshold", "-0.1"], "join_threshold is -0.1: expected 0"),
-        (["compare", "images/e", "--gate-m", "0"], "gate_m is 0: expected above 0"),
+        (["circles", "images/e", "--radius-m", "-1"], "--radius-m is -1: expected above 0"),
+        (["lines", "images/e", "--join-threshold", "-0.1"], "--join-threshold is -0.1: expected 0"),
+        (["compare", "images/e", "--gate-m", "0"], "--gate-m is 0: expected above 0"),
     ],
 )
 def test_a_setting_out_of_its_bounds_is_one_line(
@@ -352,7 +352,7 @@ def test_demands_decide_the_exit_code(
 def test_demands_are_shares(compared_run: Path, capsys: Captured, least: str) -> None:
     with pytest.raises(SystemExit):
         main(["compare", str(compared_run), "--min-recall", least])
-    assert f"min_recall is {least}: expected 0 to 1" in " ".join(capsys.readouterr().err.split())
+    assert f"--min-recall is {least}: expected 0 to 1" in " ".join(capsys.readouterr().err.split())
 
 
 def test_comparison_as_json(compared_run: Path, tmp_path: Path) -> None:
@@ -393,3 +393,12 @@ def test_help_needs_nothing_heavy() -> None:
     assert shown.splitlines()[-1] == "set()"
     for word in ("circles", "compare", "--preset", "--radius-m", "--min-recall", "--reference"):
         assert word in shown
+
+
+@pytest.mark.parametrize("help_flag", ["--help", "--help-all"])
+def test_help_has_the_defaults_of_the_preset(help_flag: str, capsys: Captured) -> None:
+    with pytest.raises(SystemExit):
+        main(["circles", "--preset", "published", help_flag])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    calibration = text.partition("--calibration-px FLOAT")[2].partition(" --")[0]
+    assert "(default: 0.0)" in calibration

@@ -26,7 +26,7 @@ from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.interface import decode_gray
 from lut.verticals import build_vertical_table
-from redetect.landmarks import Frame, LineLandmark, Step, parse_record
+from redetect.landmarks import Frame, LineLandmark, Step
 from tests.detect.line_scene import (
     EDGES,
     Edge,
@@ -38,6 +38,7 @@ from tests.detect.line_scene import (
     tilted,
 )
 from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks, tracks_again
+from tests.landmarks.rows import parse_record
 from tests.pictures import read_grey
 from tests.reference.verticals import compensated_bearings, inclinations, plane_normals
 

@@ -82,4 +82,4 @@ def test_refusals(tmp_path: Path, content: str, words: str) -> None:
 def test_a_missing_file_is_one_line(tmp_path: Path, capsys: Captured) -> None:
     missing = str(tmp_path / "none.json")
     assert main(["circles", "run", "--settings", missing]) == 1
-    assert capsys.readouterr().err.startswith(f"error: {missing}: cannot be read")
+    assert capsys.readouterr().err.startswith(f"error: {missing}: no such settings file")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import http.client
 import json
 import math
+import re
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +180,46 @@ def test_settings_and_labels_are_saved(server: TuningServer, tmp_path: Path) -> 
     assert [len(frame.circles) for frame in frames] == [0, 1, 0]
     (row,) = frames[1].circles
     assert (row.px, row.py, row.ids) == (0.5, -2.0, (17,))
+
+
+def test_a_page_that_is_loaded_again_begins_with_what_was_saved(
+    server: TuningServer, tmp_path: Path
+) -> None:
+    label = {"px": 0.5, "py": -2.0, "quality": 0.9, "cxx": 1e-4, "cxy": 0.0, "cyy": 2e-4, "id": 17}
+    post(server, "/save", {"settings": {"radius_m": 0.06}, "labels": {"1": [label]}})
+    described = server.session.described()
+    assert described["labels"] == {"1": [label]}
+    assert described["settings"]["radius_m"] == 0.06
+    post(server, "/save", {"settings": {}, "labels": {"1": []}})  # the label is removed again
+    frames = read_frames(tmp_path / "tuned" / "labels.circles")
+    assert [len(frame.circles) for frame in frames] == [0, 0, 0]
+
+
+def test_every_slider_is_a_setting(server: TuningServer) -> None:
+    _, page = ask(server, "GET", f"/?token={server.token}")
+    sliders = re.findall(r'\["(\w+)", "[^"]+", [-\d.]+, [-\d.]+, [\d.]+\]', page.decode())
+    assert len(sliders) == 8
+    assert set(sliders) <= set(asdict(CircleSettings()))
+
+
+def test_a_browser_that_leaves_shows_no_traceback(
+    server: TuningServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for error in (BrokenPipeError(), ConnectionResetError()):
+        try:
+            raise error
+        except OSError:
+            server.handle_error(None, None)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", ["tuned.json", "labels.circles"])
+def test_files_that_could_not_be_saved_are_named_at_the_start(
+    project_root: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("mine")
+    assert main(["tune", str(project_root / "images" / "e"), "--serve", "-o", str(tmp_path)]) == 1
+    assert f"{name}: exists already" in capsys.readouterr().err
 
 
 def test_files_of_others_are_not_replaced(server: TuningServer, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -102,3 +103,22 @@ def test_times_of_a_video_are_in_its_recording(small_run: Path, tmp_path: Path) 
     assert main(["view", str(video), *camera, "-o", str(output)]) == 0
     times = [row["time"].total_seconds() for row in read_back(output)["/world/robot"]]
     assert times == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)
+
+
+@pytest.mark.long
+def test_a_frame_without_rows_or_image_shows_none_of_the_one_before(
+    small_run: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    assert main(["circles", str(small_run)]) == 0
+    rows = small_run / "detected.circles"
+    head, *frames = re.split(r"(?m)^(?=STEP )", rows.read_text())
+    rows.write_text(head + frames[0])
+    (small_run / "images" / "s.0001.png").write_bytes(b"no image")
+    output = tmp_path / "v.rrd"
+    assert main(["view", str(small_run), "-o", str(output), "--frames", "2"]) == 3
+    found = read_back(output)
+    discs = {row["frame"]: row["LineStrips3D:strips"] for row in found["/world/robot/discs"]}
+    assert discs[0]
+    assert not discs[1]
+    assert [row["frame"] for row in found["/camera/image"] if row.get("Clear:is_recursive")] == [1]

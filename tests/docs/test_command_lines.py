@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import tyro
 
+from redetect import command_line
 from redetect.cli import PROGRAMS
 from tests.docs.blocks import blocks_of, commands_in, documents
 
@@ -27,15 +28,18 @@ class Parsed(BaseException):
 def accepts(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], bool]:
     """Whether a command accepts the words behind its name; it does not come to performing."""
 
-    def parse_only(parse: Callable[..., Any]) -> Callable[..., None]:
-        def parse_and_stop(*arguments: Any, **options: Any) -> None:
-            parse(*arguments, **options)
+    def parse_only(parse: Callable[..., Any]) -> Callable[..., Any]:
+        def parse_and_stop(*arguments: Any, **options: Any) -> Any:
+            parsed = parse(*arguments, **options)
+            if "return_unknown_args" in options:
+                return parsed  # what is unknown is refused later
             raise Parsed
 
         return parse_and_stop
 
     for place, name in (
         (tyro, "cli"),
+        (command_line, "_parsed_as"),
         (tyro.extras, "subcommand_cli_from_dict"),
         (argparse.ArgumentParser, "parse_args"),
     ):

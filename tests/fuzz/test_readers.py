@@ -157,7 +157,7 @@ NASTY = [
     ("opencv", b"[" * 5000, "invalid YAML"),
     ("camera info", b"!!python/object/apply:os.system ['true']\n", "expected YAML"),
     ("kalibr", b"a: {intrinsics: 1}\n" + b"b" * 900 + b": {intrinsics: 1}\n", "it holds a, bbb"),
-    ("floor points", b"u,v,x,y\n\"" + b"1" * 200_000, "expected floor points"),
+    ("floor points", b"u,v,x,y\n\"" + b"1" * 200_000, "expected 4 numbers: u v x y"),
     ("floor points", b"\xff\n", "floor points: it is not text"),
     ("settings", b"# settings threshold=1-2\n", "expected a number"),
     ("settings", b"# settings polarity=" + b"x" * 60_000, "expected one of"),

@@ -204,6 +204,19 @@ def test_parts_and_equality(found: rd.Detection, demo_image: Path, demo_camera: 
     assert undone == replace(undone)
 
 
+@pytest.mark.parametrize("interface", ["__array__", "__array_interface__"])
+def test_images_of_other_libraries(
+    interface: str, found: rd.Detection, demo_camera: rd.Camera
+) -> None:
+    """PyTorch's have `__array__`, PIL's `__array_interface__`; palettes are not grey values."""
+    attribute = getattr(found.image, interface)
+    kind = type("Image", (), {interface: attribute, "mode": "L"})
+    assert ANY.detect(kind(), demo_camera).discs == rd.detect(found.image, demo_camera).discs
+    kind.mode = "P"  # type: ignore[attr-defined]
+    with pytest.raises(rd.Error, match="expected an array of grey values"):
+        ANY.detect(kind(), demo_camera)
+
+
 #: The API for arguments that type checkers refuse.
 ANY: Any = rd
 
@@ -217,6 +230,7 @@ ANY: Any = rd
         (lambda one: ANY.detect(one.image[:9], one.camera), "of these images by `camera`$"),
         (lambda one: ANY.detect(one.image, {}), "expected a Camera, or the name of its .cam file"),
         (lambda one: ANY.detect(one.image, one.camera, "auto"), "expected metres, which"),
+        (lambda one: ANY.detect(one.image, one.camera, settings={}), "expected rd.CircleSettings"),
         (lambda one: ANY.detect(one.image, one.camera, axes="rep103"), "robotics are REP 103's"),
         (lambda _: ANY.open(["e"]), "expected the name of a run"),
         (lambda _: ANY.open("images/e/images"), "named by `camera`; `camera calibrate`"),
@@ -390,7 +404,7 @@ def test_places_where_nothing_can_be_found(
     demo_image: Path, demo_camera: rd.Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Looking for another radius takes long; that it is found is tried above.
-    monkeypatch.setattr("detect.discs.unfound._radius_at", lambda *_: None)
+    monkeypatch.setattr("detect.discs.explanation._radius_at", lambda *_: None)
     for wrong in ((300.0,), (1, 2, 3), 5, "ab"):
         with pytest.raises(rd.Error, match=r"at is .*: expected a pixel"):
             rd.explain(demo_image, demo_camera, wrong)  # type: ignore[arg-type]

@@ -84,3 +84,10 @@ def test_a_malformed_map_names_the_line(tmp_path: Path, text: str, message: str)
     (tmp_path / "m.csv").write_text(text)
     with pytest.raises(LandmarkFileError, match=message):
         read_map(tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize("mark", ["\u2028", "\x85", "\x0b", "\x1c"])
+def test_prefixes_of_a_path_may_have_any_other_mark(tmp_path: Path, mark: str) -> None:
+    path = Path2D((f"a{mark}b",), np.zeros((2, 3)))
+    write_path(tmp_path / "p.csv", path)
+    assert read_path(tmp_path / "p.csv").prefixes == path.prefixes

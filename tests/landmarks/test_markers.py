@@ -15,8 +15,8 @@ from redetect.landmarks import (
     MarkerLandmark,
     Step,
     format_record,
-    parse_record,
 )
+from tests.landmarks.rows import parse_record
 
 ROW = (
     "LANDMARK_M rawseeds 31 0.987 "

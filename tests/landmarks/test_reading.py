@@ -15,12 +15,12 @@ from redetect.landmarks import (
     LandmarkFileError,
     LineLandmark,
     Step,
-    parse_record,
     parse_rows,
     read_frames,
     read_rows,
     read_steps,
 )
+from tests.landmarks.rows import parse_record
 
 STEP = "STEP e.0067 0.00391 -0.15602 -0.00218 0.1 0.2 0.3 0.4 0.5 0.6"
 CIRCLE = "LANDMARK_C -0.302229 -2.66488 0.962567 0.00169895 0.000127857 0.00293675 26"

@@ -17,7 +17,6 @@ from redetect.landmarks import (
     Row,
     format_record,
     frames_of_rows,
-    parse_record,
     parse_rows,
     read_frames,
     read_rows,
@@ -25,6 +24,7 @@ from redetect.landmarks import (
     write_rows,
 )
 from redetect.storage import OutputExistsError
+from tests.landmarks.rows import parse_record
 
 # The report's figures 7, 10 and 11, and a row of run c. Where the report's print has one blank
 # between columns, files have two before a positive number of a pose.

@@ -45,7 +45,7 @@ def test_what_users_need_has_a_lower_and_an_upper_end(project_root: Path) -> Non
 def test_the_lowest_versions_are_those_that_are_allowed(project_root: Path) -> None:
     """Of all that users may need: the declared ends, to the last digit that they give."""
     found = pinned(project_root / "requirements" / "lowest.txt")
-    wanted = declared(project_root, ("cluster", "bags", "parquet", "view", "slam"))
+    wanted = declared(project_root, ("cluster", "bags", "dxf", "parquet", "view", "slam"))
     assert set(wanted) <= set(found)
     tools = declared(project_root, ("dev",))
     for name in set(found) & (set(wanted) | set(tools)):
@@ -61,7 +61,9 @@ def test_the_lowest_versions_are_what_is_installed(project_root: Path) -> None:
     assert pinned(folder / "lowest.txt").items() <= locked.items()
 
 
-@pytest.mark.parametrize("extras", [(), ("cluster", "bags", "parquet", "view", "slam"), ("dev",)])
+@pytest.mark.parametrize(
+    "extras", [(), ("cluster", "bags", "dxf", "parquet", "view", "slam"), ("dev",)]
+)
 def test_the_lock_is_within_what_is_allowed(project_root: Path, extras: tuple[str, ...]) -> None:
     found = pinned(project_root / "requirements" / "lock.txt")
     for name, requirement in declared(project_root, extras).items():

@@ -221,7 +221,7 @@ def test_an_image_that_cannot_be_read_costs_itself(
         ({"camera": ""}, "parameters camera and image_transport: expected a .cam file"),
         ({"camera": "gone.cam"}, "gone.cam"),
         ({"image_transport": "theora"}, "raw or compressed"),
-        ({"settings": "gone.json"}, "gone.json: cannot be read"),
+        ({"settings": "gone.json"}, "gone.json: no such settings file"),
         ({"radius_m": -1.0}, "radius_m is -1"),
     ],
 )

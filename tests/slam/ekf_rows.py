@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -20,14 +22,25 @@ def spd(rng: np.random.Generator, size: int, scale: float) -> FloatArray:
     return np.asarray(scale**2 * (root @ root.T / size + 0.3 * np.eye(size)))
 
 
+def circle_rows(rows: Iterable[tuple[int, ArrayLike, ArrayLike, int]] = ()) -> CircleRows:
+    """Rows of frame, centre (2,), covariance (2, 2) and identifier."""
+    table = list(rows)
+    return CircleRows(
+        np.array([row[0] for row in table], dtype=np.int64),
+        np.array([row[1] for row in table], dtype=np.float64).reshape(-1, 2),
+        np.array([row[2] for row in table], dtype=np.float64).reshape(-1, 2, 2),
+        np.array([row[3] for row in table], dtype=np.int64),
+    )
+
+
 def rows_of(discs: list[tuple[int, FloatArray, FloatArray]]) -> FrameRows:
-    rows = CircleRows.of((0, xy, covariance, number) for number, xy, covariance in discs)
+    rows = circle_rows((0, xy, covariance, number) for number, xy, covariance in discs)
     return FrameRows(rows, LineRows.of())
 
 
 def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
     rows = LineRows.of((0, bearing, sigma, numbers) for numbers, bearing, sigma in lines)
-    return FrameRows(CircleRows.of(), rows)
+    return FrameRows(circle_rows(), rows)
 
 
 def localizer(pose: ArrayLike, discs: ArrayLike, lines: ArrayLike) -> Localizer:

@@ -9,7 +9,8 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.plane import between, chain_steps
 from redetect.slam.models import bearing_of_vertical, disc_in_robot
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import circle_rows
 
 CAMERA_XY = np.array([0.018, -0.081])
 
@@ -54,14 +55,14 @@ def small_run(
     step_covariance = shape @ np.diag(sigma)
     measured = true_steps + noise * rng.multivariate_normal(np.zeros(3), step_covariance, steps)
 
-    circle_rows, line_rows = [], []
+    disc_rows, line_rows = [], []
     for k in range(steps):
         seen = disc_in_robot(poses[k + 1], disc_xy)
         ahead = (seen[:, 1] < -0.9) & (np.abs(seen[:, 0]) < -seen[:, 1])
         for i in np.flatnonzero(ahead & (np.linalg.norm(seen, axis=1) < 3.5)):
             spread = 0.0016 * np.eye(2) + 0.0004 * np.outer(seen[i], seen[i]) / 4
             error = noise * rng.multivariate_normal(np.zeros(2), spread)
-            circle_rows.append((k, seen[i] + error, spread, int(i) + 1))
+            disc_rows.append((k, seen[i] + error, spread, int(i) + 1))
         bearing = bearing_of_vertical(poses[k + 1], line_xy, CAMERA_XY)
         for j in np.flatnonzero(np.abs(bearing) < 1.2):
             off = noise * 0.004 * rng.standard_normal()
@@ -70,7 +71,7 @@ def small_run(
         prefixes=tuple(f"s.{k:04d}" for k in range(steps)),
         steps=measured,
         step_covariance=np.tile(step_covariance, (steps, 1, 1)),
-        circles=CircleRows.of(circle_rows),
+        circles=circle_rows(disc_rows),
         lines=LineRows.of(line_rows),
     )
     return SmallRun(recording, poses, disc_xy, line_xy)

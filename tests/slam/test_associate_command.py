@@ -93,11 +93,11 @@ def test_existing_files_and_settings_without_sense_are_refused(
     assert not target.exists()
     (tmp_path / "kept.json").unlink()
     for setting, message in (
-        (["--gate-probability", "1.5"], "gate_probability is 1.5"),
-        (["--sigma-scale", "0"], "sigma_scale is 0"),
-        (["--tilt-sigma-deg", "-1"], "tilt_sigma_deg is -1"),
-        (["--kept-probability", "0"], "kept_probability is 0"),
-        (["--fewest-rows", "0"], "fewest_rows is 0"),
+        (["--gate-probability", "1.5"], "--gate-probability is 1.5"),
+        (["--sigma-scale", "0"], "--sigma-scale is 0"),
+        (["--tilt-sigma-deg", "-1"], "--tilt-sigma-deg is -1"),
+        (["--kept-probability", "0"], "--kept-probability is 0"),
+        (["--fewest-rows", "0"], "--fewest-rows is 0"),
     ):
         with pytest.raises(SystemExit, match="2"):
             main(["associate", run, "-o", str(target), *setting])

@@ -32,6 +32,7 @@ from redetect.slam.association.loops import (
 )
 from redetect.slam.models import bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
+from tests.slam.ekf_rows import circle_rows
 
 
 @given(
@@ -283,7 +284,7 @@ def test_bearings_intersect_where_the_line_stands() -> None:
         tuple(map(str, range(20))),
         between(path[:-1], path[1:]),
         np.tile(np.eye(3), (20, 1, 1)),
-        CircleRows.of(),
+        circle_rows(),
         LineRows(frame, bearing, np.full(60, 0.002), tuple((int(i),) for i in label)),
     )
     found = intersect_bearings(recording, path, label, camera_xy=(0.02, -0.08))

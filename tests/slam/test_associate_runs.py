@@ -16,6 +16,7 @@ from redetect.slam.association.score import score_association
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings, Method
+from tests.slam.ekf_rows import circle_rows
 
 CAMERA_XY = (0.02, -0.08)
 STEP_SIGMA = np.array([0.004, 0.004, 0.006])
@@ -65,7 +66,7 @@ def drive(
         prefixes=tuple(f"s.{k}" for k in range(count)),
         steps=steps,
         step_covariance=covariance,
-        circles=CircleRows.of((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, i, xy in seen),
+        circles=circle_rows((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, i, xy in seen),
         lines=LineRows.of((k, float(wrap_angle(b)), LINE_SIGMA, (i,)) for k, i, b in upright),
     )
 
@@ -301,7 +302,7 @@ def test_clutter_does_not_keep_the_labels_of_a_disc_apart() -> None:
         tuple(map(str, range(12))),
         between(path[:-1], path[1:]),
         np.tile(1e-6 * np.eye(3), (12, 1, 1)),
-        CircleRows.of((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, xy, i in rows),
+        circle_rows((k, xy, DISC_SIGMA**2 * np.eye(2), i) for k, xy, i in rows),
         LineRows.of(),
     )
     ids, frame = recording.circles.ids, recording.circles.frame

@@ -14,8 +14,8 @@ from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.frames import Associator, Prediction
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
-from redetect.slam.recording import CircleRows, LineRows, Recording
-from tests.slam.ekf_rows import localizer, rows_of, spd
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import circle_rows, localizer, rows_of, spd
 
 
 def drive(
@@ -40,7 +40,7 @@ def drive(
         prefixes=tuple(f"a.{k:04d}" for k in range(steps)),
         steps=np.array(measured),
         step_covariance=np.array(covariances),
-        circles=CircleRows.of(rows),
+        circles=circle_rows(rows),
         lines=LineRows.of(),
     )
     return recording, np.array(poses), places

@@ -17,8 +17,8 @@ from redetect.slam.models import (
     disc_jacobians,
     move,
 )
-from redetect.slam.recording import CircleRows, LineRows, Recording
-from tests.slam.ekf_rows import CAMERA_XY, bearings_of, localizer, rows_of, spd
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import CAMERA_XY, bearings_of, circle_rows, localizer, rows_of, spd
 
 
 def test_a_line_is_placed_when_there_is_parallax() -> None:
@@ -86,7 +86,7 @@ def test_lines_are_batch_least_squares() -> None:
         prefixes=tuple(f"c.{k}" for k in range(steps)),
         steps=np.array(measured),
         step_covariance=np.tile(covariance, (steps, 1, 1)),
-        circles=CircleRows.of(),
+        circles=circle_rows(),
         lines=LineRows.of(rows),
     )
     ekf = EkfSlam(camera_xy=CAMERA_XY)
@@ -160,6 +160,6 @@ def test_bearings_behind_do_not_jump() -> None:
 
 def test_lines_can_not_be_identified_before_they_are_placed() -> None:
     lines = LineRows.of([(0, 0.1, 0.01, ())])
-    recording = Recording(("a",), np.zeros((1, 3)), np.eye(3)[None], CircleRows.of(), lines)
+    recording = Recording(("a",), np.zeros((1, 3)), np.eye(3)[None], circle_rows(), lines)
     with pytest.raises(SlamError, match="expected known association"):
         run_ekf(recording, EkfSlam(), Associator("joint"))

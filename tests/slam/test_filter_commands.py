@@ -21,7 +21,8 @@ from redetect.slam.cli import main
 from redetect.slam.commands.filters import lost_lines, map_distance, path_distance
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import FilterRun, RowCount
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import circle_rows
 
 STEP = "STEP a.{k} 0.0 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"
 DISC = "LANDMARK_C {x} -2 0.9 0.002 0.0001 0.003 {id}\n"
@@ -220,7 +221,7 @@ def test_lines_need_a_calibration(run: Path, capsys: pytest.CaptureFixture[str])
 def test_where_the_pose_is_lost_is_said(first: int, last: int, said: bool) -> None:
     seen = [k for k in range(40) if k % 10]  # every tenth frame shows none
     names = tuple(f"f{k}" for k in range(40))
-    rows = CircleRows.of((k, (0.0, -2.0), np.eye(2), -1) for k in seen)
+    rows = circle_rows((k, (0.0, -2.0), np.eye(2), -1) for k in seen)
     none = np.tile(np.eye(3), (40, 1, 1))
     recording = Recording(names, np.zeros((40, 3)), none, rows, LineRows.of())
     matched = np.array([-1 if first <= k < last else 5 for k in seen])

@@ -12,7 +12,8 @@ from redetect.landmarks.map_file import read_path
 from redetect.plane import apply, compose, invert
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.cli import main
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import circle_rows
 
 SIGMA_M = 0.05
 STEP = np.array([0.0, -0.25, 0.05])
@@ -35,7 +36,7 @@ def drive(disc_xy: FloatArray, start: FloatArray, seed: int, steps: int = 40) ->
         tuple(f"f{k}" for k in range(steps)),
         measured,
         np.tile(np.diag(STEP_SIGMA**2), (steps, 1, 1)),
-        CircleRows.of((k, xy, SIGMA_M**2 * np.eye(2), -1) for k, xy in rows),
+        circle_rows((k, xy, SIGMA_M**2 * np.eye(2), -1) for k, xy in rows),
         LineRows.of(),
     )
 

@@ -18,7 +18,8 @@ from redetect.slam.association.line_points import (
 )
 from redetect.slam.association.score import score_association
 from redetect.slam.models import bearing_of_vertical
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import LineRows, Recording
+from tests.slam.ekf_rows import circle_rows
 
 CAMERA_XY = (0.02, -0.08)
 SIGMA_RAD = 0.002
@@ -47,7 +48,7 @@ def seen(
         prefixes=tuple(f"{k}" for k in range(frames)),
         steps=steps,
         step_covariance=np.tile(np.diag([1e-4, 1e-4, 1e-4]), (frames, 1, 1)),
-        circles=CircleRows.of(),
+        circles=circle_rows(),
         lines=LineRows.of(rows),
     )
     believed = path.copy()

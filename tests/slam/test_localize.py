@@ -22,8 +22,8 @@ from redetect.slam.models import (
     move,
     move_jacobians,
 )
-from redetect.slam.recording import CircleRows, LineRows, Recording, read_recording
-from tests.slam.ekf_rows import CAMERA_XY, spd
+from redetect.slam.recording import LineRows, Recording, read_recording
+from tests.slam.ekf_rows import CAMERA_XY, circle_rows, spd
 
 
 def landmarks(rng: np.random.Generator, count: int, scale: float) -> Landmarks:
@@ -62,7 +62,7 @@ def drive(seed: int, *, noise: float = 1.0) -> tuple[Recording, LandmarkMap, Flo
             prefixes=tuple(f"b.{k}" for k in range(60)),
             steps=np.array(steps),
             step_covariance=covariances,
-            circles=CircleRows.of(circles),
+            circles=circle_rows(circles),
             lines=LineRows.of(lines),
         ),
         some,

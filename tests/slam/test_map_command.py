@@ -61,7 +61,7 @@ def test_the_joint_covariance_of_too_many_landmarks_is_not_written(
     output = demo_run.parent / "many"
     assert main(["map", str(demo_run), "-o", str(output)]) == 0
     assert (output / "map_covariance.npy").is_file()
-    monkeypatch.setattr("redetect.slam.commands.map.MOST_LANDMARKS_TOGETHER", 30)
+    monkeypatch.setattr("redetect.slam.mapping.run_map.MOST_LANDMARKS_TOGETHER", 30)
     assert main(["map", str(demo_run), "-o", str(output), "--force"]) == 0
     assert "more than 30 landmarks: no map_covariance.npy" in capsys.readouterr().out
     assert not (output / "map_covariance.npy").exists()

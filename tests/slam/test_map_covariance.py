@@ -25,13 +25,13 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.mapping.solve import equations_at, joint_covariance
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import (
-    CircleRows,
     LineRows,
     Recording,
     frames_of_discs,
     read_recording,
 )
 from redetect.storage import OutputExistsError
+from tests.slam.ekf_rows import circle_rows
 
 
 @pytest.mark.parametrize("calibrate", [False, True])
@@ -82,7 +82,7 @@ def test_file(tmp_path: Path, some: LandmarkMap) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (np.eye(6), "expected float64 of"),
+        (np.eye(6), r"expected \(4, 4\)"),
         (np.eye(4, dtype=np.float32), "expected 2-dimensional float64"),
         (np.eye(4), "not the covariance of"),
         (np.full((4, 4), np.nan), "not the covariance of"),
@@ -124,10 +124,8 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
         noise = np.diag([1e-4, 4e-4, 1e-5])
         steps = way + rng.multivariate_normal(np.zeros(3), noise, 60)
         names = tuple(f"f.{k}" for k in range(60))
-        run = Recording(
-            names, steps, np.tile(noise, (60, 1, 1)), CircleRows.of(rows), LineRows.of()
-        )
-        head = "settings radius_m=0.1 tilt_sigma_deg=0.3"
+        run = Recording(names, steps, np.tile(noise, (60, 1, 1)), circle_rows(rows), LineRows.of())
+        head = "settings radius_m=0.1 refine=True evidence=-0.1 tilt_sigma_deg=0.3"
         write_frames(tmp_path / f"{seed}.circles", frames_of_discs(run), head=head)
         mapped = map_run(read_recording(tmp_path / f"{seed}.circles"))
         error = mapped.estimate.disc_xy - discs[mapped.graph.disc_ids]
@@ -135,3 +133,22 @@ def test_a_tilt_that_frames_share_is_in_the_covariances_of_a_corridor(
         joint = joint_covariance(mapped.graph, mapped.estimate, Weighting())
         np.testing.assert_allclose(joint[-2:, -2:], mapped.covariance.discs[-1], rtol=1e-6)
     assert 0.2 < np.mean(found) < 2.0  # 0.5 and 0.8; as if independent 1.0 and 4.2
+
+
+@pytest.mark.parametrize(
+    ("settings", "tilted"),
+    [
+        ("refine=True evidence=-0.1 tilt_sigma_deg=None", True),
+        ("refine=True evidence=-0.1 tilt_sigma_deg=0.0", False),
+        ("refine=True evidence=-0.1 tilt_sigma_deg=0.05", True),
+        ("refine=False evidence=-0.1 tilt_sigma_deg=None", False),  # the published detector's
+    ],
+)
+def test_which_rows_state_a_tilt(tmp_path: Path, settings: str, tilted: bool) -> None:
+    run = Recording(
+        ("f.0",), np.array([[0.0, -0.2, 0.0]]), 1e-4 * np.eye(3)[None],
+        circle_rows([(0, np.array([0.0, -2.0]), 1e-4 * np.eye(2), 1)]), LineRows.of(),
+    )  # fmt: skip
+    path = tmp_path / "a.circles"
+    write_frames(path, frames_of_discs(run), head=f"settings radius_m=0.1 {settings}")
+    assert read_recording(path).tilted is tilted

@@ -16,7 +16,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames
 from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.filtered_start import filtered_poses
+from redetect.slam.filters.ekf_slam import filtered_poses
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
 from redetect.slam.mapping.graph_terms import PLACE_PRIOR_M, Weighting
 from redetect.slam.mapping.initial_lines import place_lines
@@ -26,12 +26,12 @@ from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models import disc_in_robot, move
 from redetect.slam.mounting import mounted_camera, rows_through_mounting
 from redetect.slam.recording import (
-    CircleRows,
     LineRows,
     Recording,
     read_recording,
     recording_of_frames,
 )
+from tests.slam.ekf_rows import circle_rows
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run
 
 
@@ -217,7 +217,7 @@ def test_a_straight_drive_leaves_the_cameras_place_as_calibrated(published_camer
         seen = disc_in_robot(poses[k + 1], discs)
         ahead = (seen[:, 1] < -1.2) & (np.hypot(*seen.T) < 3.5)
         rows += [(k, seen[i], 1e-4 * np.eye(2), int(i)) for i in np.flatnonzero(ahead)]
-    straight = replace(_only_discs(run), steps=steps, circles=CircleRows.of(rows))
+    straight = replace(_only_discs(run), steps=steps, circles=circle_rows(rows))
     mapped = map_run(straight, published_camera, Weighting(calibrate=True))
     assert mapped.mounting is not None
     np.testing.assert_allclose(mapped.mounting.change, 0.0, atol=1e-6)

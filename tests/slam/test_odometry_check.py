@@ -22,7 +22,8 @@ def _run(seed: int) -> Recording:
 
 
 def _check(recording: Recording) -> OdometryCheck:
-    return map_run(recording).odometry_check()
+    mapped = map_run(recording)
+    return check_odometry(mapped.graph, mapped.estimate, Weighting(), mapped.table.expected)
 
 
 def test_factors_of_odometry_and_of_rows_are_one_if_covariances_are_right() -> None:
@@ -59,11 +60,8 @@ def test_wrong_lengths_and_turns_of_odometry_are_found() -> None:
 
 def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
     run = _run(2)
-    mapped = map_run(run.part(0, 6))
-    assert np.isnan(mapped.odometry_check().odometry_factor)
-    one = map_run(run.part(0, 1))
-    found = check_odometry(one.graph, one.estimate, Weighting(), one.table.expected)
-    assert np.isnan(found.odometry_factor)
+    assert np.isnan(_check(run.part(0, 6)).odometry_factor)
+    assert np.isnan(_check(run.part(0, 1)).odometry_factor)
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.3])  # intervals by which odometry is later

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from camera import Camera
 from camera.uncertainty import with_pose
 from redetect.array_types import FloatArray
-from redetect.groundtruth.trajectories.transforms import transform
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import Step
 from redetect.plane import between
 
@@ -20,13 +20,13 @@ from redetect.plane import between
 def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
     """(4, 4) pose of a robot standing level on the floor at x, y with heading theta."""
     c, s = np.cos(theta_rad), np.sin(theta_rad)
-    return transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
+    return se3.transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
 
 
 def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
     """(4, 4) rotation of a tilted robot about its origin on the floor. `tilt_rad` (2,)."""
     p, q = np.asarray(tilt_rad, dtype=np.float64)
-    return transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
+    return se3.transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
 
 
 def tilted_camera(camera: Camera, tilt_rad: ArrayLike) -> Camera:

@@ -12,14 +12,9 @@ from redetect.groundtruth.commands.options import Fuse
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.fusion import stream_errors
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
-from redetect.groundtruth.fusion.stream_errors import (
-    COMMON,
-    read_common_covariance,
-    with_common,
-    without_common,
-)
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,
@@ -52,14 +47,13 @@ def perform(options: Fuse) -> int:
     # Errors that the laser's poses have in common do not average out.
     common = np.zeros((3, 3))
     if options.laser is not None:
-        known = read_common_covariance(options.laser)
-        streams["laser"], common = without_common(streams["laser"], known)
+        known = stream_errors.read_common_covariance(options.laser)
+        streams["laser"], common = stream_errors.without_common(streams["laser"], known)
     fusion = fuse(odometry, streams, settings)
-    fusion = replace(
-        fusion,
-        poses=with_common(fusion.poses, common),
-        filtered=with_common(fusion.filtered, common),
+    poses, filtered = (
+        stream_errors.with_common(path, common) for path in (fusion.poses, fusion.filtered)
     )
+    fusion = replace(fusion, poses=poses, filtered=filtered)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
@@ -68,7 +62,7 @@ def perform(options: Fuse) -> int:
         "odometry": asdict(fusion.odometry),
         "localisation": asdict(fusion.localisation) if fusion.localisation else None,
         "left_out": [asdict(segment) for segment in left_out],
-        COMMON: common.tolist(),
+        stream_errors.COMMON: common.tolist(),
         "covariances_repaired": fusion.repaired,
         "deviations_raised": fusion.raised,
         "slips_s": fusion.slips_s,
@@ -85,10 +79,9 @@ def perform(options: Fuse) -> int:
 
 
 def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -> None:
-    assert fusion.poses.covariances is not None
-    sigma = 1e3 * np.sqrt(
-        np.median(np.trace(fusion.poses.covariances[:, :2, :2], axis1=1, axis2=2))
-    )
+    covariances = fusion.poses.covariances
+    assert covariances is not None
+    sigma = 1e3 * np.sqrt(np.median(covariances[:, 0, 0] + covariances[:, 1, 1]))
     used = ", ".join(f"{count} from {name}" for name, count in fusion.used.items())
     print(
         f"{options.output}: {len(fusion.poses)} poses out of {used}; "

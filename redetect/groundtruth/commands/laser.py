@@ -14,21 +14,9 @@ from redetect.groundtruth.commands.outputs import check_outputs, provenance, war
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.stream_errors import COMMON
+from redetect.groundtruth.lasers import tracking
 from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
-from redetect.groundtruth.lasers.tracking import (
-    COASTING,
-    LOST,
-    OK,
-    REACQUIRED,
-    STATUS,
-    UNDETERMINED,
-    LaserTrack,
-    combined_poses,
-    excess_shifts,
-    track_without_suspects,
-    usual_sets_per_pose,
-)
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.storage import write_bytes
@@ -60,20 +48,21 @@ def perform(options: Laser) -> int:
     for text in noise_warnings(read_scanners(calibration), scanners, calibration):
         warn(text)
     print_sweeps(scanners, sets, robot)
-    track, left_out = track_without_suspects(sets, fixed, robot, scanners, options.settings)
+    settings = options.settings
+    track, left_out = tracking.track_without_suspects(sets, fixed, robot, scanners, settings)
 
-    average = options.average or usual_sets_per_pose(track)
-    poses = combined_poses(track, average)
+    average = options.average or tracking.usual_sets_per_pose(track)
+    poses = tracking.combined_poses(track, average)
     write_planar_poses(output, poses, overwrite=options.force)
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
-    content = {**provenance(options.settings, files), "sets_per_pose": average, **described}
+    content = {**provenance(settings, files), "sets_per_pose": average, **described}
     write_json(summary, content, overwrite=options.force)
 
-    expected = int(np.sum(track.status != LOST))
-    determined = int(np.isin(track.status, (OK, REACQUIRED)).sum())
-    coasted = int((track.status == COASTING).sum())
+    expected = int(np.sum(track.status != tracking.LOST))
+    determined = int(np.isin(track.status, (tracking.OK, tracking.REACQUIRED)).sum())
+    coasted = int((track.status == tracking.COASTING).sum())
     print(
         f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
         f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
@@ -118,65 +107,60 @@ def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) ->
         )
 
 
-def seen_through(track: LaserTrack) -> float:
+def seen_through(track: tracking.LaserTrack) -> float:
     """Share of the beams that should meet the robot, but see the background behind it."""
-    totals = np.sum(track.beams[np.isin(track.status, (OK, REACQUIRED))], axis=0)
+    totals = np.sum(track.beams[np.isin(track.status, (tracking.OK, tracking.REACQUIRED))], axis=0)
     counts = BeamCounts(*np.asarray(totals, dtype=np.int64).reshape(-1).tolist())
     return counts.through / max(counts.expected, 1)
 
 
-def set_lines(track: LaserTrack) -> list[str]:
+def set_lines(track: tracking.LaserTrack) -> list[str]:
     """A line of JSON for every set of scans."""
     lines = []
     for i, status in enumerate(track.status.tolist()):
-        line: dict[str, Any] = {"t": round(float(track.times_s[i]), 6), "status": STATUS[status]}
-        if status != LOST:
+        line: dict[str, Any] = {
+            "t": round(float(track.times_s[i]), 6),
+            "status": tracking.STATUS[status],
+        }
+        if status != tracking.LOST:
             line["visit"] = int(track.segment[i])
-        if status not in (LOST, COASTING):
+        if status not in (tracking.LOST, tracking.COASTING):
             beams = {name: int(n) for name, n in zip(BeamCounts._fields, track.beams[i])}
             line["readings"] = int(track.readings[i])
             line["rms_m"] = round(float(track.rms_m[i]), 5)
             line["chi2_per_freedom"] = round(float(track.chi2[i]), 3)
             line["beams"] = beams
             line["disturbed"] = beams["hidden"] + beams["beside"] >= _DISTURBED
-        if status == UNDETERMINED:
+        if status == tracking.UNDETERMINED:
             line["direction"] = [round(float(v), 4) for v in track.weak[i]]
-        if i in track.reasons and status == COASTING:
+        if i in track.reasons and status == tracking.COASTING:
             line["reason"] = track.reasons[i]
         lines.append(json.dumps(line))
     return lines
 
 
 def describe(
-    track: LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
+    track: tracking.LaserTrack, scanners: tuple[Scanner, ...], left_out: dict[str, FloatArray]
 ) -> dict[str, Any]:
     """Sets by status, visits and how their front was found, and the residuals of scanners."""
     segments = []
     for segment, front in sorted(track.fronts.items()):
-        times = track.times_s[track.segment == segment]
-        segments.append(
-            {"visit": segment, "from_s": float(times[0]), "to_s": float(times[-1]), "front": front}
-        )
+        times = track.times_s[track.segment == segment].tolist()
+        visit = {"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front}
+        segments.append(visit)
     entries = []
-    excess = excess_shifts(track, scanners)
+    excess = tracking.excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):
         out = scanner.name in left_out
         found = (track.corrections[k], track.correction_sigma[k])
-        shift, sigma = left_out.get(scanner.name, found)
-        entries.append(
-            {
-                "name": scanner.name,
-                "correction": shift.tolist(),
-                "sigma": sigma.tolist(),
-                "suspect": bool(out or excess[k] > 1.0),
-                "left_out": out,
-            }
-        )
-    good = np.isin(track.status, (OK, REACQUIRED))
+        shift, sigma = (values.tolist() for values in left_out.get(scanner.name, found))
+        entry = {"name": scanner.name, "correction": shift, "sigma": sigma}
+        entries.append({**entry, "suspect": bool(out or excess[k] > 1.0), "left_out": out})
+    good = np.isin(track.status, (tracking.OK, tracking.REACQUIRED))
     shared = (track.covariances - track.noise)[good]
-    counts = np.bincount(track.status, minlength=len(STATUS)).tolist()
+    counts = np.bincount(track.status, minlength=len(tracking.STATUS)).tolist()
     return {
-        "sets": {status: count for status, count in zip(STATUS, counts) if count},
+        "sets": {status: count for status, count in zip(tracking.STATUS, counts) if count},
         "outline_moved_m": track.outline_moved_m,
         "segments": segments,
         COMMON: (shared.mean(axis=0) if len(shared) else np.zeros((3, 3))).tolist(),

@@ -9,17 +9,9 @@ import numpy as np
 
 from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
+from redetect.groundtruth.lasers import scanners
 from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.lasers.scanners import (
-    Scanner,
-    find_scans,
-    noise_warnings,
-    read_scanners,
-    read_scans,
-    with_measured_noise,
-    write_scanners,
-)
 from redetect.groundtruth.lasers.walls import still_scan
 from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.groundtruth.trajectories.streams import pose_differences
@@ -42,18 +34,20 @@ def perform(options: Lasers) -> int:
     picture = output.with_suffix(".png")
     check_outputs([output, picture], options.force)
     by_hand = session / "scanners.json"
-    stated = read_scanners(by_hand)
+    stated = scanners.read_scanners(by_hand)
     map_file = find_building(session)
     building = read_building(map_file)
-    empties = [read_scans(find_scans(session / "empty", s.name), s.readings) for s in stated]
-    measured = with_measured_noise(stated, empties)
-    for text in noise_warnings(stated, measured, by_hand):
+    empties = [
+        scanners.read_scans(scanners.find_scans(session / "empty", s.name), s.readings)
+        for s in stated
+    ]
+    measured = scanners.with_measured_noise(stated, empties)
+    for text in scanners.noise_warnings(stated, measured, by_hand):
         warn(text)
     alignment = align_scanners(measured, empties, building, options.settings)
 
-    far_off = [
-        a.name for b, a in zip(measured, alignment.scanners) if _sigmas(b, a) > _FAR_OFF_SIGMA
-    ]
+    pairs = zip(measured, alignment.scanners)
+    far_off = [after.name for before, after in pairs if _sigmas(before, after) > _FAR_OFF_SIGMA]
     extra: dict[str, Any] = {
         **provenance(options.settings, [by_hand, map_file]),
         "steps": {name: poses.tolist() for name, poses in alignment.steps.items()},
@@ -73,7 +67,7 @@ def perform(options: Lasers) -> int:
         },
     }
     del extra["version"]  # that of the file's form is there
-    write_scanners(output, alignment.scanners, extra, overwrite=options.force)
+    scanners.write_scanners(output, alignment.scanners, extra, overwrite=options.force)
     points = [still_scan(a, b.ranges_mm).points for a, b in zip(measured, empties)]
     by_step = [
         icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
@@ -92,7 +86,7 @@ def perform(options: Lasers) -> int:
 
 
 def _print_differences(
-    measured: Sequence[Scanner], alignment: Alignment, far_off: Sequence[str]
+    measured: Sequence[scanners.Scanner], alignment: Alignment, far_off: Sequence[str]
 ) -> None:
     for k, (before, after) in enumerate(zip(measured, alignment.scanners)):
         shift = pose_differences(after.pose, before.pose)
@@ -116,7 +110,7 @@ def _print_differences(
         warn(f"scanner {name}: its pose on the map disagrees with the other scanners")
 
 
-def _sigmas(before: Scanner, after: Scanner) -> float:
+def _sigmas(before: scanners.Scanner, after: scanners.Scanner) -> float:
     """Distance of a scanner from its measured pose, in the measurement's standard deviations."""
     shift = pose_differences(after.pose, before.pose)
     covariance = before.covariance + after.covariance

@@ -7,15 +7,8 @@ import sys
 from itertools import product
 from pathlib import Path
 
+from redetect.groundtruth.commands import outputs
 from redetect.groundtruth.commands.options import Network as NetworkCommand
-from redetect.groundtruth.commands.outputs import (
-    check_outputs,
-    print_sigmas,
-    print_table,
-    progress,
-    provenance,
-    residual_figures,
-)
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
 from redetect.groundtruth.markers.network_estimation import estimate_network
@@ -24,10 +17,10 @@ from redetect.groundtruth.markers.session import Network, write_network
 
 def perform(command: NetworkCommand) -> int:
     """Carry out ``groundtruth network``; returns the exit code."""
-    check_outputs((command.output,), command.force)
+    outputs.check_outputs((command.output,), command.force)
     boards = read_boards(command.boards)
     shots: dict[int, list[BoardView]] = {}
-    for image in progress(boards.images, "boards"):
+    for image in outputs.progress(boards.images, "boards"):
         try:
             view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
             shots.setdefault(image.placement, []).append(view)
@@ -50,14 +43,15 @@ def perform(command: NetworkCommand) -> int:
     for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
         chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
         if chosen:
-            table.append({"camera": name, "board": board, **residual_figures(adjusted, chosen)})
+            figures = outputs.residual_figures(adjusted, chosen)
+            table.append({"camera": name, "board": board, **figures})
     extra = {
-        "made_by": provenance(command.settings),
+        "made_by": outputs.provenance(command.settings),
         "reduced_cost": adjusted.reduced_cost,
         "residuals": table,
     }
     write_network(command.output, network, extra, overwrite=command.force)
-    print_table(table)
-    print_sigmas("camera", list(estimate.names), estimate.covariance)
+    outputs.print_table(table)
+    outputs.print_sigmas("camera", list(estimate.names), estimate.covariance)
     print(f"{command.output}: {len(estimate.names)} cameras")
     return 0

@@ -13,13 +13,7 @@ from redetect.command_line import EXIT_ERROR
 from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance, warn
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.markers.session import (
-    find_runs,
-    group_by_time,
-    read_network,
-    read_network_frames,
-    read_rig,
-)
+from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.storage import write_bytes
@@ -33,16 +27,16 @@ _MUCH_TOO_LARGE = 9.0
 
 def perform(command: Poses) -> int:
     """Carry out ``groundtruth poses``; returns the exit code: 1 without a single pose."""
-    runs = find_runs(command.session)
+    runs = session.find_runs(command.session)
     network_path = command.network or command.session / "network.json"
     rig_path = command.rig or command.session / "rig.json"
     output = command.output or command.session / "poses.csv"
     settings_path = output.with_suffix(".json")
     check_outputs((output, settings_path, command.tum, command.report), command.force)
-    network = read_network(network_path)
-    rig = read_rig(rig_path)
-    frames = read_network_frames(runs, network)
-    groups = group_by_time(frames, command.settings.time_tolerance_s)
+    network = session.read_network(network_path)
+    rig = session.read_rig(rig_path)
+    frames = session.read_network_frames(runs, network)
+    groups = session.group_by_time(frames, command.settings.time_tolerance_s)
     track = track_by_markers(progress(groups, "poses"), rig, network, command.settings)
     poses = track.planar()
     print(

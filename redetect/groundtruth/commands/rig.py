@@ -8,26 +8,11 @@ import numpy as np
 
 from camera import camera_file_in, read_camera
 from redetect.bounds import ABOVE_0, demand
+from redetect.groundtruth.commands import outputs
 from redetect.groundtruth.commands.options import Rig as RigCommand
-from redetect.groundtruth.commands.outputs import (
-    check_outputs,
-    print_sigmas,
-    print_table,
-    provenance,
-    residual_figures,
-)
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.rig_estimation import estimate_rig
-from redetect.groundtruth.markers.session import (
-    MarkerFrame,
-    Network,
-    group_by_time,
-    read_marker_frames,
-    read_network,
-    read_network_frames,
-    read_rig,
-    write_rig,
-)
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.storage import write_bytes
 
@@ -36,7 +21,7 @@ def perform(command: RigCommand) -> int:
     """Carry out ``groundtruth rig``; returns the exit code."""
     demand(command, GroundTruthError, width_m=ABOVE_0)
     picture = command.output.with_suffix(".png")
-    check_outputs((command.output, picture), command.force)
+    outputs.check_outputs((command.output, picture), command.force)
     network, groups = _input(command)
     estimate = estimate_rig(
         groups,
@@ -44,7 +29,7 @@ def perform(command: RigCommand) -> int:
         command.width_m,
         command.settings,
         reference=command.reference,
-        known=None if command.robot is None else read_rig(command.robot),
+        known=None if command.robot is None else session.read_rig(command.robot),
     )
     frame = f"marker {estimate.reference}"
     if command.robot is not None:
@@ -55,7 +40,7 @@ def perform(command: RigCommand) -> int:
         for index in range(len(rig.ids))
     ]
     table = [
-        {"marker": marker, **residual_figures(estimate.adjusted, own)}
+        {"marker": marker, **outputs.residual_figures(estimate.adjusted, own)}
         for marker, own in zip(rig.ids, views)
     ]
     pairs = [
@@ -68,7 +53,7 @@ def perform(command: RigCommand) -> int:
         for (a, b), pair in sorted(estimate.pairs.items())
     ]
     extra: dict[str, Any] = {
-        "made_by": provenance(command.settings),
+        "made_by": outputs.provenance(command.settings),
         "frame": frame,
         "times": estimate.times,
         "reduced_cost": estimate.adjusted.reduced_cost,
@@ -76,12 +61,12 @@ def perform(command: RigCommand) -> int:
         "pairs": pairs,
     }
     drawn = draw_rig(estimate)
-    write_rig(command.output, rig, extra, overwrite=command.force)
+    session.write_rig(command.output, rig, extra, overwrite=command.force)
     write_bytes(picture, drawn, overwrite=command.force)
     for marker, reason in estimate.left_out.items():
         print(f"marker {marker}: left out: {reason}")
-    print_table(table)
-    print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
+    outputs.print_table(table)
+    outputs.print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
     print(
         f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "
         f"squared residuals per degree of freedom {estimate.adjusted.reduced_cost:.2f}"
@@ -89,19 +74,19 @@ def perform(command: RigCommand) -> int:
     return 0
 
 
-def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]:
+def _input(command: RigCommand) -> tuple[session.Network, list[tuple[session.MarkerFrame, ...]]]:
     """The cameras, and images grouped by time, or separately without a network's file."""
     if command.network is not None:
-        network = read_network(command.network)
-        frames = read_network_frames(command.runs, network)
-        return network, group_by_time(frames, command.settings.time_tolerance_s)
+        network = session.read_network(command.network)
+        frames = session.read_network_frames(command.runs, network)
+        return network, session.group_by_time(frames, command.settings.time_tolerance_s)
     count, files = len(command.runs), []
     for run in command.runs:
         found = camera_file_in(run)
         if found is None:
             raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
         files.append(found)
-    network = Network(
+    network = session.Network(
         tuple(run.name for run in command.runs),
         tuple(map(read_camera, files)),
         tuple(map(str, files)),
@@ -111,5 +96,5 @@ def _input(command: RigCommand) -> tuple[Network, list[tuple[MarkerFrame, ...]]]
     return network, [
         (frame,)
         for index, run in enumerate(command.runs)
-        for frame in read_marker_frames(run, index, timed=False)
+        for frame in session.read_marker_frames(run, index, timed=False)
     ]

@@ -15,33 +15,28 @@ from redetect.groundtruth.trajectories.streams import (
     planar_alignment,
     read_planar_poses,
 )
-from redetect.groundtruth.validation.scoring import (
-    read_relations,
-    score_poses,
-    score_relations,
-    score_steps,
-)
+from redetect.groundtruth.validation import scoring
 
 
 def perform(command: Score) -> int:
     """Carry out ``groundtruth score``; returns the exit code."""
     check_outputs((command.json,), command.force)
     solution, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
-    relations = None if command.relations is None else read_relations(command.relations)
+    relations = None if command.relations is None else scoring.read_relations(command.relations)
     poses, truth, unmatched = matched_streams(
         solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
     )
     alignment = planar_alignment(poses, truth) if command.align else None
     if alignment is not None:
         poses = moved_poses(poses, alignment)
-    score = score_poses(poses, truth, unmatched)
+    score = scoring.score_poses(poses, truth, unmatched)
     print(f"poses              {score.poses} ({score.unmatched} without the other at their time)")
     print(*score.lines(), sep="\n")
     relative = {}
     if relations is not None:
-        relative["relations"] = score_relations(solution, relations, command.largest_gap_s)
+        relative["relations"] = scoring.score_relations(solution, relations, command.largest_gap_s)
     if command.rpe_step is not None:
-        steps = score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
+        steps = scoring.score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
         relative[f"steps of {command.rpe_step}"] = steps
     for name, figures in relative.items():
         print(

@@ -50,12 +50,11 @@ def perform(options: Sync) -> int:
 def compare_with_ptpd(
     model: ClockModel, determined: list[ClockSegment], log: PtpdLog
 ) -> dict[str, float | int | None]:
-    """Compare the clocks estimated from headings with ptpd's reports, which are on the robot's
-    clock.
+    """Compare the clocks estimated from headings with ptpd's reports on the robot's clock.
 
-    Returns the number of reports, and of those in determined segments, the root mean square
-    difference between their offsets and the model's (s), the mean drift of both, and the residual
-    of ptpd's offsets about the best straight line (s). None if undefined.
+    Returns the number of reports, and of those in determined segments, the rms difference of their
+    offsets from the model's (s), the mean drift of both, and the residual of ptpd's offsets about
+    the best straight line (s). None if undefined.
     """
     timed = np.isfinite(log.times_s)
     times, offsets = log.times_s[timed], log.offset_s[timed]

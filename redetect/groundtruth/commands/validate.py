@@ -22,32 +22,7 @@ from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
-from redetect.groundtruth.validation.onboard import (
-    INCIDENCES_DEG,
-    Onboard,
-    ReferencePose,
-    Refused,
-    range_errors,
-    reference_poses,
-    refine_mounts,
-)
-from redetect.groundtruth.validation.reference_poses import (
-    DistancePose,
-    poses_from_distances,
-    read_distances,
-    read_survey,
-)
-from redetect.groundtruth.validation.scoring import (
-    PUBLISHED,
-    PoseScore,
-    ReferenceErrors,
-    normalised_band,
-    normalised_errors,
-    reference_errors,
-    score_poses,
-    sigma_of,
-    stream_of,
-)
+from redetect.groundtruth.validation import onboard, reference_poses, scoring
 from redetect.storage import write_bytes
 
 #: Files written to the folder.
@@ -59,46 +34,46 @@ def perform(options: Validate) -> int:
     session, folder = options.session, options.output
     outputs = {name: folder / name for name in OUTPUTS}
     check_outputs(list(outputs.values()), options.force)
-    survey = read_survey(session / "fiducials.json")
-    measured = read_distances(session / "distances.csv", survey)
+    survey = reference_poses.read_survey(session / "fiducials.json")
+    measured = reference_poses.read_distances(session / "distances.csv", survey)
     if not measured:
         raise GroundTruthError(f"{session / 'distances.csv'}: no distances in it")
     poses = read_planar_poses(options.poses)
     files = [session / "fiducials.json", session / "distances.csv", options.poses]
-    onboard: list[Onboard] = []
+    boards: list[onboard.Onboard] = []
     clock, segments, clock_path = None, None, None
     if options.refine == "scans":
         map_file = find_building(session)
         segments = read_building(map_file)
-        onboard, scan_files = _onboard(session)
+        boards, scan_files = _onboard(session)
         beside = session / "clock.json"
         clock_path = options.clock or (beside if beside.is_file() else None)
-        if onboard and clock_path is None:
+        if boards and clock_path is None:
             warn("no clock.json: the times of the on-board scans are not corrected")
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
-    solved = poses_from_distances(survey, measured)
-    references, refused = reference_poses(solved, onboard, segments, clock)
+    solved = reference_poses.poses_from_distances(survey, measured)
+    references, refused = onboard.reference_poses(solved, boards, segments, clock)
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
         raise GroundTruthError("not a single reference pose")
-    errors, without = reference_errors(references, poses)
+    errors, without = scoring.reference_errors(references, poses)
     for entry in without:
         print(f"pose {entry.index} at {entry.time_s:.3f} s: {entry.reason}", file=sys.stderr)
     if not errors.references:
         raise GroundTruthError("no ground truth at the time of any reference pose")
-    score = score_poses(errors.poses, errors.reference_poses, len(without))
+    score = scoring.score_poses(errors.poses, errors.reference_poses, len(without))
     rows = _table_rows(references, errors)
     figures: dict[str, Any] = asdict(score)
     if score.normalised:
-        figures["normalised_band"] = normalised_band(score.normalised)
+        figures["normalised_band"] = scoring.normalised_band(score.normalised)
     content = {
         **provenance({"refine": options.refine}, files),
         "poses": options.poses.name,
         "clock": None if clock_path is None else clock_path.name,
         "figures": figures,
-        "published": [asdict(published) for published in PUBLISHED],
+        "published": [asdict(published) for published in scoring.PUBLISHED],
         "refused": [asdict(r) for r in (*refused, *without)],
         "distances": _distance_figures(solved, survey.sigma_m),
         "rows": [
@@ -111,7 +86,8 @@ def perform(options: Validate) -> int:
         content |= _scanners_on_board(references, segments)
         pictures["scans.png"] = draw_scans(errors, segments)
     folder.mkdir(parents=True, exist_ok=True)
-    write_planar_poses(outputs["reference.csv"], stream_of(references), overwrite=options.force)
+    stream = scoring.stream_of(references)
+    write_planar_poses(outputs["reference.csv"], stream, overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         write_bytes(outputs[name], data, overwrite=options.force)
@@ -121,17 +97,19 @@ def perform(options: Validate) -> int:
     return 0
 
 
-def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray) -> dict[str, Any]:
+def _scanners_on_board(
+    references: Sequence[onboard.ReferencePose], segments: FloatArray
+) -> dict[str, Any]:
     """Errors of the ranges by their incidence on walls, and where the scanners are mounted."""
-    angles, errors = range_errors(references, segments)
+    angles, errors = onboard.range_errors(references, segments)
     rows: list[dict[str, Any]] = []
-    for low, high in pairwise(INCIDENCES_DEG):
+    for low, high in pairwise(onboard.INCIDENCES_DEG):
         inside = errors[(np.degrees(angles) >= low) & (np.degrees(angles) <= high)]
         mean = float(inside.mean()) if len(inside) else math.nan
         row = {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean}
-        rows.append({**row, "sigma_m": sigma_of(inside)})
+        rows.append({**row, "sigma_m": scoring.sigma_of(inside)})
     content: dict[str, Any] = {"incidence": rows}
-    if (found := refine_mounts(references, segments)) is not None:
+    if (found := onboard.refine_mounts(references, segments)) is not None:
         sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
         scanners = next(r.still.scanners for r in references if r.still is not None)
         content["mounts"] = [
@@ -142,12 +120,12 @@ def _scanners_on_board(references: Sequence[ReferencePose], segments: FloatArray
 
 
 def _table_rows(
-    references: Sequence[ReferencePose], errors: ReferenceErrors
+    references: Sequence[onboard.ReferencePose], errors: scoring.ReferenceErrors
 ) -> list[dict[str, Any]]:
     """Rows of the table: every reference pose with its error, NaN if it has none."""
     columns = ("error_x_m", "error_y_m", "linear_m", "angular_deg", "nees")
     x, y, theta = errors.error.T
-    nees = 3.0 * normalised_errors(errors.poses, errors.reference_poses)
+    nees = 3.0 * scoring.normalised_errors(errors.poses, errors.reference_poses)
     table = np.column_stack([x, y, np.hypot(x, y), np.degrees(theta), nees])
     by_index = {r.index: row for r, row in zip(errors.references, table.tolist())}
     rows: list[dict[str, Any]] = []
@@ -183,9 +161,9 @@ def _table_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def summary_lines(
-    references: Sequence[ReferencePose],
-    refused: Sequence[Refused],
-    score: PoseScore,
+    references: Sequence[onboard.ReferencePose],
+    refused: Sequence[onboard.Refused],
+    score: scoring.PoseScore,
     distances: dict[str, Any],
 ) -> list[str]:
     """The printed figures, with RAWSEEDS' beside them."""
@@ -201,12 +179,12 @@ def summary_lines(
             f"{p.name:<18} mean {1e3 * p.position_mean_m:.0f} mm, sigma "
             f"{1e3 * p.position_sigma_m:.0f}; mean {p.angle_mean_deg:+.2f} deg, sigma "
             f"{p.angle_sigma_deg:.2f} (published)"
-            for p in PUBLISHED
+            for p in scoring.PUBLISHED
         ),
     ]
 
 
-def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
+def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     """The robot's scanners that have scans in the session, and the files read."""
     path = session / "robot.json"
     robot = read_robot(path)
@@ -218,14 +196,16 @@ def _onboard(session: Path) -> tuple[list[Onboard], list[Path]]:
             warn(f"{error}: its scans are not used")
             continue
         # If a clock was set, times step back; the poses' own times are looked up.
-        boards.append(Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
+        boards.append(onboard.Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
         files.append(found)
     if not boards:
         warn("no scans of a scanner on board: using distances only")
     return boards, files
 
 
-def _distance_figures(solved: Sequence[DistancePose], sigma_m: float) -> dict[str, Any]:
+def _distance_figures(
+    solved: Sequence[reference_poses.DistancePose], sigma_m: float
+) -> dict[str, Any]:
     good = [d for d in solved if d.status in ("ok", "ambiguous")]
     residuals = np.concatenate([d.residuals_m for d in good]) if good else np.zeros(0)
     freedom = sum(d.freedom for d in good)

@@ -12,7 +12,6 @@ comma-separated statistics under a head with the names of the columns, and debug
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +26,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray
 from redetect.bounds import NOT_NEGATIVE, from_to, inside
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import NUMBER, JsonObject
+from redetect.groundtruth.files import NUMBER, JsonObject, PathLike
 from redetect.storage.bounded import read_content
 
 Status = Literal["ok", "no turns", "jump", "at a bound"]
@@ -64,8 +63,7 @@ class ClockSegment:
     offset_s: float = 0.0  # Robot time minus ground truth time there
     rate: float = 1.0  # Seconds of the robot's clock per second of the ground truth's
     angle_rad: float = 0.0  # Heading of the ground truth minus heading of the odometry
-    # Standard deviations; infinite if the segment does not determine the value
-    sigma_offset_s: float = math.inf
+    sigma_offset_s: float = math.inf  # Standard deviations; infinite if not determined
     sigma_rate: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
     # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
@@ -73,8 +71,7 @@ class ClockSegment:
     # limit of the search range.
     status: Status = "ok"
     note: str = ""  # Details of the status
-    # From the segment alone, if one line through all segments replaced offset and deviation
-    own_offset_s: float | None = None
+    own_offset_s: float | None = None  # From the segment alone, if one line replaced these two
     own_sigma_s: float | None = None
 
 
@@ -154,7 +151,7 @@ def _extended(
     return np.asarray(np.interp(at, knots, values) + beyond)
 
 
-def read_clock(path: str | os.PathLike[str]) -> ClockModel:
+def read_clock(path: PathLike) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
 
     Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
@@ -240,11 +237,10 @@ class PtpdLog:
 
     times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
     offset_s: FloatArray  # (N,): clock minus master
-    # (N,): observed drift as a share (ptpd's parts per billion times 1e-9); NaN where not reported.
-    drift: FloatArray
+    drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
 
 
-def read_ptpd(path: str | os.PathLike[str]) -> PtpdLog:
+def read_ptpd(path: PathLike) -> PtpdLog:
     """Read a log of ptpd.
 
     Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from

@@ -1,9 +1,8 @@
 """The clocks' offset to a tenth of a second, from turns and ways over a second at many offsets.
 
 The refinement of the clock needs a start within a second. Offsets of many seconds, and robots that
-hardly turn, are found here: the movements of both streams, over windows of a second, are compared
-at all offsets of a grid. An offset far from the expected one is only taken if it explains the
-movements much better than those near it, and than any other place.
+hardly turn, are found here: the movements of both streams are compared at all offsets of a grid. An
+offset far from the expected one is only taken if it explains them much better than any other.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ _LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
 _LEAST_PART_S, _LEAST_JUMP_S = 10.0, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
 _COVERED = 0.5
-# Largest ratio of the squared errors at an offset that is taken to those near the expected one, of
-# other movements, and, beyond the width of its own minimum, elsewhere.
+# Largest ratio of the squared errors at another offset to those near the expected one or of others'
+# movements, and to those elsewhere, beyond the width of its own minimum.
 _MUCH_BETTER, _ALONE, _OWN_WIDTH_S = 0.25, 0.5, 3.0
 # Movements do not match if their squared errors are larger than this share of those of unrelated
 # ones, in segments with much movement.
@@ -90,7 +89,7 @@ class OffsetSearch:
     def offset_s(self, parts: Sequence[PlanarPoses], around_s: float) -> float:
         """Robot time minus ground truth time for parts of the ground truth.
 
-        `around_s`, the expected offset, unless another one explains their movements much better.
+        It is `around_s`, the expected one, unless another one fits their movements much better.
         """
         compared = self._compared(parts)
         if compared is None:

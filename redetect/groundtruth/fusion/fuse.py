@@ -92,8 +92,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     """Factor of odometry's variances over seconds to those expected from single samples.
 
     A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
-    over a gap. So most measurements are dropped, and odometry's predictions between the remaining
-    ones are compared with them. The factor is 1 unless the errors are significantly larger.
+    over a gap. So its predictions between measurements seconds apart are compared with these. The
+    factor is 1 unless the errors are significantly larger.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
@@ -105,10 +105,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     inflation = 1.0
     for _ in range(_LOOSENING_ROUNDS):
         # The first one of each part gives no information on odometry.
-        squared = sum(
-            float(np.sum(np.minimum(found.squared[1:], problem.gate())))
-            for found in (part.innovations(math.sqrt(inflation) * noise) for part in some)
-        )
+        tried = (part.innovations(math.sqrt(inflation) * noise).squared[1:] for part in some)
+        squared = sum(float(np.sum(np.minimum(values, problem.gate()))) for values in tried)
         if inflation == 1.0 and squared < chdtri(numbers, _DOUBT):
             return 1.0
         inflation *= max(squared / numbers, 1.0)
@@ -166,38 +164,25 @@ class OdometryErrors:
     lateral_sigma: float
     turn_sigma: float
     turn_per_metre_sigma: float
-    # Factor on their variances if nothing was measured for more than a second, since errors over
-    # seconds were larger than expected from single samples; 1 if they were not.
-    looser_in_gaps: float
+    looser_in_gaps: float  # Factor on their variances if nothing is measured for over a second
 
 
 @dataclass(frozen=True, eq=False)
 class Fusion:
     """The robot's path from all streams."""
 
-    # At the odometry's times from the first measurement to the last, with covariances; headings
-    # within +-pi.
-    poses: PlanarPoses
-    # The same from the filter alone: each from measurements until then
-    filtered: PlanarPoses
+    poses: PlanarPoses  # At odometry's times from the first measurement to the last
+    filtered: PlanarPoses  # The same from the filter alone: each from measurements until then
     rejected: tuple[Rejected, ...]  # In order of time
-    # Times at which the filter was restarted because measurements did not fit any more
-    restarts_s: tuple[float, ...]
+    restarts_s: tuple[float, ...]  # When the filter restarted, as measurements did not fit any more
     used: dict[str, int]  # Number of measurements used, by stream
     odometry: OdometryErrors  # The estimated errors of odometry
-    # Errors of odometry treated as a localisation, if the path was estimated that way
-    localisation: LocalisationErrors | None
-    # Number of covariances that were not positive definite as written, by stream; they were
-    # increased by their file's rounding.
-    repaired: dict[str, int]
-    # Factor by which deviations were raised, by stream, since the poses jitter more from one to the
-    # next than their covariances allow; 1 if they do not.
-    raised: dict[str, float]
+    localisation: LocalisationErrors | None  # Errors of odometry treated as a localisation
+    repaired: dict[str, int]  # Number of covariances that were not positive definite, by stream
+    raised: dict[str, float]  # Factor on deviations, by stream, since the poses jitter more
     # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
-    # wheels or a reset: the covariances do not rely on it there.
+    # wheels or a reset, and its pauses: the covariances do not rely on it there.
     slips_s: tuple[tuple[float, float], ...]
-    # Pauses of odometry within the poses' time. Motion that it may have missed there, at the
-    # robot's usual rates, increases the covariances.
     pauses_s: tuple[tuple[float, float], ...]
 
 
@@ -263,34 +248,25 @@ def fuse(
         if found is not None:
             path, localisation = found
             restarted[:] = False
+    columns = (problem.streams, problem.measured_s, innovations.squared)
+    rejected = (column[~innovations.accepted].tolist() for column in columns)
+    numbers = [smoothed[-1, 3:], _systematic_deviations(spread), noise, np.array([inflation])]
+    pauses = pauses_of(last_of_each_time(odometry))
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
-        rejected=tuple(
-            Rejected(
-                str(problem.streams[i]), float(problem.measured_s[i]), float(innovations.squared[i])
-            )
-            for i in np.flatnonzero(~innovations.accepted)
-        ),
+        rejected=tuple(Rejected(*row) for row in zip(*rejected)),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
             name: int(np.count_nonzero(innovations.accepted & (problem.streams == name)))
             for name in streams
         },
-        odometry=OdometryErrors(
-            *np.concatenate(
-                [smoothed[-1, 3:], _systematic_deviations(spread), noise, [inflation]]
-            ).tolist()
-        ),
+        odometry=OdometryErrors(*np.concatenate(numbers).tolist()),
         localisation=localisation,
         repaired=problem.repaired,
         raised={name: factor for name, (_, factor) in covered.items()},
         slips_s=slipped_intervals(problem.times_s, slips),
-        pauses_s=tuple(
-            (begin, end)
-            for begin, end in pauses_of(last_of_each_time(odometry))
-            if end > first and begin < last
-        ),
+        pauses_s=tuple(pause for pause in pauses if pause[1] > first and pause[0] < last),
     )
 
 
@@ -316,8 +292,7 @@ class LeftOut:
     position_rms_m: float  # Root of the mean squared error of the fused path
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
-    # The same for odometry, rigidly aligned with the other segments
-    aligned_position_rms_m: float
+    aligned_position_rms_m: float  # The same for odometry, aligned with the other segments
     aligned_heading_rms_rad: float
 
 
@@ -326,10 +301,9 @@ def leave_out(
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
-    Parameters as for `fuse`. Segments are those of the first stream; the other streams are left out
-    at the same times. The first and the last segment are not predicted, since a fused path extends
-    from the first measured pose to the last. Raises `GroundTruthError` if there are fewer than
-    three segments within the odometry's time.
+    Parameters as for `fuse`. Segments are those of the first stream; the others are left out at the
+    same times. A fused path ends with the measured poses: the first and the last segment are not
+    predicted. Raises `GroundTruthError` if there are fewer than three within the odometry's time.
     """
     truth = next(iter(streams.values()))
     own = last_of_each_time(odometry)

@@ -153,7 +153,6 @@ def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatAr
             "none below what rounding to six decimals makes of 0"
         )
     weak = smallest <= RAWSEEDS_ROUNDING * 0.1
-    symmetric[weak] += np.eye(3) * (
-        RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])[:, None, None]
-    )
+    added = RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])
+    symmetric[weak] += np.eye(3) * added[:, None, None]
     return symmetric, int(np.count_nonzero(weak))

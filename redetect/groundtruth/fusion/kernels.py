@@ -215,10 +215,8 @@ class Gating(NamedTuple):
     """Conditions for rejecting a measurement, and for restarting the filter from one."""
 
     largest_squared: float  # Largest squared normalised innovation
-    # After this number of consecutive rejections the pose is set to the measured one, with
-    # `restart_variances`, however far off the filter was
-    restart_after: int
-    restart_variances: FloatArray  # (3,)
+    restart_after: int  # Consecutive rejections after which the pose is set to the measured one
+    restart_variances: FloatArray  # (3,): with these variances
     lost_variance: float  # The same immediately if the heading's variance (rad^2) is larger
     cuts: BoolArray  # (N,): the same at these nodes, at their first measurement
 
@@ -230,8 +228,7 @@ class FilterHistory(NamedTuple):
     predicted_covariance: FloatArray
     filtered: FloatArray
     filtered_covariance: FloatArray
-    # (N, d, d): derivatives of each node's prediction with respect to the node before
-    transitions: FloatArray
+    transitions: FloatArray  # (N, d, d): derivatives of predictions by the node before
 
 
 class Innovations(NamedTuple):
@@ -246,9 +243,7 @@ class Innovations(NamedTuple):
 def empty_history(nodes: int) -> FilterHistory:
     """A history to be filled; with zero nodes if none is needed."""
     states, spreads = (nodes, STATE), (nodes, STATE, STATE)
-    return FilterHistory(
-        np.empty(states), np.empty(spreads), np.empty(states), np.empty(spreads), np.empty(spreads)
-    )
+    return FilterHistory(*map(np.empty, (states, spreads, states, spreads, spreads)))
 
 
 # Element by element, since an assignment of arrays takes seconds to compile.
@@ -401,9 +396,8 @@ def _smooth_in_place(
                 states[k, i] += gain[i, j] * (states[k + 1, j] - predicted[k + 1, j])
                 total = 0.0
                 for n in range(size):
-                    total += gain[i, n] * (
-                        covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
-                    )
+                    off = covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
+                    total += gain[i, n] * off
                 change[i, j] = total
         for i in range(size):
             for j in range(i + 1):

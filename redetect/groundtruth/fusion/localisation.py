@@ -58,8 +58,7 @@ class LocalisationErrors:
     heading_sigma: float  # Of the heading (rad)
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
-    # Heading of the ground truth minus that of the aligned localisation (rad)
-    heading_offset: float
+    heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
 
 
 def as_localisation(
@@ -87,9 +86,8 @@ def as_localisation(
     errors = pose_differences(measured.poses[usual], there)
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
     centre = there[:, :2].mean(axis=0)
-    position = _stationary(
-        times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), _by_motion(there[:, :2] - centre)
-    )
+    design = _by_motion(there[:, :2] - centre)
+    position = _stationary(times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), design)
     heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
     if not deviance < thin.innovations(noise).deviance:
@@ -200,9 +198,8 @@ def _bridged(
         last = min(int(np.searchsorted(times, measured_s[gap + 1])), len(times) - 1)
         within = slice(first + 1, last)
         ends = pose_differences(poses[[first, last]], there.poses[[first, last]])
-        after, before = (
-            np.exp(-np.abs(times[within, None] - times[end]) / correlation) for end in (first, last)
-        )
+        after = np.exp(-np.abs(times[within, None] - times[first]) / correlation)
+        before = np.exp(-np.abs(times[within, None] - times[last]) / correlation)
         whole = np.exp(-(times[last] - times[first]) / correlation)
         by_first = (after - whole * before) / (1.0 - whole**2)
         by_last = (before - whole * after) / (1.0 - whole**2)

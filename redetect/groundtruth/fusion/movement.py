@@ -20,27 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.groundtruth.fusion.inputs import (
-    CREEP_M2_PER_S,
-    CREEP_RAD2_PER_S,
-    gather,
-    movements,
-    systematic_sigmas,
-)
-from redetect.groundtruth.fusion.kernels import (
-    AFTER_REJECTIONS,
-    POSE,
-    STATE,
-    WHERE_LOST,
-    FilterHistory,
-    Gating,
-    Innovations,
-    MeasuredPoses,
-    Odometry,
-    empty_history,
-    filter_forward,
-    smooth_backward,
-)
+from redetect.groundtruth.fusion import inputs, kernels
 from redetect.groundtruth.fusion.slips import slip_variances
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -63,26 +43,31 @@ _SETTLED_RAD = 1e-3
 
 
 def predicted_backward(
-    odometry: Odometry, end: FloatArray, end_spread: FloatArray
+    odometry: kernels.Odometry, end: FloatArray, end_spread: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry from a gap's end.
-
-    `end` (6,) and `end_spread` (6, 6) are those at the last of the N nodes.
+    """States (N, 6) and covariances (N, 6, 6) predicted backward by odometry, from the last of N
+    nodes with `end` (6,) and `end_spread` (6, 6).
     """
     controls, variances = odometry
     count = len(controls)
     # Backward in time, all rates change their signs; the turn per metre does so by itself.
-    mirror = np.ones(STATE)
+    mirror = np.ones(kernels.STATE)
     mirror[_TURN_PER_METRE] = -1.0
     reverse = np.concatenate([np.zeros((1, 4)), -controls[:0:-1]])
-    history = empty_history(count)
-    filter_forward(
-        Odometry(reverse, np.concatenate([np.zeros((1, 3)), variances[:0:-1]])),
+    history = kernels.empty_history(count)
+    kernels.filter_forward(
+        kernels.Odometry(reverse, np.concatenate([np.zeros((1, 3)), variances[:0:-1]])),
         mirror * end,
         end_spread * mirror * mirror[:, None],
-        MeasuredPoses(np.empty(0, dtype=np.int64), np.empty((0, POSE)), np.empty((0, POSE, POSE))),
-        Gating(math.inf, 1, np.ones(POSE), math.inf, np.zeros(count, dtype=np.bool_)),
-        np.empty((1, STATE)),
+        kernels.MeasuredPoses(
+            np.empty(0, dtype=np.int64),
+            np.empty((0, kernels.POSE)),
+            np.empty((0, kernels.POSE, kernels.POSE)),
+        ),
+        kernels.Gating(
+            math.inf, 1, np.ones(kernels.POSE), math.inf, np.zeros(count, dtype=np.bool_)
+        ),
+        np.empty((1, kernels.STATE)),
         history,
     )
     states, spreads = history.filtered * mirror, history.filtered_covariance
@@ -94,7 +79,7 @@ class Smoothed(NamedTuple):
 
     states: FloatArray  # (N, 6)
     covariances: FloatArray  # (N, 6, 6)
-    innovations: Innovations
+    innovations: kernels.Innovations
     slips: FloatArray  # (N, 3): variances of movements that were added where odometry slipped
 
 
@@ -107,10 +92,10 @@ class MovementProblem:
     # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
     # one, else 0.
     controls: FloatArray
-    # (N, 4): additional distance (m) and turn (rad) that are possible in pauses of odometry; and
-    # variances of where the robot is (m^2, rad^2) if it is measured within a pause
+    # (N, 4): more distance (m) and turn (rad) that pauses may hide; and variances of where the robot
+    # is if it is measured within a pause (m^2, rad^2)
     unseen: FloatArray
-    measured: MeasuredPoses
+    measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     repaired: dict[str, int]  # Number of covariances that had to be increased, by stream
     settings: FuseSettings
@@ -146,17 +131,15 @@ class MovementProblem:
     def split(self, longest_s: float) -> list[MovementProblem]:
         """The parts between gaps in the measurements longer than this, without the gaps."""
         cuts = np.flatnonzero(np.diff(self.measured_s) > longest_s) + 1
-        return [
-            self._part(int(own[0]), int(own[-1]) + 1) for own in np.split(self.measured.nodes, cuts)
-        ]
+        parts = np.split(self.measured.nodes, cuts)
+        return [self._part(int(own[0]), int(own[-1]) + 1) for own in parts]
 
     def innovations(
         self, noise: FloatArray, systematic: tuple[FloatArray, FloatArray] | None = None
-    ) -> Innovations:
+    ) -> kernels.Innovations:
         """Innovations of the measurements in a forward filter.
 
-        It begins with the given means and deviations of odometry's systematic errors, by default
-        those of the settings.
+        `systematic`: initial means and deviations of systematic errors; by default the settings'.
         """
         return self.forward(self._variances(noise), systematic=systematic)
 
@@ -172,7 +155,7 @@ class MovementProblem:
     def with_only(self, kept: BoolArray) -> MovementProblem:
         """The problem with some of its measurements."""
         nodes, poses, covariances = self.measured
-        measured = MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
+        measured = kernels.MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
         return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -180,7 +163,7 @@ class MovementProblem:
 
         `slips` (N, 3): variances of movements that are added for slips.
         """
-        history = empty_history(len(self.times_s))
+        history = kernels.empty_history(len(self.times_s))
         self.forward(self._variances(noise) + slips, history=history)
         return history.filtered, history.filtered_covariance
 
@@ -197,7 +180,7 @@ class MovementProblem:
             variances[begin + 1 : end + 1] *= looser_in_gaps
         slips = slip_variances(self, variances, UNMEASURED_S)
         variances += slips
-        history = empty_history(len(self.times_s))
+        history = kernels.empty_history(len(self.times_s))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
             innovations = self.forward(variances, cuts=cuts, history=history)
@@ -205,30 +188,45 @@ class MovementProblem:
             if not unfit:
                 break
             cuts[unfit] = True
-        states, covariances = smooth_backward(history)
+        states, covariances = kernels.smooth_backward(history)
         good = nodes[innovations.accepted]
         # The nodes of the last measurement before and the first one after each gap that was cut.
         gaps = [
             (int(good[np.searchsorted(good, end) - 1]), int(end))
-            for end in np.flatnonzero(innovations.restarted == WHERE_LOST)
+            for end in np.flatnonzero(innovations.restarted == kernels.WHERE_LOST)
         ]
         carried = cuts.copy()
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):
             before = states
             innovations = self.forward(variances, before, cuts, history)
-            states, covariances = smooth_backward(history)
+            states, covariances = kernels.smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
+        # The second half of a gap that was cut follows odometry from the measurements after it.
         for begin, end in gaps:
-            self._anchor(begin, end, variances, states, covariances, carried=bool(carried[end]))
+            gap, inner = slice(begin, end + 1), slice(begin + 1, end)
+            odometry = kernels.Odometry(self.controls[gap], variances[gap])
+            back, spreads = predicted_backward(odometry, states[end], covariances[end])
+            way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
+            way -= way[0]
+            half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
+            apart = pose_differences(back[1:-1, : kernels.POSE], states[inner, : kernels.POSE])
+            states[begin + half : end] = back[half:-1]
+            covariances[begin + half : end] = spreads[half:-1]
+            # A robot that was carried in the gap may have been anywhere along its path then, so
+            # covariances include the other end's path as a possibility.
+            if carried[end]:
+                share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
+                other = share[:, None, None] * apart[:, :, None] * apart[:, None]
+                covariances[inner, : kernels.POSE, : kernels.POSE] += other
         return Smoothed(states, covariances, innovations, slips)
 
-    def _ends_that_did_not_fit(self, innovations: Innovations) -> list[int]:
+    def _ends_that_did_not_fit(self, innovations: kernels.Innovations) -> list[int]:
         """Nodes after gaps at which the rejections began that made the filter restart."""
         nodes, times_s = self.measured.nodes, self.measured_s
         found = []
-        for node in np.flatnonzero(innovations.restarted == AFTER_REJECTIONS):
+        for node in np.flatnonzero(innovations.restarted == kernels.AFTER_REJECTIONS):
             first = int(np.searchsorted(nodes, node))
             while first > 0 and not innovations.accepted[first - 1]:
                 first -= 1
@@ -236,39 +234,9 @@ class MovementProblem:
                 found.append(int(nodes[first]))
         return found
 
-    def _anchor(
-        self,
-        begin: int,
-        end: int,
-        variances: FloatArray,
-        states: FloatArray,
-        covariances: FloatArray,
-        *,
-        carried: bool,
-    ) -> None:
-        """Determine the second half of a gap that was cut from the measurements after it.
-
-        A robot that was `carried` in the gap may have been anywhere along its path then, so
-        covariances include the other end's path as a possibility.
-        """
-        gap = slice(begin, end + 1)
-        back, spreads = predicted_backward(
-            Odometry(self.controls[gap], variances[gap]), states[end], covariances[end]
-        )
-        way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
-        way -= way[0]
-        half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
-        apart = pose_differences(back[1:-1, :POSE], states[begin + 1 : end, :POSE])
-        states[begin + half : end] = back[half:-1]
-        covariances[begin + half : end] = spreads[half:-1]
-        if carried:
-            share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
-            other = share[:, None, None] * apart[:, :, None] * apart[:, None]
-            covariances[begin + 1 : end, :POSE, :POSE] += other
-
     def gate(self) -> float:
         """Largest squared normalised innovation."""
-        return float(chdtri(POSE, 1.0 - self.settings.gate_probability))
+        return float(chdtri(kernels.POSE, 1.0 - self.settings.gate_probability))
 
     def _variances(self, noise: FloatArray) -> FloatArray:
         """(N, 3) noise of movements to nodes: along the path, across it (m^2), of the turn (rad^2).
@@ -284,8 +252,9 @@ class MovementProblem:
         hidden_way, hidden_turn, anywhere, any_turn = self.unseen.T
         bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_way)
         hidden = by_turn * hidden_turn + by_way * hidden_way + bend
-        aside = hidden * hidden_way**2 / 12.0 + anywhere + CREEP_M2_PER_S * passed
-        rest = by_turn * turn + by_way * way + hidden + any_turn + CREEP_RAD2_PER_S * passed
+        aside = hidden * hidden_way**2 / 12.0 + anywhere + inputs.CREEP_M2_PER_S * passed
+        rest = by_turn * turn + by_way * way + hidden + inputs.CREEP_RAD2_PER_S * passed
+        rest += any_turn
         way = way + hidden_way
         return np.column_stack([along * way + aside, across * way + aside, rest])
 
@@ -294,25 +263,25 @@ class MovementProblem:
         variances: FloatArray,
         points: FloatArray | None = None,
         cuts: BoolArray | None = None,
-        history: FilterHistory | None = None,
+        history: kernels.FilterHistory | None = None,
         systematic: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Innovations:
+    ) -> kernels.Innovations:
         """Innovations of a forward filter with variances (N, 3) of the movements to nodes."""
-        means, deviations = systematic or (np.zeros(3), systematic_sigmas(self.settings))
-        return filter_forward(
-            Odometry(self.controls, variances),
+        means, deviations = systematic or (np.zeros(3), inputs.systematic_sigmas(self.settings))
+        return kernels.filter_forward(
+            kernels.Odometry(self.controls, variances),
             np.concatenate([self.measured.poses[0], means]),
             np.diag(np.concatenate([_RESTART_VARIANCES, np.square(deviations)])),
             self.measured,
-            Gating(
+            kernels.Gating(
                 self.gate(),
                 _RESTART_AFTER,
                 _RESTART_VARIANCES,
                 _LOST_VARIANCE if points is None else math.inf,
                 np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
             ),
-            np.empty((1, STATE)) if points is None else points,
-            empty_history(0) if history is None else history,
+            np.empty((1, kernels.STATE)) if points is None else points,
+            kernels.empty_history(0) if history is None else history,
         )
 
 
@@ -323,16 +292,16 @@ def movement_problem(
 
     The nodes are from the first measurement within the odometry's time to the last.
     """
-    names, times, measured, covariances, repaired = gather(odometry, streams)
+    names, times, measured, covariances, repaired = inputs.gather(odometry, streams)
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(times[0], times[-1])]
     node_times = np.union1d(inside, times)
-    controls, unseen = movements(odometry, node_times)
+    controls, unseen = inputs.movements(odometry, node_times)
     return MovementProblem(
         times_s=node_times,
         controls=controls,
         unseen=unseen,
-        measured=MeasuredPoses(
+        measured=kernels.MeasuredPoses(
             np.searchsorted(node_times, times).astype(np.int64), measured, covariances
         ),
         streams=names,

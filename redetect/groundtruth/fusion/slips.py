@@ -99,10 +99,8 @@ def _added(slips: FloatArray, times_s: FloatArray, more: Sequence[_Slip]) -> Flo
 
 def slipped_intervals(times_s: FloatArray, slips: FloatArray) -> tuple[tuple[float, float], ...]:
     """Begin and end (s) of the slips; `times_s` (N,) of the nodes, `slips` (N, 3)."""
-    return tuple(
-        (float(times_s[max(begin - 1, 0)]), float(times_s[end - 1]))
-        for begin, end in _stretches(slips[:, 0] > 0.0)
-    )
+    stretches = _stretches(slips[:, 0] > 0.0)
+    return tuple((float(times_s[max(a - 1, 0)]), float(times_s[b - 1])) for a, b in stretches)
 
 
 def _stretches(mask: BoolArray) -> list[tuple[int, int]]:

@@ -8,14 +8,13 @@ are fused without them, and they are added to the fused path, which has the same
 
 from __future__ import annotations
 
-import os
 from math import comb
 from pathlib import Path
 
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.files import JsonObject
+from redetect.groundtruth.files import JsonObject, PathLike
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 # Median of the absolute value of a standard normal number.
@@ -49,8 +48,7 @@ def roughness(values: FloatArray) -> float:
 def jitter_ratio(poses: PlanarPoses) -> float:
     """Jitter of poses in their standard deviations: about 1 if these are right.
 
-    The largest of x, y and the heading; 0 if it is unknown: without covariances, or
-    with too few or too slow poses.
+    The largest of x, y and the heading; 0 without covariances, or with too few or too slow poses.
     """
     count = len(poses) - _ORDER
     if poses.covariances is None or count < _FEWEST:
@@ -81,7 +79,7 @@ def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
     return PlanarPoses(poses.times_s, poses.poses, factor**2 * poses.covariances), factor
 
 
-def read_common_covariance(stream: str | os.PathLike[str]) -> FloatArray:
+def read_common_covariance(stream: PathLike) -> FloatArray:
     """(3, 3) covariance that is common to a stream's poses, from the .json that
     `groundtruth laser` wrote beside it; zeros if there is none.
     """

@@ -57,8 +57,7 @@ _LARGEST_CHI2 = 4.0
 class Background(NamedTuple):
     """A scanner's static background, beam by beam."""
 
-    # (readings,): a reading below this is of a new object; infinite if the beam sees nothing
-    near_m: FloatArray
+    near_m: FloatArray  # (readings,): a reading below this is new; infinite without any
     quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
 
 
@@ -66,8 +65,7 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
     """Learn the background of the beams from scans (N, readings) of the empty area.
 
     Readings without a return are 0, or `max_range_m` and more. The nearest object of a beam is at a
-    low quantile of its readings: beams along an edge jump between near and far. Nearer readings are
-    treated as passing objects.
+    low quantile of its readings: beams along an edge jump, and nearer ones are of passing objects.
     """
     if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
         raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
@@ -99,8 +97,7 @@ class ScanSets:
     """Sets of scans, at most one per scanner, taken at about the same time."""
 
     times_s: FloatArray  # (sets,): mean time of the set's scans
-    # (sets, scanners): row of `ranges_mm` per scanner; -1 if the scanner has none in the set.
-    rows: IntArray
+    rows: IntArray  # (sets, scanners): rows of `ranges_mm`; -1 if a scanner has none in the set
     ages_s: FloatArray  # (sets, scanners): the set's time minus the scan's
     ranges_mm: NDArray[np.uint16]  # (scans, readings): all scans of all scanners
 
@@ -146,9 +143,8 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
     """Group the scans of scanners that run independently into sets.
 
     `scans` has an entry per scanner. In the order of time, a new set begins if it would contain a
-    scanner twice, or if its first scan is older than the median time between a scanner's scans. So
-    each scan is in one set, and scanners that run slightly faster than others occasionally have a
-    set of their own.
+    scanner twice, or if its first scan is older than the median time between a scanner's scans: so
+    scanners that run slightly faster than others occasionally have a set of their own.
     """
     total = sum(len(one) for one in scans)
     if total == 0:
@@ -201,8 +197,7 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
     `outline`: corners (k, 2) in order, in either direction (m); `outward_m`: by how much all faces
-    are moved. Raises `GroundTruthError` if two
-    consecutive corners coincide, faces cross, or the outline encloses no area.
+    are moved. Raises `GroundTruthError` if corners coincide, faces cross, or there is no area.
     """
     corners = np.asarray(outline, dtype=np.float64)
     following = np.roll(corners, -1, axis=0)

@@ -1,9 +1,8 @@
 """Poses of fixed scanners, aligned with each other and with the building, step by step.
 
 The steps are those of RAWSEEDS' deliverable D2.1, part 2: pairs of scanners are aligned by ICP;
-their scans are merged one after the other; each scanner is aligned again with the others' merged
-scans, in rounds until none moves; finally all as one body with the map, then each, together with
-the walls' offsets.
+their scans are merged one after the other; each is aligned again with the others', in rounds until
+none moves; finally all as one body with the map, then each, together with the walls' offsets.
 """
 
 from __future__ import annotations
@@ -62,16 +61,12 @@ class Alignment:
     """Estimated poses of the scanners."""
 
     scanners: tuple[Scanner, ...]  # With poses on the map and their covariances
-    # Poses after each of `STEPS`; those before the map are in the frame of the measured poses.
-    steps: dict[str, FloatArray]
-    # Share of two scans that coincides with the other scan after the pairwise ICP, 0 to 1
-    pairs: dict[tuple[int, int], float]
+    steps: dict[str, FloatArray]  # Poses after each of `STEPS`, at first in the measured frame
+    pairs: dict[tuple[int, int], float]  # Shares of two scans that coincide after their ICP
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
-    # (3 scanners, 3 scanners): covariance of their poses, jointly
-    covariance: FloatArray
-    # Standard deviation of the offsets of the walls' ends from the map (m); 0 if it is exact.
-    map_sigma_m: float
+    covariance: FloatArray  # (3 scanners, 3 scanners): of their poses, jointly
+    map_sigma_m: float  # Standard deviation of the walls' ends from the map (m); 0 if exact
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 
@@ -127,7 +122,12 @@ def align_scanners(
     gates = np.geomspace(s.gate_m, 0.08, 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = _round(scans, steps["merged"], s)
-    steps["together"] = _together(scans, steps["realigned"], s)
+    together = steps["realigned"]
+    for _ in range(_ROUNDS):  # until no scanner moves
+        before, together = together, _round(scans, together, s)
+        if np.abs(together - before).max() < 1e-5:
+            break
+    steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
     whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
@@ -214,9 +214,8 @@ def _chained(
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):
-        pair = max(
-            (p for p in shares if (p[0] in placed) != (p[1] in placed)), key=lambda p: shares[p]
-        )
+        joining = (pair for pair in shares if (pair[0] in placed) != (pair[1] in placed))
+        pair = max(joining, key=shares.__getitem__)
         a, b = pair if pair[0] in placed else pair[::-1]
         a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
         poses[b] = compose(poses[a], a_from_b)
@@ -226,10 +225,9 @@ def _chained(
 
 def _merge(scans: list[Scan], poses: FloatArray, members: Iterable[int]) -> Scan:
     """Several scans in one frame."""
-    return Scan(
-        np.concatenate([apply(poses[k], scans[k].points) for k in members]),
-        np.concatenate([apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]),
-    )
+    points = [apply(poses[k], scans[k].points) for k in members]
+    normals = [apply([0.0, 0.0, poses[k][2]], scans[k].normals) for k in members]
+    return Scan(np.concatenate(points), np.concatenate(normals))
 
 
 def _realigned(
@@ -252,20 +250,13 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
     return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), s.keep)
 
 
-def _together(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
-    """Rounds until no scanner moves."""
-    for _ in range(_ROUNDS):
-        before = poses
-        poses = _round(scans, poses, s)
-        if np.abs(poses - before).max() < 1e-5:
-            break
-    return poses
-
-
 def _whole_to_map(
-    stills: list[StillScan], poses: FloatArray, measured: FloatArray, building: FloatArray,
+    stills: list[StillScan],
+    poses: FloatArray,
+    measured: FloatArray,
+    building: FloatArray,
     narrowing_m: list[float],
-) -> tuple[FloatArray, WallCurves]:  # fmt: skip
+) -> tuple[FloatArray, WallCurves]:
     """Align all scanners, as one rigid body, with the map, from their measured poses.
 
     Also says which walls are chords of curves: whether coarse ones are, the readings decide.
@@ -295,9 +286,5 @@ def icp_by_step(
     They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
     (3,).
     """
-    return np.array(
-        [
-            fit_outline(points, building, invert(start), s.gate_m, s.keep, 0.0, k)[1]
-            for k in range(steps + 1)
-        ]
-    )
+    from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
+    return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

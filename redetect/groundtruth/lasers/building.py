@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ezdxf import units
-from ezdxf.enums import InsertUnits
-from ezdxf.filemanagement import readfile
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_table
-from redetect.messages import one_line
+from redetect.groundtruth.files import PathLike, read_table
+from redetect.messages import imported_for, one_line
 from redetect.storage.bounded import read_content
 
 #: Curved walls are approximated by segments no farther from the curve than this (m).
@@ -33,7 +30,7 @@ _SHORTEST_M = 1e-6
 _DEEPEST = 32
 
 
-def find_building(folder: str | os.PathLike[str]) -> Path:
+def find_building(folder: PathLike) -> Path:
     """The building map of a session: ``building.csv`` or else ``building.dxf``."""
     for name in ("building.csv", "building.dxf"):
         if (path := Path(folder) / name).is_file():
@@ -41,7 +38,7 @@ def find_building(folder: str | os.PathLike[str]) -> Path:
     raise GroundTruthError(f"{Path(folder)}: contains neither building.csv nor building.dxf")
 
 
-def read_building(path: str | os.PathLike[str]) -> FloatArray:
+def read_building(path: PathLike) -> FloatArray:
     """Read a building map.
 
     Parameters
@@ -76,9 +73,13 @@ def read_building(path: str | os.PathLike[str]) -> FloatArray:
     return segments
 
 
-def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
+def _read_drawing(path: PathLike) -> FloatArray:
     pieces: list[tuple[float, float, float, float]] = []
     read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
+    with imported_for(f"{path}: drawings are read by the package ezdxf", "dxf", GroundTruthError):
+        from ezdxf import units
+        from ezdxf.enums import InsertUnits
+        from ezdxf.filemanagement import readfile
     try:
         drawing = readfile(os.fspath(path))
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
@@ -98,7 +99,7 @@ def _read_drawing(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def _curves(
-    path: str | os.PathLike[str], space: Iterable[Any], tolerance: float
+    path: PathLike, space: Iterable[Any], tolerance: float
 ) -> Iterator[list[tuple[float, float]]]:
     """Lines and curves of a drawing as chains of points, in its units."""
     # Not ezdxf's own decomposition: it also converts dimensions and leaders to lines.

@@ -12,7 +12,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import re
 import struct
 import zipfile
@@ -28,9 +28,9 @@ from numpy.typing import ArrayLike, NDArray
 from redetect.array_types import BoolArray, FloatArray
 from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, parse_numbers, read_rows, write_json
+from redetect.groundtruth.files import JsonObject, PathLike, parse_numbers, read_rows, write_json
 from redetect.messages import excerpt, one_line
-from redetect.storage.bounded import read_plain_array
+from redetect.storage.bounded import read_content, read_plain_array
 
 MOST_READINGS = 4096
 
@@ -47,20 +47,13 @@ _ENDINGS = (".scans.npz", ".scans.csv", ".scans.csv.gz")
 
 @dataclass(frozen=True, eq=False)
 class Scanner:
-    """A laser scanner.
-
-    Raises `GroundTruthError` if a shape or value is impossible.
-    """
+    """A laser scanner; raises `GroundTruthError` if a shape or value is impossible."""
 
     name: str  # Its scans are in ``<name>.scans.npz``
-    # (3,): x, y (m), theta (rad) of the scanner in the world or, on board, in the robot's frame
-    pose: FloatArray
-    # (3, 3): of the pose, (x, y, theta) in the same frame; zeros if it is known exactly.
-    covariance: FloatArray
-    # Beam i points to first_angle + i step in the scanner's frame.
-    first_angle_rad: Annotated[float, FINITE]
-    # Negative where it is mounted upside down
-    angle_step_rad: Annotated[float, NOT_0]
+    pose: FloatArray  # (3,): x, y (m), theta (rad) in the world or, on board, the robot's frame
+    covariance: FloatArray  # (3, 3): of the pose; zeros if it is known exactly
+    first_angle_rad: Annotated[float, FINITE]  # Beam i points to first + i step in its frame
+    angle_step_rad: Annotated[float, NOT_0]  # Negative where it is mounted upside down
     readings: Annotated[int, whole(1, MOST_READINGS)]  # Beams per scan
     max_range_m: Positive  # Readings of at least this length are no returns
     sigma_m: NotNegative  # Standard deviation of a reading (m)
@@ -108,16 +101,13 @@ class Scanner:
 class Robot:
     """A robot to be tracked by laser scanners."""
 
-    # (K, 2): corners of the closed polygon that the scanners see, in the robot's frame (m)
-    outline: FloatArray
+    outline: FloatArray  # (K, 2): corners of the polygon that scanners see, in its frame (m)
     largest_speed_m_s: float  # Upper bound of its speed
     largest_turn_rad_s: float
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
 
-def read_joint_covariance(
-    path: str | os.PathLike[str], scanners: Sequence[Scanner]
-) -> FloatArray | None:
+def read_joint_covariance(path: PathLike, scanners: Sequence[Scanner]) -> FloatArray | None:
     """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
 
     Raises `GroundTruthError` if it is not one of these scanners, in their order.
@@ -160,7 +150,7 @@ def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Pat
     ]
 
 
-def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
+def read_scanners(path: PathLike) -> tuple[Scanner, ...]:
     """Read a ``scanners.json``: the scanners, in the file's order.
 
     Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
@@ -170,7 +160,7 @@ def read_scanners(path: str | os.PathLike[str]) -> tuple[Scanner, ...]:
 
 
 def write_scanners(
-    path: str | os.PathLike[str],
+    path: PathLike,
     scanners: Sequence[Scanner],
     extra: Mapping[str, Any] | None = None,
     *,
@@ -181,7 +171,7 @@ def write_scanners(
     write_json(path, content, overwrite=overwrite)
 
 
-def read_robot(path: str | os.PathLike[str]) -> Robot:
+def read_robot(path: PathLike) -> Robot:
     """Read a ``robot.json``.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
@@ -236,11 +226,8 @@ class Scans:
     Raises `GroundTruthError` if shapes or types disagree or a time is not finite.
     """
 
-    # (N,): seconds on the scanner's clock (of a scan's middle beam), in the order of measurement.
-    # In some real logs they step back.
-    times_s: FloatArray
-    # (N, readings): readings in millimetres, 0 if nothing was returned
-    ranges_mm: NDArray[np.uint16]
+    times_s: FloatArray  # (N,): of scans' middle beams, as measured; some real logs step back
+    ranges_mm: NDArray[np.uint16]  # (N, readings): in millimetres, 0 if nothing was returned
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
@@ -256,7 +243,7 @@ class Scans:
         return len(self.times_s)
 
 
-def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
+def find_scans(folder: PathLike, name: str) -> Path:
     """The file with a scanner's scans in a folder: ``.scans.npz``, ``.csv`` or ``.csv.gz``.
 
     Raises `GroundTruthError` if there is none, or more than one.
@@ -271,9 +258,7 @@ def find_scans(folder: str | os.PathLike[str], name: str) -> Path:
     return found[0]
 
 
-def read_scans(
-    path: str | os.PathLike[str], readings: int | None = None, *, ordered: bool = True
-) -> Scans:
+def read_scans(path: PathLike, readings: int | None = None, *, ordered: bool = True) -> Scans:
     """Read scans.
 
     Parameters
@@ -304,10 +289,9 @@ def read_scans(
         scans = Scans(times, ranges)
     except GroundTruthError as error:
         raise GroundTruthError(f"{path}: {error}") from None
-    if readings is not None and scans.ranges_mm.shape[1] != readings:
-        raise GroundTruthError(
-            f"{path}: {scans.ranges_mm.shape[1]} readings per scan: expected {readings}"
-        )
+    width = scans.ranges_mm.shape[1]
+    if readings not in (None, width):
+        raise GroundTruthError(f"{path}: {width} readings per scan: expected {readings}")
     back = np.flatnonzero(np.diff(scans.times_s) < 0.0)
     if ordered and back.size:
         i = int(back[0])
@@ -318,51 +302,33 @@ def read_scans(
     return scans
 
 
-def _read_npz(path: str | os.PathLike[str]) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_npz(path: PathLike) -> tuple[FloatArray, NDArray[np.uint16]]:
     """Read the two arrays, checking the sizes stated in the file and without unpickling."""
+    content = read_content(path, _LARGEST_FILE_BYTES, "file", GroundTruthError)
+    place, arrays = f"{path}: unreadable .npz", []
     try:
-        with zipfile.ZipFile(path) as archive:
-            times = _member(path, archive, "times_s", np.dtype(np.float64), 1)
-            return times, _member(path, archive, "ranges_mm", np.dtype(np.uint16), 2)
-    except GroundTruthError:
-        raise
-    except FileNotFoundError:
-        raise GroundTruthError(f"{path}: no such file") from None
-    except OSError as error:
-        raise GroundTruthError(f"{path}: cannot be read: {error.strerror}") from None
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            for name, kind, dimensions in (("times_s", np.float64, 1), ("ranges_mm", np.uint16, 2)):
+                place = f"{path}: {name}"
+                info = archive.getinfo(f"{name}.npy")
+                if info.file_size > _LARGEST_FILE_BYTES:
+                    raise ValueError(f"larger than {_LARGEST_FILE_BYTES} bytes")
+                with archive.open(info) as stream:
+                    file, dtype = cast(BinaryIO, stream), np.dtype(kind)
+                    arrays.append(read_plain_array(file, dtype, dimensions, info.file_size))
+    except KeyError:
+        raise GroundTruthError(f"{place}: no such array: expected times_s and ranges_mm") from None
     # Errors of damaged archives: names that are not UTF-8, offsets beyond the file, ...
     except (
         zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OverflowError,
-        struct.error,
+        struct.error, zlib.error,
     ) as error:  # fmt: skip
-        said = one_line(str(error), 200)
-        raise GroundTruthError(f"{path}: unreadable .npz: {said}") from None
+        raise GroundTruthError(f"{place}: {one_line(str(error), 200)}") from None
+    times, ranges = arrays
+    return times, ranges
 
 
-def _member(
-    path: str | os.PathLike[str],
-    archive: zipfile.ZipFile,
-    name: str,
-    dtype: np.dtype[Any],
-    dimensions: int,
-) -> NDArray[Any]:
-    place = f"{path}: {name}"
-    try:
-        info = archive.getinfo(f"{name}.npy")
-    except KeyError:
-        raise GroundTruthError(f"{place}: no such array: expected times_s and ranges_mm") from None
-    if info.file_size > _LARGEST_FILE_BYTES:
-        raise GroundTruthError(f"{place}: larger than {_LARGEST_FILE_BYTES} bytes")
-    try:
-        with archive.open(info) as stream:
-            return read_plain_array(cast(BinaryIO, stream), dtype, dimensions, info.file_size)
-    except (ValueError, zlib.error) as error:
-        raise GroundTruthError(f"{place}: {error}") from None
-
-
-def _read_rows(
-    path: str | os.PathLike[str], readings: int | None
-) -> tuple[FloatArray, NDArray[np.uint16]]:
+def _read_rows(path: PathLike, readings: int | None) -> tuple[FloatArray, NDArray[np.uint16]]:
     rows: list[FloatArray] = []
     columns = None if readings is None else readings + 1
     for line, words in read_rows(path, _LARGEST_FILE_BYTES):

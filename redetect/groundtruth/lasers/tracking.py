@@ -8,6 +8,7 @@ that the beams agree. Errors of one set affect the next one's pose only through 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.ndimage import convolve1d
 from scipy.stats import trim_mean
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
 from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
@@ -65,28 +66,21 @@ class LaserTrack:
     # (N,): index into `STATUS`. Poses are valid if it is OK or REACQUIRED, and except for one
     # direction if it is UNDETERMINED.
     status: IntArray
-    # (N,): number of the acquisition that the set belongs to; -1 if the robot is lost.
-    segment: IntArray
+    segment: IntArray  # (N,): number of the set's acquisition; -1 if the robot is lost
     poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
-    # (N, 3, 3): of (x, y, theta), from the readings' noise and the scanners' poses
-    covariances: FloatArray
+    covariances: FloatArray  # (N, 3, 3): from the readings' noise and the scanners' poses
     noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
-    # (N, 3): velocity (m/s) and turn (rad/s) in the world, from the poses before and after
-    motion: FloatArray
+    motion: FloatArray  # (N, 3): velocity (m/s) and turn (rad/s) in the world
     readings: IntArray  # (N,): number of readings used for the pose
     rms_m: FloatArray  # (N,): their root mean square distance from the outline
     chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
     beams: FloatArray  # (N, 6): as in `BeamCounts`
-    # (N, 3): the least determined direction of (x, y, theta times the outline's radius), where it
-    # is UNDETERMINED
-    weak: FloatArray
+    weak: FloatArray  # (N, 3): least determined direction of x, y, theta times the radius
     reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
-    # (scanners, 3): corrections of the scanners' given poses that their residuals suggest
-    corrections: FloatArray
+    corrections: FloatArray  # (scanners, 3): of their poses, as their residuals suggest
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
-    # By how much each face of the given outline was moved outward to fit the readings (m)
-    outline_moved_m: float = 0.0
+    outline_moved_m: float = 0.0  # By how much its faces were moved outward to fit (m)
 
 
 class Tracker:
@@ -128,21 +122,25 @@ class Tracker:
                 searched_s = t
                 # From the scans of this set alone, if they show the robot.
                 found = acquire(self.sets[i], self.fixed, self.body, self.settings)
-                acquired = None if found is None else self._fit(i, found, np.zeros(3), 0.0)
-                if acquired is not None:
+                if found is None:
+                    continue
+                with suppress(GeometryError):
+                    pose, motion = self._fit(i, found, np.zeros(3), 0.0), np.zeros(3)
                     if self.track.status[i] == OK:
                         self.track.status[i] = REACQUIRED
-                    pose, motion, segment, tracked = acquired, np.zeros(3), segment + 1, True
+                    segment, begun, tracked = segment + 1, i, True
                     posed_s = before_s = determined_s = t
-                    self.track.segment[i], begun = segment, i
+                    self.track.segment[i] = segment
                 continue
             step, before_s = t - before_s, t
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - determined_s)
-            fitted = self._fit(i, predicted, motion, t - posed_s)
-            if fitted is None:
+            try:
+                fitted = self._fit(i, predicted, motion, t - posed_s)
+            except GeometryError as reason:
+                self.track.reasons[i] = str(reason)
                 self.track.status[i], pose = COASTING, predicted
                 continue
             error = pose_differences(fitted, predicted)
@@ -157,35 +155,28 @@ class Tracker:
 
     def _fit(
         self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
-    ) -> FloatArray | None:
-        """Pose of set i near a prediction over `unseen_s` without poses; None, with a reason."""
+    ) -> FloatArray:
+        """Pose of set i near a prediction over `unseen_s` without poses, or a `GeometryError`."""
         s = self.settings
         seen = self._points(i, predicted, motion, unseen_s)
         if len(seen.points) < s.least_readings:
-            self.track.reasons[i] = f"{len(seen.points)} new readings where the robot should be"
-            return None
+            raise GeometryError(f"{len(seen.points)} new readings where the robot should be")
         start, count = self._aligned(seen, predicted)
         if count < s.least_readings:
-            self.track.reasons[i] = f"{count} readings within {s.gate_m:g} m of the outline"
-            return None
+            raise GeometryError(f"{count} readings within {s.gate_m:g} m of the outline")
         found = self._refine(i, seen, start)
         pose, used, chi2 = found.pose, found.used, found.chi2
         if used < s.least_readings:
-            self.track.reasons[i] = f"{used} readings on the outline"
-            return None
+            raise GeometryError(f"{used} readings on the outline")
         if chi2 > _LARGEST_CHI2 * (used - 3.0):
-            self.track.reasons[i] = f"squared normalised residuals {chi2:.0f} of {used} readings"
-            return None
+            raise GeometryError(f"squared normalised residuals {chi2:.0f} of {used} readings")
         far = math.hypot(pose[0] - predicted[0], pose[1] - predicted[1])
         if far > 0.1 + 2.0 * self.speed * unseen_s:
-            self.track.reasons[i] = f"{far:.2f} m from where the robot should be"
-            return None
+            raise GeometryError(f"{far:.2f} m from where the robot should be")
         beams = explain_set(self.sets[i], self.fixed, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
-            self.track.reasons[i] = (
-                f"{beams.through} beams see through the robot, {beams.agree} see it"
-            )
-            return None
+            through, agree = beams.through, beams.agree
+            raise GeometryError(f"{through} beams see through the robot, {agree} see it")
         self._store(i, found, beams)
         return pose
 
@@ -391,9 +382,8 @@ def track_without_suspects(
 ) -> tuple[LaserTrack, dict[str, FloatArray]]:  # fmt: skip
     """Follow the robot, excluding scanners whose readings disagree with the others'.
 
-    They are excluded one at a time, the worst first, and only while at least three scanners remain.
-    Returns the track and, for the excluded ones, the shift that their readings suggest and its
-    standard deviations (2, 3).
+    The worst is excluded first, while three or more remain. Returns the track and, for the excluded
+    ones, the shift that their readings suggest and its standard deviations (2, 3).
     """
     left_out: dict[str, FloatArray] = {}
     while True:
@@ -402,9 +392,8 @@ def track_without_suspects(
         worst = int(np.argmax(excess))
         if len(scanners) - len(left_out) < 3 or excess[worst] <= 1.0:
             return track, left_out
-        left_out[scanners[worst].name] = np.stack(
-            [track.corrections[worst], track.correction_sigma[worst]]
-        )
+        suggested = (track.corrections[worst], track.correction_sigma[worst])
+        left_out[scanners[worst].name] = np.stack(suggested)
         rows = sets.rows.copy()
         rows[:, worst] = -1
         sets = replace(sets, rows=rows)
@@ -422,8 +411,8 @@ def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArra
 def usual_sets_per_pose(track: LaserTrack) -> int:
     """Number of consecutive sets that are close enough to average, at least 1.
 
-    While the robot speeds up or begins to turn, the mean of poses over a time T is off by a T^2/24,
-    which is less than their noise over this time only.
+    If the robot speeds up or begins to turn, the mean over a time T is off by a T^2/24: less than
+    the noise over this time only.
     """
     return max(1, round(_AVERAGED_S / max(_interval_s(track.times_s), 1e-9)))
 

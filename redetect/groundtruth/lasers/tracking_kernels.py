@@ -31,8 +31,7 @@ class ScanSet(NamedTuple):
 class FixedScanners(NamedTuple):
     """Scanners as arrays, padded to the longest scan."""
 
-    # (scanners, readings): below this a reading is new: nearer than the background; 0 for padding
-    near_mm: FloatArray
+    near_mm: FloatArray  # (scanners, readings): below this a reading is new; 0 for padding
     direction: FloatArray  # (scanners, readings, 2): of the beams in the world
     origins: FloatArray  # (scanners, 2): in the world (m)
     sigmas_m: FloatArray  # (scanners,): standard deviations of readings, rounding included
@@ -68,18 +67,15 @@ class OutlinePose(NamedTuple):
     """The most likely pose of an outline near a start."""
 
     pose: FloatArray
-    # (3, 3): from the readings alone, except for undetermined directions, which have the prior's
-    covariance: FloatArray
+    covariance: FloatArray  # (3, 3): from the readings; along undetermined directions the prior's
     by_scanner: FloatArray  # (3, 3 scanners): derivatives of the pose by the scanners' poses
     used: int  # Number of readings used
     chi2: float  # Their squared normalised residuals
     open_directions: int
     rms_m: float  # Of their distances from the outline
-    # (3,): the least determined direction of (x, y, theta), theta times `scale_m`
-    weak: FloatArray
-    # (scanners, 3, 3), (scanners, 3): correction of each scanner's own pose by the residuals
-    information: FloatArray
-    gradient: FloatArray
+    weak: FloatArray  # (3,): least determined direction of x, y, theta times `scale_m`
+    information: FloatArray  # (scanners, 3, 3): correction of each scanner's own pose
+    gradient: FloatArray  # (scanners, 3): the same
 
 
 class BeamCounts(NamedTuple):
@@ -158,10 +154,10 @@ def _face_of(
     x: float, y: float, bx: float, by: float, range_m: float, faces: FloatArray,
     normal: FloatArray, gate_m: float,
 ) -> int:  # fmt: skip
-    """The face that a reading at (x, y) belongs to, -1 for none; (bx, by) is its beam's direction.
+    """The face of a reading at (x, y), -1 for none; (bx, by) is its beam's direction.
 
-    Of faces turned to the scanner that which the beam meets first; where its range is not given
-    (below 0), the nearest one within the gate.
+    Of faces turned to the scanner that which the beam meets first; without its range (below 0), the
+    nearest one within the gate.
     """
     best, face = np.inf, -1
     for k in range(faces.shape[0]):
@@ -222,8 +218,7 @@ class _NormalEquations(NamedTuple):
     h: FloatArray  # (3, 3)
     g: FloatArray  # (3,)
     cross: FloatArray  # (3, 3 scanners): of the pose and the scanners' own poses
-    # As in `OutlinePose`
-    information: FloatArray
+    information: FloatArray  # This and the next as in `OutlinePose`
     gradient: FloatArray
     used: int
     chi2: float

@@ -74,8 +74,8 @@ class StillScan(NamedTuple):
 def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
     """Average scans (N, readings) in which nothing moves.
 
-    Excluded are beams without a reading in half of the scans and those along an edge, which jump
-    between near and far; also a beam's readings far from its median, of passing objects.
+    Without beams that have no reading in half of the scans or jump along an edge, and readings far
+    from a beam's median, of passing objects.
     """
     metres = ranges_mm * 1e-3
     hit = scanner.has_return(ranges_mm)
@@ -96,10 +96,8 @@ def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
 def first_walls(
     origin: FloatArray, directions: FloatArray, walls: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """The walls (S, 4) that rays from a point meet first: distances (N,), infinite if there is
-    none, indices (N,), and cosines (N,) of the angles of incidence.
-
-    `directions`: (N, 2) unit vectors.
+    """Distances (N,), infinite if there is none, and indices (N,) of the walls (S, 4) that rays
+    from a point first meet in `directions` (N, 2), unit vectors; cosines (N,) of the incidence.
     """
     start, along = walls[:, :2] - origin, walls[:, 2:] - walls[:, :2]
     across = directions[:, :1] * along[:, 1] - directions[:, 1:] * along[:, 0]
@@ -191,8 +189,7 @@ class MapProblem(NamedTuple):
     prior: FloatArray  # (3 poses, 3 poses): information of the measured poses
     walls: FloatArray  # (S, 4): pieces of wall, seen from both sides (m)
     curves: WallCurves  # Which of them are chords
-    # (scanners, 3): poses on one body, the only pose; otherwise each scanner has a pose.
-    mounts: FloatArray | None = None
+    mounts: FloatArray | None = None  # (scanners, 3): on one body, the only pose; else no body
 
     def fit(self, starts: FloatArray, narrowing_m: Sequence[float], weak_sigma_m: float) -> MapFit:
         """The most likely poses near starts.
@@ -342,9 +339,9 @@ class MapProblem(NamedTuple):
             near = squared < _GATE_SIGMA**2
             found.append([v[near] for v in (*rows, np.column_stack([normal, turn]))])
         columns = [np.concatenate(column) for column in zip(*found)]
-        if len(columns[0]) < _LEAST_READINGS:
+        if (used := len(columns[0])) < _LEAST_READINGS:
             raise GeometryError(
-                f"{len(columns[0])} readings lie on the map: expected {_LEAST_READINGS} or more"
+                f"{used} readings lie on the map: expected {_LEAST_READINGS} or more"
             )
         return _OnWalls(cost, *columns)
 

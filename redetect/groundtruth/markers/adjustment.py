@@ -24,31 +24,14 @@ from camera import Camera
 from camera.rotations import cross_matrices
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    exp_se3,
-    inverse,
-    log_se3,
-    right_jacobian,
-)
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import squared_mahalanobis
-from redetect.least_squares.solver import (
-    Block,
-    Linear,
-    Loss,
-    StartError,
-    factor,
-    minimise,
-    normal_equations,
-    robust_cost,
-    stack,
-    whitening,
-)
+from redetect.least_squares import solver
 
 UNDETERMINED = "the points do not determine all poses"
 # A first, coarse pass has a robust loss.
-_ROBUST, _NEAR = Loss("huber", 3.0), 1e-6
-_PLAIN, _TOLERANCE = Loss(), 1e-15
+_ROBUST, _NEAR = solver.Loss("huber", 3.0), 1e-6
+_PLAIN, _TOLERANCE = solver.Loss(), 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +65,7 @@ class Chain(NamedTuple):
 class ChainProjection(NamedTuple):
     """Pixels of points and their derivatives by right perturbations of the three poses."""
 
-    # (N, 2): NaN where a point is not in front of its camera or past the distortion's fold
-    pixels: FloatArray
+    pixels: FloatArray  # (N, 2): NaN behind the camera or past the distortion's fold
     by_camera: FloatArray  # (N, 2, 6): d(u, v) / d(translation m, rotation rad)
     by_body: FloatArray
     by_part: FloatArray
@@ -91,9 +73,9 @@ class ChainProjection(NamedTuple):
 
 def project_chain(chain: Chain, seen: ChainPoints) -> FloatArray:
     """(N, 2) pixels at which the points would be seen (see `ChainProjection.pixels`)."""
-    in_body = apply(chain.body_from_part[seen.part], seen.points)
-    in_world = apply(chain.world_from_body[seen.body], in_body)
-    in_camera = apply(inverse(chain.world_from_camera)[seen.camera], in_world)
+    in_body = se3.apply(chain.body_from_part[seen.part], seen.points)
+    in_world = se3.apply(chain.world_from_body[seen.body], in_body)
+    in_camera = se3.apply(se3.inverse(chain.world_from_camera)[seen.camera], in_world)
     pixels = np.empty((len(seen), 2))
     for index in np.unique(seen.camera):
         chosen = seen.camera == index
@@ -103,10 +85,10 @@ def project_chain(chain: Chain, seen: ChainPoints) -> FloatArray:
 
 def project_chain_with_jacobians(chain: Chain, seen: ChainPoints) -> ChainProjection:
     """Pixels and Jacobians; parameters as in `project_chain`."""
-    camera_from_world = inverse(chain.world_from_camera)[seen.camera]
+    camera_from_world = se3.inverse(chain.world_from_camera)[seen.camera]
     camera_from_body = camera_from_world @ chain.world_from_body[seen.body]
-    in_body = apply(chain.body_from_part[seen.part], seen.points)
-    in_camera = apply(camera_from_body, in_body)
+    in_body = se3.apply(chain.body_from_part[seen.part], seen.points)
+    in_camera = se3.apply(camera_from_body, in_body)
     pixels = np.empty((len(seen), 2))
     by_point = np.empty((len(seen), 2, 3))
     for index in np.unique(seen.camera):
@@ -143,8 +125,7 @@ class Bundle:
 
     cameras: tuple[Camera, ...]  # C lenses
     parts: int  # P, the number of parts
-    # (C + P + B, 4, 4): `world_from_camera`, then `body_from_part`, then `world_from_body`
-    poses: FloatArray
+    poses: FloatArray  # (C + P + B, 4, 4): of cameras, of parts in bodies, of bodies
     free: BoolArray  # (C + P + B,)
     seen: ChainPoints
     view: IntArray  # (N,): which part in which image each point is of: 0 to V - 1
@@ -183,7 +164,7 @@ class Bundle:
         """With free poses moved by right perturbations."""
         steps = np.zeros((len(self.free), 6))
         steps[self.free] = step.reshape(-1, 6)
-        return replace(self, poses=self.poses @ exp_se3(steps))
+        return replace(self, poses=self.poses @ se3.exp(steps))
 
     @property
     def chain(self) -> Chain:
@@ -197,7 +178,7 @@ class Bundle:
 
     def prior_error(self, prior: PosePrior) -> FloatArray:
         """(6,) right perturbation that leads from the prior's pose to the bundle's."""
-        return log_se3(inverse(prior.pose) @ self.poses[prior.index])
+        return se3.log(se3.inverse(prior.pose) @ self.poses[prior.index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +190,8 @@ class AdjustedBundle:
     residuals: FloatArray  # (N, 2): measured minus predicted pixels, of all points
     cost: float  # Squared normalised residuals of the used points and of the priors
     degrees_of_freedom: int
-    # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, the bodies marginalised;
-    # zeros for fixed ones. That of the corners' covariances, not scaled by the residuals.
+    # (6 (C + P), 6 (C + P)): of right perturbations of cameras and parts, zeros for fixed ones, by
+    # the corners' covariances, not scaled by the residuals.
     covariance: FloatArray
 
     @property
@@ -252,15 +233,14 @@ def adjust_bundle(
         used = kept
         # A body without used points is not moved.
         free = bundle.free.copy()
-        free[bundle.shared :] &= np.isin(
-            np.arange(len(bundle.world_from_body)), bundle.seen.body[used]
-        )
+        bodies = np.arange(len(bundle.world_from_body))
+        free[bundle.shared :] &= np.isin(bodies, bundle.seen.body[used])
         bundle = replace(bundle, free=free)
         bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)
     return _result(bundle, used)
 
 
-def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
+def linearised(bundle: Bundle, loss: solver.Loss = _PLAIN) -> solver.Linear:
     """The problem near a bundle's poses; the unknowns are right perturbations, ordered as `free`.
 
     Residuals are in standard deviations: those of the points, then those of the priors.
@@ -268,42 +248,42 @@ def linearised(bundle: Bundle, loss: Loss = _PLAIN) -> Linear:
     seen, free = bundle.seen, bundle.free
     projection = project_chain_with_jacobians(bundle.chain, seen)
     unknown = np.where(free, 6 * (np.cumsum(free) - 1), -1)
-    white = whitening(seen.covariances)
+    white = solver.whitening(seen.covariances)
     derivatives = [
         (unknown[seen.camera], -white @ projection.by_camera),
         (unknown[len(bundle.cameras) + seen.part], -white @ projection.by_part),
         (unknown[bundle.shared + seen.body], -white @ projection.by_body),
     ]
     residuals = (white @ (seen.pixels - projection.pixels)[..., None])[..., 0]
-    blocks = [Block(residuals, derivatives, loss=loss)]
+    blocks = [solver.Block(residuals, derivatives, loss=loss)]
     for prior in bundle.priors:
-        error, root = bundle.prior_error(prior), whitening(prior.covariance)
-        by_pose = root @ np.linalg.inv(right_jacobian(error))
+        error, root = bundle.prior_error(prior), solver.whitening(prior.covariance)
+        by_pose = root @ np.linalg.inv(se3.right_jacobian(error))
         at = unknown[prior.index : prior.index + 1]
-        blocks.append(Block((root @ error)[None], [(at, by_pose[None])]))
-    return stack(blocks, bundle.unknowns, 0)
+        blocks.append(solver.Block((root @ error)[None], [(at, by_pose[None])]))
+    return solver.stack(blocks, bundle.unknowns, 0)
 
 
 class _Adjustment(NamedTuple):
     """The sum of squares of a bundle as `redetect.least_squares.solver.minimise` takes it."""
 
-    loss: Loss
+    loss: solver.Loss
 
     def cost(self, at: Bundle) -> float:
-        residuals = whitening(at.seen.covariances) @ (at.seen.pixels - at.pixels())[..., None]
-        priors = [whitening(p.covariance) @ at.prior_error(p) for p in at.priors]
-        return robust_cost(
-            [(residuals[..., 0], self.loss), *((prior[None], _PLAIN) for prior in priors)]
-        )
+        off = at.seen.pixels - at.pixels()
+        residuals = (solver.whitening(at.seen.covariances) @ off[..., None])[..., 0]
+        priors = [solver.whitening(p.covariance) @ at.prior_error(p) for p in at.priors]
+        parts = [(residuals, self.loss), *((prior[None], _PLAIN) for prior in priors)]
+        return solver.robust_cost(parts)
 
-    def linear(self, at: Bundle) -> Linear:
+    def linear(self, at: Bundle) -> solver.Linear:
         return linearised(at, self.loss)
 
     def moved(self, at: Bundle, step: FloatArray, _: FloatArray) -> Bundle:
         return at.moved(step)
 
 
-def _minimised(bundle: Bundle, used: BoolArray, loss: Loss, tolerance: float) -> Bundle:
+def _minimised(bundle: Bundle, used: BoolArray, loss: solver.Loss, tolerance: float) -> Bundle:
     """The bundle at the minimum of the used points' cost."""
     if bundle.unknowns == 0:
         return bundle
@@ -314,8 +294,8 @@ def _minimised(bundle: Bundle, used: BoolArray, loss: Loss, tolerance: float) ->
             f"{residuals} residuals for {bundle.unknowns} unknowns: too little was seen"
         )
     try:
-        part = minimise(_Adjustment(loss), part, tolerance=tolerance).at
-    except StartError:
+        part = solver.minimise(_Adjustment(loss), part, tolerance=tolerance).at
+    except solver.StartError:
         raise GeometryError("the start has a point behind its camera or outside its lens") from None
     except np.linalg.LinAlgError:
         raise GeometryError(UNDETERMINED) from None
@@ -347,18 +327,18 @@ def _result(bundle: Bundle, used: BoolArray) -> AdjustedBundle:
     )
 
 
-def _shared_information(problem: Linear, shared: int) -> FloatArray:
+def _shared_information(problem: solver.Linear, shared: int) -> FloatArray:
     """Inverse covariance of the first unknowns, those of cameras and parts; bodies marginalised.
 
     No two bodies share a residual, so that their part of the normal equations is sparse (Triggs et
     al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
     """
-    normal = normal_equations(problem).matrix
+    normal = solver.normal_equations(problem).matrix
     information, coupling = normal[:shared, :shared].toarray(), normal[shared:, :shared].toarray()
     if not len(coupling):
         return np.asarray(information)
     try:
-        bodies = factor(normal[shared:, shared:].tocsc())
+        bodies = solver.factor(normal[shared:, shared:].tocsc())
     except np.linalg.LinAlgError:
         raise GeometryError(UNDETERMINED) from None
     return np.asarray(information - coupling.T @ bodies.solve(coupling))

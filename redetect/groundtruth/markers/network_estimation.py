@@ -15,18 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import (
-    AdjustedBundle,
-    Bundle,
-    ChainPoints,
-    PosePrior,
-    adjust_bundle,
-)
+from redetect.groundtruth.markers import adjustment
 from redetect.groundtruth.markers.boards import FIRST, SECOND, WORLD, BoardsFile, BoardView
 from redetect.groundtruth.markers.pairs import chained_poses
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
-from redetect.groundtruth.trajectories.transforms import inverse, log_se3, transform
+from redetect.groundtruth.trajectories import se3
 
 _PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
@@ -39,7 +33,7 @@ class NetworkEstimate:
     world_from_camera: FloatArray  # (C, 4, 4)
     covariance: FloatArray  # (6 C, 6 C): joint, scaled by the residuals
     offset: FloatArray | None  # (4, 4): `first_from_second` of the double board, adjusted
-    adjusted: AdjustedBundle
+    adjusted: adjustment.AdjustedBundle
     views: tuple[BoardView, ...]  # The bundle's views
 
 
@@ -71,7 +65,7 @@ def estimate_network(
     poses, bodies = _chained(names, seen, parts)
     bundle, views = _bundle(setup, parts, seen, poses, bodies, settings.corner_sigma_px)
     try:
-        adjusted = adjust_bundle(
+        adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
         )
     except GeometryError as error:
@@ -108,11 +102,11 @@ def _estimated_offset(seen: _PosedShots) -> FloatArray:
         for (view_a, a), (view_b, b) in product(shot, repeat=2):
             if (view_a.board, view_b.board) == (FIRST, SECOND):
                 if view_a.camera == view_b.camera:
-                    return np.asarray(inverse(a) @ b)
+                    return np.asarray(se3.inverse(a) @ b)
                 together.setdefault((view_a.camera, view_b.camera), []).append((a, b))
     pairs = np.array(max(together.values(), key=len, default=[])).reshape(-1, 2, 4, 4)
-    left, right = (inverse(poses[:1]) @ poses[1:] for poses in pairs.swapaxes(0, 1))
-    if len(left) < 2 or np.linalg.svd(log_se3(left)[:, 3:], compute_uv=False)[1] < 0.05:
+    left, right = (se3.inverse(poses[:1]) @ poses[1:] for poses in pairs.swapaxes(0, 1))
+    if len(left) < 2 or np.linalg.svd(se3.log(left)[:, 3:], compute_uv=False)[1] < 0.05:
         raise GroundTruthError(
             f"the offset of boards {FIRST} and {SECOND} cannot be estimated: "
             "expected 3 or more shots of two cameras with the boards turned about different axes"
@@ -122,11 +116,11 @@ def _estimated_offset(seen: _PosedShots) -> FloatArray:
 
 def hand_eye(left: FloatArray, right: FloatArray) -> FloatArray:
     """(4, 4) least-squares solution X of left_k X = X right_k (Park & Martin 1994)."""
-    rotation = Rotation.align_vectors(log_se3(left)[:, 3:], log_se3(right)[:, 3:])[0]
+    rotation = Rotation.align_vectors(se3.log(left)[:, 3:], se3.log(right)[:, 3:])[0]
     matrix = np.concatenate(left[:, :3, :3] - np.eye(3))
     vector = np.concatenate(rotation.apply(right[:, :3, 3]) - left[:, :3, 3])
     translation = np.linalg.lstsq(matrix, vector, rcond=None)[0]
-    return transform(rotation.as_matrix(), translation)
+    return se3.transform(rotation.as_matrix(), translation)
 
 
 def _chained(
@@ -140,15 +134,16 @@ def _chained(
         for view, pose in shot:
             camera = 1 + names.index(view.camera)
             if view.board == WORLD:
-                estimates.setdefault((0, camera), []).append(parts[WORLD] @ inverse(pose))
+                estimates.setdefault((0, camera), []).append(parts[WORLD] @ se3.inverse(pose))
             else:
                 here = held.setdefault(number, [])
-                here.append((camera, pose @ inverse(parts[view.board])))
+                here.append((camera, pose @ se3.inverse(parts[view.board])))
                 for other, other_from_body in here[:-1]:
                     pair = ((camera, here[-1][1]), (other, other_from_body))
                     (a, a_from_body), (b, b_from_body) = sorted(pair, key=lambda one: one[0])
                     if a != b:
-                        estimates.setdefault((a, b), []).append(a_from_body @ inverse(b_from_body))
+                        a_from_b = a_from_body @ se3.inverse(b_from_body)
+                        estimates.setdefault((a, b), []).append(a_from_b)
     support = {pair: len(poses) for pair, poses in estimates.items()}
     central = {pair: _most_central(poses) for pair, poses in estimates.items()}
     poses = chained_poses(central, support, 1 + len(names), 0)
@@ -166,7 +161,7 @@ def _chained(
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:
     """The pose with the least sum of distances (m, rad) to the others."""
     stack = np.stack(poses)
-    apart = np.linalg.norm(log_se3(inverse(stack)[:, None] @ stack), axis=-1)
+    apart = np.linalg.norm(se3.log(se3.inverse(stack)[:, None] @ stack), axis=-1)
     return np.asarray(stack[int(np.argmin(np.minimum(apart, 1.0).sum(axis=1)))])
 
 
@@ -177,7 +172,7 @@ def _bundle(
     poses: FloatArray,
     bodies: Mapping[int, FloatArray],
     corner_sigma_px: float,
-) -> tuple[Bundle, tuple[BoardView, ...]]:
+) -> tuple[adjustment.Bundle, tuple[BoardView, ...]]:
     """Bundle of all views; its first body is the world, the others are the double boards."""
     names, order = sorted(setup.cameras), list(parts)
     body_index = {number: body for body, number in enumerate(bodies, 1)}
@@ -189,7 +184,7 @@ def _bundle(
     ]
     counts = [len(view.corners) for view in views]
     camera, body, part = np.repeat(np.array(rows).reshape(-1, 3), counts, axis=0).astype(np.int64).T
-    points = ChainPoints(
+    points = adjustment.ChainPoints(
         camera,
         body,
         part,
@@ -199,15 +194,16 @@ def _bundle(
     )
     free = np.ones(len(names) + len(order) + 1 + len(bodies), dtype=np.bool_)
     free[len(names) : len(names) + len(order) + 1] = False
-    priors: tuple[PosePrior, ...] = ()
+    priors: tuple[adjustment.PosePrior, ...] = ()
     double = setup.double
     if double is not None and any(view.board == SECOND for view in views):
         second = len(names) + order.index(SECOND)
         free[second] = double.offset is None or bool(np.any(double.covariance))
         if free[second] and double.offset is not None:
             # Exactly known poses among uncertain ones get a prior of a micrometre.
-            priors = (PosePrior(second, double.offset, double.covariance + 1e-12 * np.eye(6)),)
-    bundle = Bundle(
+            covariance = double.covariance + 1e-12 * np.eye(6)
+            priors = (adjustment.PosePrior(second, double.offset, covariance),)
+    bundle = adjustment.Bundle(
         tuple(setup.cameras[name] for name in names),
         len(order),
         np.stack([*poses, *parts.values(), np.eye(4), *bodies.values()]),

@@ -15,13 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.trajectories.transforms import (
-    composed_covariance,
-    inverse,
-    inverse_covariance,
-    log_se3,
-    mean_pose,
-)
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import squared_mahalanobis
 
 # Squared normalised distance (6 dof) above which an estimate disagrees.
@@ -48,8 +42,7 @@ class PairConsensus:
     covariance: FloatArray  # (6, 6)
     estimates: FloatArray  # (T, 4, 4): each time's estimate that is closest to the consensus
     agrees: BoolArray  # (T,): which of them agree with it
-    # (T,): whether these are the solutions that fit the image best
-    first: BoolArray
+    first: BoolArray  # (T,): whether these are the solutions that fit the image best
 
     @property
     def support(self) -> int:
@@ -59,9 +52,9 @@ class PairConsensus:
 
 def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     """Estimates of `a_from_b` from all combinations of both markers' solutions at one time."""
-    poses = inverse(a.poses)[:, None] @ b.poses
-    own = inverse_covariance(a.poses, a.covariances)[:, None]
-    covariances = composed_covariance(own, b.poses, b.covariances)
+    poses = se3.inverse(a.poses)[:, None] @ b.poses
+    own = se3.inverse_covariance(a.poses, a.covariances)[:, None]
+    covariances = se3.composed_covariance(own, b.poses, b.covariances)
     costs = np.add.outer(a.costs, b.costs).ravel()
     return MarkerPose(poses.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6), costs)
 
@@ -78,7 +71,7 @@ def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
 
     def nearest(pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, IntArray]:
         """Each time's estimate nearest to a pose: squared normalised distance, and its index."""
-        apart = log_se3(inverse(pose) @ poses)
+        apart = se3.log(se3.inverse(pose) @ poses)
         distance = squared_mahalanobis(apart, covariances + covariance + _FLOOR) + costs
         order = np.lexsort((distance, owner))
         best = order[np.searchsorted(owner[order], np.arange(len(times)))]
@@ -98,8 +91,8 @@ def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
         agreeing = best[distance < _AGREES]
         if not len(agreeing):  # not even the hypothesis itself
             agreeing = np.array([chosen])
-        new, covariance = mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
-        moved = float(np.abs(log_se3(inverse(consensus) @ new)).max())
+        new, covariance = se3.mean_pose(poses[agreeing], covariances[agreeing] + _FLOOR)
+        moved = float(np.abs(se3.log(se3.inverse(consensus) @ new)).max())
         consensus = new
         if moved < 1e-10:
             break
@@ -128,7 +121,7 @@ def chained_poses(
     for number in order[1:].tolist():
         parent = int(parents[number])
         known = relative.get((parent, number))
-        poses[number] = poses[parent] @ (
-            inverse(relative[number, parent]) if known is None else known
-        )
+        if known is None:
+            known = se3.inverse(relative[number, parent])
+        poses[number] = poses[parent] @ known
     return poses

@@ -1,9 +1,9 @@
 """The robot's pose at one time: solutions, wrong markers, and the planar ambiguity.
 
 The chosen solver (of OpenCV or pycolmap) gives initial poses, which are refined by least squares
-over all corners. If all markers agree, the mirror image of the markers is tested, too, since it may
-explain the corners as well. If not, each marker's own two solutions are hypotheses, and the one
-with which most others agree determines the wrong markers.
+over all corners. If all markers agree, their mirror image is tested, which may explain the corners,
+too. If not, the hypothesis of a single marker with which most others agree determines the wrong
+ones.
 """
 
 from __future__ import annotations
@@ -17,15 +17,9 @@ import numpy as np
 from camera import Camera
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.markers.refinement import (
-    PoseProblem,
-    RefinedPose,
-    predicted_errors,
-    refine_pose,
-    refined_poses,
-)
+from redetect.groundtruth.markers import refinement
 from redetect.groundtruth.settings import PoseSettings, Solver
-from redetect.groundtruth.trajectories.transforms import apply, inverse, log_se3, transform
+from redetect.groundtruth.trajectories import se3
 
 _RANSAC_PX = 4.0
 # Two minima closer than this are one; mirror images are tens of degrees apart, or are no problem.
@@ -74,12 +68,12 @@ def solve_camera(
         raise GeometryError("a corner lies where the lens sees nothing")
     return _best_first(
         _opencv(points, normalised, solver),
-        lambda pose: _rms(camera.project(apply(pose, points)) - pixels),
+        lambda pose: _rms(camera.project(se3.apply(pose, points)) - pixels),
         f"{solver} found no pose with all points in front of the camera",
     )
 
 
-def solve_robot(problem: PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
+def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
     """Pose of a robot seen by one or several cameras.
 
     `pycolmap` (RANSAC, then least squares) works on all cameras at once; the others on one camera,
@@ -121,7 +115,7 @@ def _best_first(
     return [pose for _, pose in sorted(finite, key=lambda entry: entry[0])]
 
 
-def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
+def view_poses(problem: refinement.PoseProblem, view: int) -> list[FloatArray]:
     """Poses `world_from_robot` that one marker in one image allows, the best first; may be none."""
     chosen = np.flatnonzero(problem.view == view)
     camera, marker = int(problem.seen.camera[chosen[0]]), int(problem.seen.part[chosen[0]])
@@ -130,11 +124,11 @@ def view_poses(problem: PoseProblem, view: int) -> list[FloatArray]:
         found = solve_camera(problem.network.cameras[camera], points, pixels, "ippe")
     except GeometryError:
         return []
-    marker_from_robot = inverse(problem.rig.robot_from_marker[marker])
+    marker_from_robot = se3.inverse(problem.rig.robot_from_marker[marker])
     return [problem.network.world_from_camera[camera] @ pose @ marker_from_robot for pose in found]
 
 
-def robot_rms_px(problem: PoseProblem, world_from_robot: FloatArray) -> float:
+def robot_rms_px(problem: refinement.PoseProblem, world_from_robot: FloatArray) -> float:
     """Root mean square residual per coordinate; infinite with a corner behind its camera."""
     return _rms(problem.pixels(world_from_robot) - problem.seen.pixels)
 
@@ -151,21 +145,17 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
         "iterative": cv2.SOLVEPNP_ITERATIVE,
         "ippe": cv2.SOLVEPNP_IPPE_SQUARE,
     }
-    contiguous = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
+    both = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
     try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            *contiguous, np.eye(3), None, flags=flags[solver]
-        )
-        poses = [
-            transform(cv2.Rodrigues(rotation)[0], translation.ravel())
-            for rotation, translation in zip(rotations, translations)
-        ]
+        found = cv2.solvePnPGeneric(*both, np.eye(3), None, flags=flags[solver])
+        turns_and_shifts = zip(*found[1:3])
+        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in turns_and_shifts]
     except cv2.error as error:
         raise GeometryError(f"{solver} found no pose: {error.err}") from None
     return [pose for pose in poses if np.all(np.isfinite(pose))]
 
 
-def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
+def _pycolmap(problem: refinement.PoseProblem) -> list[FloatArray]:
     import pycolmap  # not every platform has it
 
     used, index = np.unique(problem.seen.camera, return_inverse=True)
@@ -190,7 +180,7 @@ def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
         pixels,
         problem.robot_points,
         index.tolist(),
-        [pycolmap.Rigid3d(inverse(problem.network.world_from_camera[c])[:3]) for c in used],
+        [pycolmap.Rigid3d(se3.inverse(problem.network.world_from_camera[c])[:3]) for c in used],
         pinholes,
         # One thread and a seed: the same corners give the same pose.
         estimation_options=pycolmap.RANSACOptions(
@@ -200,18 +190,16 @@ def _pycolmap(problem: PoseProblem) -> list[FloatArray]:
     if found is None:
         return []
     matrix = np.asarray(found["rig_from_world"].matrix(), dtype=np.float64)
-    return [transform(matrix[:, :3], matrix[:, 3])]
+    return [se3.transform(matrix[:, :3], matrix[:, 3])]
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """Pose estimate from the corners of one time."""
 
-    # The best first; several if the markers are ambiguous.
-    candidates: tuple[RefinedPose, ...]
+    candidates: tuple[refinement.RefinedPose, ...]  # The best first; several if ambiguous
     views: BoolArray  # (V,): which of all views they explain
-    # Log-odds of the first against each candidate: 0 for the first
-    log_odds: tuple[float, ...]
+    log_odds: tuple[float, ...]  # Of the first against each candidate: 0 for the first
 
     @property
     def ambiguous(self) -> bool:
@@ -219,19 +207,18 @@ class PoseEstimate:
         return len(self.candidates) > 1
 
 
-def estimate_pose(problem: PoseProblem) -> PoseEstimate:
+def estimate_pose(problem: refinement.PoseProblem) -> PoseEstimate:
     """All poses of a robot that its markers' corners allow.
 
-    Raises `GeometryError` if there is no view, no pose explains any of them, or equally many
-    support poses that exclude each other.
+    Raises `GeometryError` if no pose explains a view, or poses that exclude each other do as well.
     """
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
     settings = problem.settings
-    found = _distinct(refined_poses(problem, _starts(problem)[:1]))
+    found = _distinct(refinement.refined_poses(problem, _starts(problem)[:1]))
     # Least squares may not have reached the right minimum from the solver's start.
     if not found or np.any(_disagreeing(found[0], settings)):
-        found = _distinct(refined_poses(problem, _starts(problem) + _own_poses(problem)))
+        found = _distinct(refinement.refined_poses(problem, _starts(problem) + _own_poses(problem)))
     if found and not np.any(_disagreeing(found[0], settings)):
         views = np.ones(problem.views, dtype=np.bool_)
     else:
@@ -239,7 +226,7 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
         found = [refined]
     alone = problem.only(views)
     starts = _starts(alone)[:1] + _mirrored(alone)
-    minima = _distinct(found + refined_poses(alone, starts))
+    minima = _distinct(found + refinement.refined_poses(alone, starts))
     best = minima[0]
     # Squared residuals may be larger than their covariances imply.
     inflation = max(1.0, best.cost / max(1, best.degrees_of_freedom))
@@ -254,26 +241,25 @@ def estimate_pose(problem: PoseProblem) -> PoseEstimate:
     return PoseEstimate(candidates, views, log_odds)
 
 
-def _disagreeing(refined: RefinedPose, settings: PoseSettings) -> BoolArray:
-    return np.asarray(
-        (refined.view_errors > settings.outlier_sigma) & (refined.view_rms_px > settings.outlier_px)
-    )
+def _disagreeing(refined: refinement.RefinedPose, settings: PoseSettings) -> BoolArray:
+    far = refined.view_errors > settings.outlier_sigma
+    return np.asarray(far & (refined.view_rms_px > settings.outlier_px))
 
 
-def _starts(problem: PoseProblem) -> list[FloatArray]:
+def _starts(problem: refinement.PoseProblem) -> list[FloatArray]:
     try:
         return solve_robot(problem, problem.settings.solver)
     except GeometryError:
         return []
 
 
-def _own_poses(problem: PoseProblem) -> list[FloatArray]:
+def _own_poses(problem: refinement.PoseProblem) -> list[FloatArray]:
     """Poses by single views: those that explain all views best."""
     poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     return sorted(poses, key=lambda pose: robot_rms_px(problem, pose))[:_OWN_STARTS]
 
 
-def _mirrored(problem: PoseProblem) -> list[FloatArray]:
+def _mirrored(problem: refinement.PoseProblem) -> list[FloatArray]:
     """Both solutions of each camera's largest view: starts from which a mirror image is found."""
     largest = [
         int(max(np.unique(problem.view[problem.seen.camera == camera]), key=problem.extent_px))
@@ -283,9 +269,9 @@ def _mirrored(problem: PoseProblem) -> list[FloatArray]:
     return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
 
 
-def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
+def _distinct(minima: list[refinement.RefinedPose]) -> list[refinement.RefinedPose]:
     """Those that differ, the best first."""
-    kept: list[RefinedPose] = []
+    kept: list[refinement.RefinedPose] = []
     for pose in sorted(minima, key=lambda pose: pose.cost):
         if np.abs(pose.world_from_robot).max() < _FARTHEST_M and not any(
             _same(pose.world_from_robot, other.world_from_robot) for other in kept
@@ -295,26 +281,25 @@ def _distinct(minima: list[RefinedPose]) -> list[RefinedPose]:
 
 
 def _same(a: FloatArray, b: FloatArray) -> bool:
-    apart = inverse(a) @ b
-    turn = np.linalg.norm(log_se3(apart)[3:])
+    apart = se3.inverse(a) @ b
+    turn = np.linalg.norm(se3.log(apart)[3:])
     return bool(np.linalg.norm(apart[:3, 3]) < _SAME_PLACE_M and turn < _SAME_ANGLE_RAD)
 
 
-def _within_covariance(pose: RefinedPose, best: RefinedPose) -> bool:
+def _within_covariance(pose: refinement.RefinedPose, best: refinement.RefinedPose) -> bool:
     """Whether a second minimum is within the covariance of the best one."""
-    apart = log_se3(inverse(best.world_from_robot) @ pose.world_from_robot)
+    apart = se3.log(se3.inverse(best.world_from_robot) @ pose.world_from_robot)
     return bool(apart @ np.linalg.solve(best.covariance, apart) < 4.0)
 
 
-def _consensus(problem: PoseProblem) -> tuple[BoolArray, RefinedPose]:
+def _consensus(problem: refinement.PoseProblem) -> tuple[BoolArray, refinement.RefinedPose]:
     """The largest set of views that agree, and their pose."""
     count = problem.views
-    found: dict[bytes, tuple[BoolArray, RefinedPose]] = {}
+    found: dict[bytes, tuple[BoolArray, refinement.RefinedPose]] = {}
     # A larger marker is the better hypothesis.
     extents = [problem.extent_px(view) for view in range(count)]
-    hypotheses = (
-        (view, start) for view in np.argsort(extents)[::-1] for start in view_poses(problem, view)
-    )
+    order = np.argsort(extents)[::-1]
+    hypotheses = ((view, start) for view in order for start in view_poses(problem, view))
     for view, start in hypotheses:
         explained = _explained(problem, np.arange(count) == view, start)
         if explained is None:
@@ -337,13 +322,13 @@ def _consensus(problem: PoseProblem) -> tuple[BoolArray, RefinedPose]:
 
 
 def _explained(
-    problem: PoseProblem, views: BoolArray, start: FloatArray
-) -> tuple[BoolArray, RefinedPose] | None:
+    problem: refinement.PoseProblem, views: BoolArray, start: FloatArray
+) -> tuple[BoolArray, refinement.RefinedPose] | None:
     """Views that agree with a hypothesis, grown and pruned until they stay; None if none does."""
     pose = start
     for _ in range(6):
         try:
-            refined = refine_pose(problem.only(views), pose)
+            refined = refinement.refine_pose(problem.only(views), pose)
         except GeometryError:
             return None
         pose = refined.world_from_robot
@@ -353,7 +338,7 @@ def _explained(
             worst = np.flatnonzero(views)[int(np.argmax(refined.view_errors))]
             views = views & (np.arange(len(views)) != worst)
             continue
-        predicted = predicted_errors(problem, pose, refined.covariance)
+        predicted = refinement.predicted_errors(problem, pose, refined.covariance)
         grown = views | (predicted < problem.settings.outlier_sigma)
         if np.array_equal(grown, views):
             return views, refined

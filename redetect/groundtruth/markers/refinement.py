@@ -31,7 +31,7 @@ from redetect.groundtruth.markers.adjustment import (
 )
 from redetect.groundtruth.markers.session import Network, Rig, View
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import apply, exp_se3
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import squared_mahalanobis
 
 #: Residuals of a view: two of each corner.
@@ -50,8 +50,7 @@ class PoseProblem:
     network: Network
     rig: Rig
     seen: ChainPoints  # Corners: `camera` and `part` point to cameras and markers, `body` is 0
-    # (N,): which marker in which image each corner is of: four of 0, four of 1, up to V - 1
-    view: IntArray
+    view: IntArray  # (N,): marker in an image of each corner: four of 0, up to V - 1
     settings: PoseSettings
 
     @property
@@ -62,7 +61,7 @@ class PoseProblem:
     @property
     def robot_points(self) -> FloatArray:
         """(N, 3) corners in the robot's frame (m)."""
-        return apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
+        return se3.apply(self.rig.robot_from_marker[self.seen.part], self.seen.points)
 
     def pixels(self, world_from_robot: FloatArray) -> FloatArray:
         """(N, 2) pixels at which the corners are expected; NaN where they cannot be seen."""
@@ -89,12 +88,10 @@ class RefinedPose:
     """A local minimum."""
 
     world_from_robot: FloatArray  # (4, 4)
-    # (6, 6): of the right perturbation: translation (m) and rotation (rad) in the robot's axes
-    covariance: FloatArray
+    covariance: FloatArray  # (6, 6): of the right perturbation (m, rad), in the robot's axes
     cost: float  # Squared Mahalanobis length of all residuals, without robust weights
     degrees_of_freedom: int
-    # (V,): root mean square of each view's normalised residuals: about 1 where all is well
-    view_errors: FloatArray
+    view_errors: FloatArray  # (V,): rms of each view's normalised residuals: about 1 if right
     view_rms_px: FloatArray  # (V,): root mean square of each view's residuals, per coordinate
 
     @property
@@ -132,7 +129,7 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
             step = -np.linalg.solve(now.normal + np.diag(added), now.gradient)
         except np.linalg.LinAlgError:
             raise GeometryError(UNDETERMINED) from None
-        ahead = pose @ exp_se3(step)
+        ahead = pose @ se3.exp(step)
         cost = _cost(problem, ahead, now.covariance)
         gain = float(step @ (added * step - now.gradient))
         settled = np.abs(step).max() < _SMALLEST_STEP or gain <= _COST_TOLERANCE * now.cost
@@ -176,8 +173,7 @@ class _Linearised(NamedTuple):
     cost: float
     gradient: FloatArray  # (6,): J'r
     normal: FloatArray  # (6, 6): J'J
-    # Weights stay those of this step: a cost that also changes them is no measure.
-    covariance: FloatArray
+    covariance: FloatArray  # For this step: a cost that also changes weights is no measure
 
 
 def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
@@ -285,9 +281,8 @@ def chain_points(views: Sequence[View], rig: Rig, corner_floor_px: float) -> Cha
                 f"image {view.frame.prefix}, marker {view.marker.id}: the covariance of a corner "
                 "is not positive definite: expected one, or a corner floor above 0"
             )
-    return ChainPoints(
-        cameras, np.zeros(len(cameras), np.int64), parts, points, pixels, covariances
-    )
+    body = np.zeros(len(cameras), np.int64)
+    return ChainPoints(cameras, body, parts, points, pixels, covariances)
 
 
 def pose_problem(

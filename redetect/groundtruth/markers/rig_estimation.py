@@ -15,14 +15,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.markers.adjustment import (
-    AdjustedBundle,
-    Bundle,
-    Chain,
-    PosePrior,
-    adjust_bundle,
-    project_chain,
-)
+from redetect.groundtruth.markers import adjustment
 from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
@@ -31,10 +24,10 @@ from redetect.groundtruth.markers.pairs import (
     pair_estimates,
 )
 from redetect.groundtruth.markers.poses import view_poses
-from redetect.groundtruth.markers.refinement import PoseProblem, chain_points, refined_poses
+from redetect.groundtruth.markers.refinement import chain_points, pose_problem, refined_poses
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings, RigSettings
-from redetect.groundtruth.trajectories.transforms import inverse, mean_pose
+from redetect.groundtruth.trajectories import se3
 
 # Standard deviations of exactly known poses: a micrometre and a microradian.
 _EXACT = 1e-12
@@ -51,7 +44,7 @@ class RigEstimate:
     rig: Rig
     reference: int  # The marker from which the others were chained
     pairs: dict[tuple[int, int], PairConsensus]  # By indices of the rig
-    adjusted: AdjustedBundle
+    adjusted: adjustment.AdjustedBundle
     views: tuple[View, ...]  # The bundle's views
     times: int  # Number of times (images, without a network) used
     left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
@@ -126,7 +119,7 @@ def estimate_rig(
     }
     kept_ids = tuple(ids[i] for i in kept)
     rig = _bare_rig(dictionaries[0], kept_ids, width_m)
-    priors: tuple[PosePrior, ...] = ()
+    priors: tuple[adjustment.PosePrior, ...] = ()
     if known is not None:
         start, priors = _in_known_frame(kept_ids, start, known, len(network.cameras))
     # One bundle adjustment of all markers and all times.
@@ -137,7 +130,7 @@ def estimate_rig(
     if np.any(network.covariance):
         bundle = _with_free_cameras(bundle, network.covariance)
     try:
-        adjusted = adjust_bundle(
+        adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
         )
     except GeometryError as error:
@@ -150,7 +143,7 @@ def estimate_rig(
 
 def _in_known_frame(
     ids: Sequence[int], rig_from_marker: FloatArray, known: Rig, cameras: int
-) -> tuple[FloatArray, tuple[PosePrior, ...]]:
+) -> tuple[FloatArray, tuple[adjustment.PosePrior, ...]]:
     """Markers (M, 4, 4) moved to where some are known, and priors of these behind the cameras."""
     common = [marker for marker in ids if marker in known.ids]
     if not common:
@@ -159,39 +152,28 @@ def _in_known_frame(
     for marker in common:
         i, j = ids.index(marker), known.ids.index(marker)
         priors.append(_prior(cameras + i, known.robot_from_marker[j], known.covariance, j))
-        starts.append(known.robot_from_marker[j] @ inverse(rig_from_marker[i]))
-    robot_from_rig, _ = mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
+        starts.append(known.robot_from_marker[j] @ se3.inverse(rig_from_marker[i]))
+    robot_from_rig, _ = se3.mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))
     return robot_from_rig @ rig_from_marker, tuple(priors)
 
 
 def _bare_rig(dictionary: str, ids: tuple[int, ...], width_m: float) -> Rig:
     count = len(ids)
-    return Rig(
-        dictionary,
-        ids,
-        np.full(count, width_m),
-        np.tile(np.eye(4), (count, 1, 1)),
-        np.zeros((6 * count, 6 * count)),
-    )
+    poses, exact = np.tile(np.eye(4), (count, 1, 1)), np.zeros((6 * count, 6 * count))
+    return Rig(dictionary, ids, np.full(count, width_m), poses, exact)
 
 
 def _solutions(view: View, rig: Rig, network: Network, settings: RigSettings) -> MarkerPose | None:
     """Both poses of a marker in an image, refined; None if it has none."""
-    problem = PoseProblem(
-        replace(network, covariance=np.zeros_like(network.covariance)),
-        rig,  # with identities: the marker itself is the body
-        chain_points([view], rig, settings.corner_floor_px),
-        np.zeros(4, dtype=np.int64),
-        PoseSettings(),
-    )
+    exact = replace(network, covariance=np.zeros_like(network.covariance))
+    # The rig's poses are identities: the marker itself is the body.
+    floor = PoseSettings(corner_floor_px=settings.corner_floor_px)
+    problem = pose_problem([view], rig, exact, floor)
     found = refined_poses(problem, view_poses(problem, 0))
     if not found:
         return None
-    return MarkerPose(
-        np.stack([refined.world_from_robot for refined in found]),
-        np.stack([refined.covariance for refined in found]),
-        np.array([refined.cost for refined in found]),
-    )
+    poses, covariances, costs = zip(*((r.world_from_robot, r.covariance, r.cost) for r in found))
+    return MarkerPose(np.stack(poses), np.stack(covariances), np.array(costs))
 
 
 def _consensus_of_pairs(
@@ -240,7 +222,7 @@ def _bundle(
     start: FloatArray,
     network: Network,
     settings: RigSettings,
-) -> tuple[Bundle, tuple[View, ...], int]:
+) -> tuple[adjustment.Bundle, tuple[View, ...], int]:
     """The bundle, its views, and the number of times, each of which is a body."""
     views: list[View] = []
     bodies: list[int] = []
@@ -259,19 +241,15 @@ def _bundle(
             bodies += [len(poses)] * len(own)
             poses.append(pose)
     points = chain_points(views, rig, settings.corner_floor_px)
-    cameras = len(network.cameras)
-    bundle = Bundle(
-        network.cameras,
-        len(start),
-        np.concatenate([network.world_from_camera, start, poses]),
-        np.arange(cameras + len(start) + len(poses)) >= cameras,
-        replace(points, body=np.repeat(bodies, 4).astype(np.int64)),
-        np.repeat(np.arange(len(views)), 4),
-    )
+    points = replace(points, body=np.repeat(bodies, 4).astype(np.int64))
+    together = np.concatenate([network.world_from_camera, start, poses])
+    free = np.arange(len(together)) >= len(network.cameras)
+    view = np.repeat(np.arange(len(views)), 4)
+    bundle = adjustment.Bundle(network.cameras, len(start), together, free, points, view)
     return bundle, tuple(views), len(poses)
 
 
-def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
+def _with_free_cameras(bundle: adjustment.Bundle, covariance: FloatArray) -> adjustment.Bundle:
     """The bundle with its cameras free, each with its own covariance as a prior."""
     seen = np.unique(bundle.seen.camera)
     free = bundle.free.copy()
@@ -280,10 +258,12 @@ def _with_free_cameras(bundle: Bundle, covariance: FloatArray) -> Bundle:
     return replace(bundle, free=free, priors=(*bundle.priors, *priors))
 
 
-def _prior(index: int, pose: FloatArray, covariance: FloatArray, among: int) -> PosePrior:
+def _prior(
+    index: int, pose: FloatArray, covariance: FloatArray, among: int
+) -> adjustment.PosePrior:
     """The prior of one pose of a bundle, which is one `among` several with a covariance."""
     own = slice(6 * among, 6 * among + 6)
-    return PosePrior(index, pose, covariance[own, own] + _EXACT * np.eye(6))
+    return adjustment.PosePrior(index, pose, covariance[own, own] + _EXACT * np.eye(6))
 
 
 def _best_start(
@@ -297,9 +277,9 @@ def _best_start(
     points = chain_points([view for view, _ in own], rig, settings.corner_floor_px)
     best, least = None, np.inf
     for view, solutions in own:
-        for pose in solutions.poses @ inverse(start[view.rig_index]):
-            chain = Chain(network.cameras, network.world_from_camera, pose[None], start)
-            pixels = project_chain(chain, points)
+        for pose in solutions.poses @ se3.inverse(start[view.rig_index]):
+            chain = adjustment.Chain(network.cameras, network.world_from_camera, pose[None], start)
+            pixels = adjustment.project_chain(chain, points)
             squares = np.sum((pixels - points.pixels) ** 2, axis=1).reshape(-1, 4).mean(axis=1)
             if not np.all(np.isfinite(squares)):
                 continue

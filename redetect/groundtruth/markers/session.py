@@ -6,7 +6,6 @@ each camera; both may contain covariances (see docs/groundtruth.md).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +19,8 @@ from camera import Camera, read_camera
 from redetect.array_types import FloatArray
 from redetect.bounds import Bounds
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, write_json
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw, transform
+from redetect.groundtruth.files import JsonObject, PathLike, write_json
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.times import read_times
 from redetect.messages import excerpt
@@ -38,11 +37,8 @@ class Rig:
     dictionary: str  # The set of markers that defines the identifiers
     ids: tuple[int, ...]  # The markers, M of them
     widths_m: FloatArray  # (M,): widths of the black squares
-    # (M, 4, 4): a marker's frame has its origin at the centre, x right, y up, z out of the print
-    robot_from_marker: FloatArray
-    # (6 M, 6 M): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    robot_from_marker: FloatArray  # (M, 4, 4): markers' x right, y up, z out of the print
+    covariance: FloatArray  # (6 M, 6 M): of right perturbations (m, rad); zeros if exact
 
     @property
     def corners(self) -> FloatArray:
@@ -55,13 +51,10 @@ class Network:
     """Cameras fixed in the world."""
 
     names: tuple[str, ...]  # The cameras, C of them
-    # Their calibrations. The mounting in a ``.cam`` file is ignored.
-    cameras: tuple[Camera, ...]
+    cameras: tuple[Camera, ...]  # Their lenses; the mounting in a ``.cam`` file is ignored
     calibrations: tuple[str, ...]  # Their files, relative to the folder of the network's file
     world_from_camera: FloatArray  # (C, 4, 4)
-    # (6 C, 6 C): joint covariance of the poses' right perturbations (m, rad); zeros if known
-    # exactly.
-    covariance: FloatArray
+    covariance: FloatArray  # (6 C, 6 C): of right perturbations (m, rad); zeros if exact
 
 
 def marker_corners(width_m: float) -> FloatArray:
@@ -70,7 +63,7 @@ def marker_corners(width_m: float) -> FloatArray:
     return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
 
 
-def read_rig(path: str | os.PathLike[str]) -> Rig:
+def read_rig(path: PathLike) -> Rig:
     """Read a ``rig.json``; its markers are returned in the order of their identifiers.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
@@ -91,7 +84,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     return Rig(dictionary, ids, widths, poses, _joint_covariance(content, "markers", entries))
 
 
-def read_network(path: str | os.PathLike[str]) -> Network:
+def read_network(path: PathLike) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
     Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
@@ -115,11 +108,7 @@ def read_network(path: str | os.PathLike[str]) -> Network:
 
 
 def write_rig(
-    path: str | os.PathLike[str],
-    rig: Rig,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    overwrite: bool = False,
+    path: PathLike, rig: Rig, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
 ) -> None:
     """Write a ``rig.json``; `extra` is written beside the markers (settings, residuals)."""
     entries = {
@@ -132,18 +121,16 @@ def write_rig(
 
 
 def write_network(
-    path: str | os.PathLike[str],
+    path: PathLike,
     network: Network,
     extra: Mapping[str, Any] | None = None,
     *,
     overwrite: bool = False,
 ) -> None:
     """Write a ``network.json``; `extra` is written beside the cameras (settings, residuals)."""
+    rows = zip(network.names, network.calibrations, network.world_from_camera)
     entries = {
-        name: {"calibration": calibration, **pose_entries(pose)}
-        for name, calibration, pose in zip(
-            network.names, network.calibrations, network.world_from_camera
-        )
+        name: {"calibration": calibration, **pose_entries(pose)} for name, calibration, pose in rows
     }
     content = {**_with_covariance("cameras", entries, network.covariance), **(extra or {})}
     write_json(path, content, overwrite=overwrite)
@@ -161,7 +148,7 @@ def pose_entries(pose: FloatArray) -> dict[str, list[float]]:
     """A (4, 4) pose in the form that `parse_pose` reads."""
     return {
         "translation_m": pose[:3, 3].tolist(),
-        "quaternion_xyzw": quaternion_xyzw(pose).tolist(),
+        "quaternion_xyzw": se3.quaternion_xyzw(pose).tolist(),
     }
 
 
@@ -174,7 +161,7 @@ def parse_pose(entry: JsonObject) -> FloatArray:
         raise GroundTruthError(
             f"{entry.place}: quaternion_xyzw has length {length:.6g}: expected a unit quaternion"
         )
-    return transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
+    return se3.transform(Rotation.from_quat(quaternion / length).as_matrix(), translation)
 
 
 def _joint_covariance(
@@ -192,11 +179,9 @@ def _joint_covariance(
     if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
         raise content.wrong("covariance", f"an object with {key} and matrix")
     order, names = [str(name) for name in joint[key]], list(entries)
-    if sorted(order) != sorted(names):
-        raise GroundTruthError(
-            f"{content.place}: covariance: {key} are {excerpt(order)}: expected {excerpt(names)}"
-        )
     place = f"{content.place}: covariance"
+    if sorted(order) != sorted(names):
+        raise GroundTruthError(f"{place}: {key} are {excerpt(order)}: expected {excerpt(names)}")
     matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
     index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
     return np.asarray(matrix[np.ix_(index, index)])

@@ -16,8 +16,8 @@ from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose, pose_problem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig, View, rig_views
 from redetect.groundtruth.settings import PoseSettings
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import heading, planar_covariance
 from redetect.landmarks import squared_mahalanobis
 
 Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
@@ -79,13 +79,12 @@ class Track:
         """The poses on the floor with their covariances, raised where residuals contradict them."""
         posed = self.posed
         poses = np.array([pose.world_from_robot for _, pose in posed]).reshape(-1, 4, 4)
-        covariances = np.array([excess_of(pose) * pose.covariance for _, pose in posed]).reshape(
-            -1, 6, 6
-        )
+        raised = [excess_of(pose) * pose.covariance for _, pose in posed]
+        covariances = np.array(raised).reshape(-1, 6, 6)
         return PlanarPoses(
             np.array([time_s for time_s, _ in posed], dtype=np.float64),
-            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], heading(poses)]),
-            planar_covariance(poses, covariances),
+            np.column_stack([poses[:, 0, 3], poses[:, 1, 3], se3.heading(poses)]),
+            se3.planar_covariance(poses, covariances),
         )
 
 
@@ -153,7 +152,7 @@ def report_entry(tracked: TrackedTime, network: Network) -> dict[str, Any]:
             {
                 "x_y_theta": [
                     *(round(float(v), 6) for v in candidate.world_from_robot[:2, 3]),
-                    round(float(heading(candidate.world_from_robot)), 6),
+                    round(float(se3.heading(candidate.world_from_robot)), 6),
                 ],
                 "z_m": round(float(candidate.world_from_robot[2, 3]), 6),
                 "rms_px": round(candidate.rms_px, 4),
@@ -260,14 +259,11 @@ def _steps(
     turned = Rotation.from_matrix(rotation_b @ rotation_a.transpose(0, 2, 1)).as_rotvec()
     moved = np.concatenate([b[:, :3, 3] - a[:, :3, 3], turned], axis=1)
     spread = np.zeros((len(moved), 6, 6))
-    for pose_rotation, covariance in (
-        (rotation_a, covariances[first]),
-        (rotation_b, covariances[second]),
-    ):
+    for pose_rotation, which in ((rotation_a, first), (rotation_b, second)):
         axes = np.zeros((len(moved), 6, 6))
         axes[:, :3, :3] = pose_rotation
         axes[:, 3:, 3:] = rotation_b
-        spread += axes @ covariance @ axes.transpose(0, 2, 1)
+        spread += axes @ covariances[which] @ axes.transpose(0, 2, 1)
     at = np.asarray(times_s)[frame]
     seconds = at[second] - at[first]
     reach, turn = settings.speed_m_s * seconds, np.radians(settings.turn_deg_s) * seconds

@@ -51,21 +51,17 @@ class Inputs:
 
     name: str  # Of the session
     building: FloatArray | None = None  # (S, 4)
-    # Those available, by the names in `STREAMS`
-    streams: dict[str, PlanarPoses] = field(default_factory=dict)
-    # On the ground truth's clock, aligned rigidly with truth (or fused poses) in each visit
-    odometry: PlanarPoses | None = None
+    streams: dict[str, PlanarPoses] = field(default_factory=dict)  # By the names in `STREAMS`
+    odometry: PlanarPoses | None = None  # Aligned with truth, or fused poses, in each visit
     truth: PlanarPoses | None = None
     clock: ClockModel | None = None
     # Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`
     documents: dict[str, dict[str, Any]] = field(default_factory=dict)
     pictures: dict[str, bytes] = field(default_factory=dict)  # By the names in `PICTURES` (PNG)
-    # Tape measurements in the building
-    dimensions: list[Dimension] = field(default_factory=list)
+    dimensions: list[Dimension] = field(default_factory=list)  # Tape measurements
     fiducials: SurveyedFiducials | None = None
     ptpd: PtpdLog | None = None
-    # Begin and end of each visit of the robot to the covered area
-    visits: list[tuple[float, float]] = field(default_factory=list)
+    visits: list[tuple[float, float]] = field(default_factory=list)  # To the covered area
     missing: list[str] = field(default_factory=list)  # Missing files
     problems: list[str] = field(default_factory=list)  # Files that cannot be read
 

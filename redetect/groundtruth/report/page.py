@@ -110,10 +110,9 @@ def _dimensions(dimensions: Sequence[Dimension]) -> list[Part]:
     ]
     head = ("dimension", "drawn / m", "measured / m", "drawn minus measured / mm")
     caption = "Dimensions in the drawing and measured in the building"
-    words = (
-        f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {scoring.sigma_of(off):.1f} mm, "
-    )
-    words += f"worst {np.abs(off).max():.1f} mm."
+    sigma, worst = scoring.sigma_of(off), np.abs(off).max()
+    words = f"{len(off)} dimensions: mean {off.mean():+.1f} mm, sigma {sigma:.1f} mm, "
+    words += f"worst {worst:.1f} mm."
     return [table(caption, head, rows), Part("text", words)]
 
 
@@ -189,9 +188,8 @@ def _all_streams(inputs: Inputs) -> dict[str, PlanarPoses]:
 def _maps(inputs: Inputs) -> list[Part]:
     tracks = [_track(name, poses, inputs) for name, poses in inputs.streams.items()]
     beside = {"odometry": inputs.odometry, "truth": inputs.truth}
-    everything = tracks + [
-        _track(name, poses, inputs) for name, poses in beside.items() if poses is not None
-    ]
+    others = [_track(name, poses, inputs) for name, poses in beside.items() if poses is not None]
+    everything = tracks + others
     if not everything and inputs.building is None:
         return [Part("note", "Neither a building nor a stream of poses: nothing to draw.")]
     words = "The building" if inputs.building is not None else "No building map in the session"
@@ -209,9 +207,8 @@ def _maps(inputs: Inputs) -> list[Part]:
 
 def _errors(inputs: Inputs) -> list[Part]:
     if inputs.truth is None:
-        return [
-            Part("note", "No truth in the session: give it by --truth to see errors over time.")
-        ]
+        words = "No truth in the session: give it by --truth to see errors over time."
+        return [Part("note", words)]
     rows: list[tuple[str, ...]] = []
     place, turn, faults, outside = [], [], [], []
     compared = [
@@ -276,21 +273,14 @@ def _validation(inputs: Inputs) -> list[Part]:
     if document is None:
         return [Part("note", "No validation in the session: groundtruth validate writes it.")]
     figures = _entry(document, "figures", dict)
-    rows = [
-        (
-            str(document.get("poses", "ground truth")),
-            *(_number(figures.get(k), 1e3) for k in
-              ("position_mean_m", "position_sigma_m", "position_max_m")),
-            *(_number(figures.get(k), 180.0 / math.pi, 3) for k in
-              ("angle_mean_rad", "angle_sigma_rad", "angle_max_rad")),
-        )
-    ]  # fmt: skip
+    linear = [_number(figures.get(f"position_{k}_m"), 1e3) for k in ("mean", "sigma", "max")]
+    angles = [figures.get(f"angle_{k}_rad") for k in ("mean", "sigma", "max")]
+    angular = [_number(angle, 180.0 / math.pi, 3) for angle in angles]
+    rows = [(str(document.get("poses", "ground truth")), *linear, *angular)]
     for p in scoring.PUBLISHED:
-        linear = (f"{1e3 * p.position_mean_m:.0f}", f"{1e3 * p.position_sigma_m:.0f}", "-")
-        rows.append(
-            (f"{p.name} (published)", *linear, f"{p.angle_mean_deg:+.2f}",
-             f"{p.angle_sigma_deg:.2f}", "-")
-        )  # fmt: skip
+        linear = [f"{1e3 * p.position_mean_m:.0f}", f"{1e3 * p.position_sigma_m:.0f}", "-"]
+        angular = [f"{p.angle_mean_deg:+.2f}", f"{p.angle_sigma_deg:.2f}", "-"]
+        rows.append((f"{p.name} (published)", *linear, *angular))
     head = ("ground truth", "mean / mm", "sigma", "worst", "mean / deg", "sigma", "worst")
     content = [table("Linear and angular errors at reference poses", head, rows)]
     nees = figures.get("normalised_error")

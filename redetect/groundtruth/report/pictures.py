@@ -21,8 +21,8 @@ from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner
 from redetect.groundtruth.markers.rig_estimation import RigEstimate
 from redetect.groundtruth.markers.session import Rig, marker_corners
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import apply, inverse
 from redetect.groundtruth.validation.onboard import OF_A_WALL_M
 from redetect.groundtruth.validation.scoring import PUBLISHED, PoseScore, ReferenceErrors
 from redetect.reporting.page import Part, figure_file, image_part
@@ -109,9 +109,8 @@ def series_figure(
             axes.set(xlim=(0.0, span), yscale="log")
             axes.grid(axis="y", alpha=0.25, lw=0.6)
             if span > 0.08 * sum(spans):
-                axes.set_xlabel(
-                    f"visit {visits.index((first, last)) + 1}: {span:.0f} s", fontsize=8
-                )
+                number = visits.index((first, last)) + 1
+                axes.set_xlabel(f"visit {number}: {span:.0f} s", fontsize=8)
             else:
                 axes.set_xticks([])
         least = 10.0 ** math.floor(math.log10(max(float(np.quantile(positive, 0.05)), 1e-9)))
@@ -262,7 +261,7 @@ def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
     poses, pairs = estimate.rig.robot_from_marker, sorted(estimate.pairs.items())
     estimates = [np.zeros((0, 4, 4))]
     for (a, b), pair in pairs:
-        estimates += [poses[a] @ pair.estimates, poses[b] @ inverse(pair.estimates)]
+        estimates += [poses[a] @ pair.estimates, poses[b] @ se3.inverse(pair.estimates)]
     places = np.concatenate(estimates)[:, :3, 3]
     agrees = np.array([one for _, pair in pairs for one in (*pair.agrees, *pair.agrees)], bool)
     return places[agrees], places[~agrees]
@@ -270,10 +269,10 @@ def _clouds(estimate: RigEstimate) -> tuple[FloatArray, FloatArray]:
 
 def _draw_markers(axes: Axes, rig: Rig, across: int, up: int) -> None:
     for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker):
-        outline = apply(pose, marker_corners(width)[[0, 1, 2, 3, 0]])
+        outline = se3.apply(pose, marker_corners(width)[[0, 1, 2, 3, 0]])
         label = "adjusted markers" if marker == rig.ids[0] else None
         axes.plot(outline[:, across], outline[:, up], color="black", lw=1.4, label=label, zorder=3)
-        normal = apply(pose, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6 * width]]))
+        normal = se3.apply(pose, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6 * width]]))
         axes.plot(normal[:, across], normal[:, up], color="black", lw=0.8, zorder=3)
         axes.annotate(
             str(marker), (float(normal[1, across]), float(normal[1, up])), ha="center",
@@ -290,7 +289,7 @@ def draw_alignment(
     """Draw scanners' points on the map for measured and aligned poses; returns a PNG's bytes.
 
     Beside them, `icp_rms_m`: for each scanner, the distances from the map (m) after each step of an
-    ICP from its measured pose. The same input gives the same bytes.
+    ICP from its measured pose.
     """
     with figure_file((17.0, 5.4), "png") as (figure, content):
         after = [scanner.pose for scanner in alignment.scanners]

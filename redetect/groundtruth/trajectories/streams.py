@@ -7,7 +7,6 @@ a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth th
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -17,8 +16,8 @@ from numpy.typing import NDArray
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import parse_numbers, read_rows
-from redetect.groundtruth.trajectories.transforms import quaternion_xyzw
+from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
@@ -38,10 +37,8 @@ class PlanarPoses:
     """
 
     times_s: FloatArray  # (N,): seconds, not decreasing
-    # (N, 3): x, y (m) and theta (rad). Headings may be beyond +-pi, as in the real streams.
-    poses: FloatArray
-    # (N, 3, 3): covariances of (x, y, theta); may be singular due to rounding in files.
-    covariances: FloatArray | None = None
+    poses: FloatArray  # (N, 3): x, y (m), theta (rad), which may be beyond +-pi, as in real streams
+    covariances: FloatArray | None = None  # (N, 3, 3); may be singular due to rounding in files
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
@@ -50,10 +47,9 @@ class PlanarPoses:
                 f"poses of shapes {self.times_s.shape} and {self.poses.shape}: "
                 "expected (N,) times and (N, 3) poses"
             )
-        if self.covariances is not None and self.covariances.shape != (count, 3, 3):
-            raise GroundTruthError(
-                f"covariances of shape {self.covariances.shape}: expected ({count}, 3, 3)"
-            )
+        shape = (count, 3, 3) if self.covariances is None else self.covariances.shape
+        if shape != (count, 3, 3):
+            raise GroundTruthError(f"covariances of shape {shape}: expected ({count}, 3, 3)")
         for name, values in (
             ("times", self.times_s),
             ("poses", self.poses),
@@ -92,7 +88,7 @@ def last_of_each_time(poses: PlanarPoses) -> PlanarPoses:
     return poses if np.all(last) else poses.only(last)
 
 
-def read_planar_poses(path: str | os.PathLike[str]) -> PlanarPoses:
+def read_planar_poses(path: PathLike) -> PlanarPoses:
     """Read a RAWSEEDS stream, with or without covariances.
 
     All rows have 4, or all have 13, numbers separated by commas or blanks; blank lines and `#`
@@ -135,16 +131,14 @@ def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> st
     return "".join(lines)
 
 
-def write_planar_poses(
-    path: str | os.PathLike[str], poses: PlanarPoses, *, overwrite: bool = False
-) -> None:
+def write_planar_poses(path: PathLike, poses: PlanarPoses, *, overwrite: bool = False) -> None:
     """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
     write_bytes(path, format_planar_poses(poses).encode(), overwrite=overwrite)
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
     """Format (N,) times and (N, 4, 4) poses as a TUM trajectory: t x y z qx qy qz qw."""
-    quaternions = quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
+    quaternions = se3.quaternion_xyzw(world_from_robot) if len(times_s) else np.zeros((0, 4))
     return "".join(
         " ".join([f"{t:.6f}", *(f"{v:.6f}" for v in pose[:3, 3]), *(f"{v:.9f}" for v in q)]) + "\n"
         for t, pose, q in zip(times_s, world_from_robot, quaternions)
@@ -163,9 +157,8 @@ def interpolate_poses(
 ) -> tuple[PlanarPoses, BoolArray]:
     """Interpolate poses and covariances linearly at ascending times (N,), wrapping headings.
 
-    Between neighbours farther apart than the largest gap there are no poses, except at the
-    neighbours' own times. Returns the interpolated poses, and a mask (N,) of the times that have
-    one.
+    Between neighbours farther apart than the largest gap there are none. Returns the interpolated
+    poses, and a mask (N,) of the times that have one.
     """
     if len(poses) == 0:
         raise GroundTruthError("no poses to interpolate between")

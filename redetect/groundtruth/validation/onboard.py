@@ -1,9 +1,8 @@
 """Fit of the readings on board, at the reference poses, to the building's walls.
 
-The robot is at rest, so its readings are averaged first. The pose from distances is the prior: the
-fit to the walls starts there, and the two results are combined by their covariances, unless the
-walls do not determine a direction or the results disagree. From all reference poses together, the
-range errors and the mounts of the scanners are estimated.
+The robot is at rest, so its readings are averaged first. The fit starts at the pose from distances,
+its prior; both are combined by their covariances, unless the walls leave a direction undetermined
+or they disagree. All reference poses together give range errors and the scanners' mounts.
 """
 
 from __future__ import annotations
@@ -202,9 +201,8 @@ def refined_by_walls(
     # Joseph's form remains symmetric and positive definite.
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
-    return ReferencePose(
-        distances, pose, combined, "used", "", int(found.used[0]), float(found.rms_m[0]), still
-    )
+    points, rms_m = int(found.used[0]), float(found.rms_m[0])
+    return ReferencePose(distances, pose, combined, "used", "", points, rms_m, still)
 
 
 class RefinedMounts(NamedTuple):
@@ -246,9 +244,8 @@ def refine_mounts(
     None if fewer than three poses have both distances and scans.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
-    used = [
-        r for r in references if r.scans in ("used", "disagrees") and r.distances.status == "ok"
-    ]
+    accepted = [r for r in references if r.distances.status == "ok"]
+    used = [r for r in accepted if r.scans in ("used", "disagrees")]
     stills = [r.still for r in used if r.still is not None]
     if len(stills) < 3:
         return None

@@ -16,7 +16,6 @@ between two fiducials.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -28,7 +27,7 @@ from scipy.special import chdtrc
 from redetect.array_types import FloatArray
 from redetect.bounds import ABOVE_0
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import JsonObject, known_name, read_table
+from redetect.groundtruth.files import JsonObject, PathLike, known_name, read_table
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, fitted, rotation
 
@@ -71,7 +70,7 @@ class Distance:
     distance_m: float
 
 
-def read_survey(path: str | os.PathLike[str]) -> Survey:
+def read_survey(path: PathLike) -> Survey:
     """Read a ``fiducials.json``.
 
     Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
@@ -82,7 +81,7 @@ def read_survey(path: str | os.PathLike[str]) -> Survey:
     return Survey(fiducials, robot_points, content.number("sigma_m", ABOVE_0))
 
 
-def read_distances(path: str | os.PathLike[str], survey: Survey) -> list[Distance]:
+def read_distances(path: PathLike, survey: Survey) -> list[Distance]:
     """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
     Raises `GroundTruthError` if the file cannot be read, a row is malformed or names an unknown
@@ -152,10 +151,9 @@ class Measured(NamedTuple):
 
 
 def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """All local minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
+    """All minima of the squared normalised residuals: (M, 3) poses and (M,) chi2, best first.
 
-    By Levenberg-Marquardt from many starts: with all headings, all around the fiducial of the first
-    distance.
+    By Levenberg-Marquardt with all headings, from all around the fiducial of the first distance.
     """
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
@@ -196,11 +194,9 @@ def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray
 def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose:
     time_s = float(np.median([row.time_s for row in rows]))
     if len(rows) < 3:
-        reason, open_ = f"{len(rows)} distances: expected 3 or more", np.full((3, 3), np.inf)
-        nothing = np.full(len(rows), np.nan)
-        return DistancePose(
-            index, time_s, "undetermined", reason, np.full(3, np.nan), open_, nothing, math.nan
-        )
+        reason, nothing = f"{len(rows)} distances: expected 3 or more", np.full(len(rows), np.nan)
+        pose, open_ = np.full(3, np.nan), np.full((3, 3), np.inf)
+        return DistancePose(index, time_s, "undetermined", reason, pose, open_, nothing, math.nan)
     measured = Measured(
         np.array([survey.fiducials[row.fiducial] for row in rows]),
         np.array([survey.robot_points[row.point] for row in rows]),
@@ -220,9 +216,8 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
         )
     else:
         status, reason = _determined(poses[costs < costs[0] + _AMBIGUITY_CHI2], covariance)
-    return DistancePose(
-        index, time_s, status, reason, poses[0], covariance, residuals, float(costs[0])
-    )
+    pose, chi2 = poses[0], float(costs[0])
+    return DistancePose(index, time_s, status, reason, pose, covariance, residuals, chi2)
 
 
 def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
@@ -236,10 +231,8 @@ def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status,
             f"most {_LARGEST_SIGMA_M:g} m and {_LARGEST_SIGMA_DEG:g} deg"
         )
     if len(candidates) > 1:
-        others = ", ".join(
-            f"({x:.2f}, {y:.2f}, {math.degrees(t):.0f} deg)" for x, y, t in candidates
-        )
-        return "ambiguous", f"{len(candidates)} poses fit the distances: {others}"
+        places = (f"({x:.2f}, {y:.2f}, {math.degrees(t):.0f} deg)" for x, y, t in candidates)
+        return "ambiguous", f"{len(candidates)} poses fit the distances: {', '.join(places)}"
     return "ok", ""
 
 
@@ -270,7 +263,7 @@ class SurveyedFiducials(NamedTuple):
     residuals_m: FloatArray  # (K,): measured distances minus those between `places`
 
 
-def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
+def read_dimensions(path: PathLike) -> list[Dimension]:
     """Read a ``dimensions.csv``."""
     found = []
     for _, (name,), (x1, y1, x2, y2, measured) in read_table(path, DIMENSIONS_HEAD, ("name",)):
@@ -278,7 +271,7 @@ def read_dimensions(path: str | os.PathLike[str]) -> list[Dimension]:
     return found
 
 
-def read_fiducial_distances(path: str | os.PathLike[str], survey: Survey) -> list[FiducialDistance]:
+def read_fiducial_distances(path: PathLike, survey: Survey) -> list[FiducialDistance]:
     """Read a ``fiducial_distances.csv``, which may name only the survey's fiducials."""
     found = []
     for line, names, (distance,) in read_table(path, FIDUCIAL_DISTANCES_HEAD, ("a", "b")):

@@ -6,7 +6,6 @@ A normalised error (NEES) is error^T covariance^-1 error over 3, its degrees of 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import read_table
+from redetect.groundtruth.files import PathLike, read_table
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
@@ -73,9 +72,7 @@ class PoseScore(ErrorFigures):
     poses: int  # Poses compared with the truth
     unmatched: int  # Poses without truth at their time
     normalised: int  # Poses with an invertible covariance
-    # Mean of error^T covariance^-1 error over 3, the degrees of freedom: 1 if the covariances are
-    # right. NaN without covariances.
-    normalised_error: float
+    normalised_error: float  # Mean of these: 1 if covariances are right; NaN without any
 
     def lines(self) -> list[str]:
         """The figures to print."""
@@ -142,8 +139,7 @@ class Relations(NamedTuple):
 
     from_s: FloatArray  # (N,)
     to_s: FloatArray  # (N,): may be the earlier one
-    # (N, 3): x, y (m), theta (rad) of the pose at `to_s` in the frame of the pose at `from_s`
-    from_to: FloatArray
+    from_to: FloatArray  # (N, 3): x, y (m), theta (rad) of the second pose in the first's frame
 
 
 @dataclass(frozen=True)
@@ -154,7 +150,7 @@ class RelativeScore(ErrorFigures):
     unmatched: int  # Pairs without poses on one side, or too far apart
 
 
-def read_relations(path: str | os.PathLike[str]) -> Relations:
+def read_relations(path: PathLike) -> Relations:
     """Read relations: rows t_i, t_j, x, y, z, roll, pitch, yaw separated by blanks or commas.
 
     Only x, y and yaw are used, as poses are on a floor. Raises `GroundTruthError` if the file
@@ -175,12 +171,11 @@ def score_relations(
     Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
     has poses at both its times.
     """
-    before, known_before = _at(poses, relations.from_s, largest_gap_s)
-    after, known_after = _at(poses, relations.to_s, largest_gap_s)
-    known = known_before & known_after
-    return relative_score(
-        relations.from_to[known], between(before[known], after[known]), int((~known).sum())
-    )
+    times_s = (relations.from_s, relations.to_s)
+    before, after = (_at(poses, some, largest_gap_s) for some in times_s)
+    known = np.isfinite(before[:, 0]) & np.isfinite(after[:, 0])
+    mine = between(before[known], after[known])
+    return relative_score(relations.from_to[known], mine, int((~known).sum()))
 
 
 def score_steps(
@@ -217,16 +212,13 @@ def relative_score(truth: FloatArray, estimates: FloatArray, unmatched: int = 0)
     return RelativeScore(**_figures(error), pairs=len(error), unmatched=unmatched)
 
 
-def _at(
-    poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float
-) -> tuple[FloatArray, BoolArray]:
-    """(N, 3) poses at times in any order, zeros if unknown, and a mask of the known ones."""
+def _at(poses: PlanarPoses, times_s: FloatArray, largest_gap_s: float) -> FloatArray:
+    """(N, 3) poses at times in any order; NaN if unknown."""
     order = np.argsort(times_s, kind="stable")
     interpolated, found = interpolate_poses(poses, times_s[order], largest_gap_s)
-    result, known = np.zeros((len(times_s), 3)), np.zeros(len(times_s), dtype=np.bool_)
+    result = np.full((len(times_s), 3), np.nan)
     result[order[found]] = interpolated.poses
-    known[order[found]] = True
-    return result, known
+    return result
 
 
 @dataclass(frozen=True)
@@ -261,9 +253,8 @@ class ReferenceErrors(NamedTuple):
 
     @property
     def sigma(self) -> FloatArray:
-        """(E, 2) standard deviations of position (m) and heading (rad), from both covariances.
-
-        For the position, the root of the trace; NaN if the ground truth has no invertible one.
+        """(E, 2) standard deviations of position (m; root of the trace) and heading (rad), from
+        both covariances; NaN if the ground truth has no invertible one.
         """
         found = np.full((len(self.poses), 2), np.nan)
         if self.poses.covariances is not None and self.reference_poses.covariances is not None:

@@ -95,8 +95,7 @@ def _append(
 ) -> float:
     """Extend a Cholesky factor and the whitened innovation by one pair's block, in place.
 
-    Returns the pair's contribution to the squared distance; negative if the extended covariance is
-    not positive definite.
+    Returns the pair's part of the squared distance; negative if it is not positive definite.
     """
     width = len(innovation)
     added = 0.0

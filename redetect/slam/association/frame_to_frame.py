@@ -37,13 +37,12 @@ def associate_locally(
 ) -> tuple[IntArray, IntArray]:
     """Label the rows of a run, frame by frame, ignoring IDs in the file.
 
-    Returns the landmark of each row of a disc (n,) and of a line (m,), both numbered from 0 in the
-    order of first sight.
+    Returns the landmarks of discs' rows (n,) and lines' rows (m,), from 0 in order of first sight.
     """
     settings = settings or AssociateSettings()
     circles = recording.circles
     scaled = replace(circles, covariance=settings.sigma_scale**2 * circles.covariance)
-    none = FrameRows(CircleRows.of(), LineRows.of())
+    none = FrameRows(circles.only([]), LineRows.of())
     disc_labels: list[int] = []
     line_labels: list[int] = []
     discs_seen: dict[int, int] = {}  # frame of each landmark's last sight

@@ -63,9 +63,8 @@ class Rays(NamedTuple):
 
     row: IntArray  # (n,): index of each ray's row in the run
     centre: FloatArray  # (n, 2): the camera's position (m)
-    # (n,): its direction in the map, and in the robot frame (rad).
-    angle: FloatArray
-    bearing: FloatArray
+    angle: FloatArray  # (n,): its direction in the map (rad)
+    bearing: FloatArray  # (n,): the same in the robot frame (rad)
     sigma: FloatArray  # (n,): of it (rad)
     frame: IntArray  # (n,): ascending from 0
     start: IntArray  # (F + 1,): rays start[f] to start[f + 1] are those of frame f
@@ -79,24 +78,13 @@ def _wrapped(angle: float) -> float:
 
 
 @kernel()
-def _crossing(centre: FloatArray, angle: FloatArray, i: int, j: int) -> tuple[float, float]:
-    """How far from their origins two rays cross; negative behind."""
-    ux, uy = math.sin(angle[i]), -math.cos(angle[i])
-    vx, vy = math.sin(angle[j]), -math.cos(angle[j])
-    determinant = vx * uy - ux * vy
-    if abs(determinant) < 1e-9:
-        return -1.0, -1.0
-    x, y = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
-    return (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
-
-
-@kernel()
 def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
     """Points (k, 2) where rays of frames some steps apart cross, ahead of both, and the frames."""
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
     points = []
     frames = []
     for i in range(len(angle)):
+        ux, uy = math.sin(angle[i]), -math.cos(angle[i])
         for gap in _GAPS:
             other = frame[i] + gap
             if other >= len(start) - 1:
@@ -105,11 +93,16 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
                 parallax = abs(_wrapped(angle[j] - angle[i]))
                 if parallax < _LEAST_PARALLAX_SIGMAS * math.hypot(sigma[i], sigma[j]):
                     continue
-                near, far = _crossing(centre, angle, i, j)
+                vx, vy = math.sin(angle[j]), -math.cos(angle[j])
+                determinant = vx * uy - ux * vy
+                if abs(determinant) < 1e-9:
+                    continue
+                x, y = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1]
+                near, far = (vx * y - vy * x) / determinant, (ux * y - uy * x) / determinant
                 if min(near, far) < _NEAREST_M or max(near, far) > _FARTHEST_M:
                     continue
-                points.append(centre[i, 0] + near * math.sin(angle[i]))
-                points.append(centre[i, 1] - near * math.cos(angle[i]))
+                points.append(centre[i, 0] + near * ux)
+                points.append(centre[i, 1] + near * uy)
                 frames.append(frame[i])
     return np.array(points, dtype=np.float64).reshape(-1, 2), np.array(frames, dtype=np.int64)
 
@@ -194,10 +187,10 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
 def take_points(
     points: FloatArray, frames: IntArray, rays: Rays, reach: float
 ) -> tuple[IntArray, FloatArray]:
-    """Select points greedily: the best one with its rays, then the best of the other rays, etc.
+    """Select points (k, 2) greedily: the best one with its rays, then the best of the other rays.
 
-    Takes `points` (k, 2), `frames` (k,), and the widest gate of a bearing (rad); returns `labels`
-    (n,), `found` (m, 2).
+    Takes their `frames` (k,), and the widest gate of a bearing (rad); returns `labels` (n,) of the
+    rays, `found` (m, 2).
     """
     # Log likelihood ratio of a ray from a vertical to one from anywhere.
     clutter = len(rays.angle) / len(rays.heading) / (2.0 * rays.widest_rad)
@@ -256,9 +249,8 @@ def lines_by_points(
     def corrected(path: FloatArray, labels: IntArray, points: FloatArray) -> FloatArray:
         """Least squares over poses, discs and points, repeated without outliers."""
         count = len(points)
-        used = (labels >= 0) & (
-            np.bincount(labels + 1, minlength=count + 1)[labels + 1] >= _PATH_ROWS
-        )
+        rows = np.bincount(labels + 1, minlength=count + 1)[labels + 1]
+        used = (labels >= 0) & (rows >= _PATH_ROWS)
         for _ in range(3):
             solution = solve_path(
                 *(scaled, circle_labels, np.where(used, labels, count), path),
@@ -298,10 +290,7 @@ def rays_of(
     sigma_scale: float,
     heading_sigma_rad: float,
 ) -> Rays:
-    """The rows of verticals as rays in the map.
-
-    Takes `path` (N + 1, 3), `camera_xy` (2,).
-    """
+    """The rows of verticals as rays in the map, by the `path` (N + 1, 3) and `camera_xy` (2,)."""
     lines = recording.lines
     row = np.lexsort((lines.bearing_rad, lines.frame))
     frame, bearing = lines.frame[row], lines.bearing_rad[row]
@@ -320,10 +309,7 @@ def rays_of(
 
 
 def find_points(rays: Rays) -> tuple[IntArray, FloatArray]:
-    """The points in which rays intersect, the best first.
-
-    Returns `labels` (n,), `points` (k, 2).
-    """
+    """Labels (n,) of rows by the points in which their rays intersect, and these points (k, 2)."""
     points, frames = _crossings(rays)
     taken, found = take_points(points, frames, rays, _GATE * float(rays.sigma.max(initial=0.0)))
     labels = np.empty(len(taken), dtype=np.int64)

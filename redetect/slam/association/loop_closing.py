@@ -62,9 +62,8 @@ class LabelledMap(NamedTuple):
 def intersect_bearings(
     recording: Recording, path: FloatArray, labels: IntArray, *, camera_xy: ArrayLike = (0.0, 0.0)
 ) -> FloatArray:
-    """Positions of lines from the bearings of all their rows, given the path.
-
-    Takes `path` (N + 1, 3), `labels` (n,), `camera_xy` (2,); returns (L, 2).
+    """(L, 2) positions of lines from the bearings of all rows with `labels` (n,), given the `path`
+    (N + 1, 3) and `camera_xy` (2,).
     """
     lines, count = recording.lines, int(labels.max(initial=-1)) + 1
     poses = path[lines.frame + 1]
@@ -118,12 +117,10 @@ def solve_path(
 def merge_labels(
     frames: IntArray, labels: IntArray, pairs: Iterable[tuple[int, int]], most_together: float = 0.0
 ) -> tuple[IntArray, int]:
-    """Merge labels that are the same landmark.
+    """Merge labels (n,) that are the same landmark; returns them (n,), and how many were merged.
 
-    Labels with rows in the same frames are distinct landmarks, unless these frames are at most a
+    Labels with rows in the same `frames` (n,) are distinct landmarks, unless these are at most a
     share `most_together` of those of either: clutter beside a landmark, of one label with it.
-
-    Takes `frames, labels` (n,); returns `labels` (n,), `merged`.
     """
     seen: list[set[int]] = [set() for _ in range(int(labels.max(initial=-1)) + 1)]
     for frame, label in zip(frames.tolist(), labels.tolist()):
@@ -161,9 +158,8 @@ def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
 def pairs_by_position(
     stretches: Sequence[Stretch], covariance: FloatArray, gate_probability: float
 ) -> list[tuple[int, int]]:
-    """Pairs of labels at the same position, in stretches known to be the same place.
-
-    Takes `covariance` (M, 2, 2).
+    """Pairs of labels at the same position, with some `covariance` (M, 2, 2), in stretches known to
+    be the same place.
     """
     labels = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.labels for s in stretches)]))
     if len(labels) < 2:

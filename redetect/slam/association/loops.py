@@ -49,13 +49,10 @@ SHARED_BY_ONE_PLACE = 3
 class Search(NamedTuple):
     """Parameters of the search."""
 
-    # Largest motion between the two constellations.
-    most_turn_rad: float = 0.8
+    most_turn_rad: float = 0.8  # largest motion between the two constellations
     most_shift_m: float = 8.0
-    # Least number of agreeing landmarks, whatever the number of false alarms.
-    least_agreeing: int = 7
-    # Largest number of matches at least as good that are expected by chance in the whole search.
-    false_alarms: float = 1e-3
+    least_agreeing: int = 7  # of landmarks, whatever the number of false alarms
+    false_alarms: float = 1e-3  # largest expected number of them in the whole search
     # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
     # `earlier_step`-th of these.
     later_step: int = 1
@@ -69,8 +66,7 @@ class Search(NamedTuple):
 class _Cells(NamedTuple):
     """A grid in which the nearest landmark is looked up."""
 
-    # Its low corner (m).
-    low_x: float
+    low_x: float  # its low corner (m)
     low_y: float
     nearest: IntArray  # (columns, rows): landmark nearest to a cell's centre, -1 if out of reach
 
@@ -152,9 +148,8 @@ def _best_motion(
     """The motion under which most landmarks of one constellation fall on those of another.
 
     Every pair of landmarks of the first with every pair of the second of the same length gives a
-    motion; agreeing landmarks are counted. Returns the rotation about the first constellation's
-    centre and the shift, the number of agreeing landmarks, and the number of motions tried. Motions
-    near those `besides` (k, 3) are not considered.
+    motion. Returns the rotation about the first constellation's centre and the shift, the number of
+    agreeing landmarks, and that of motions tried, without those near `besides` (k, 3).
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -222,14 +217,11 @@ class Stretch:
 class Match:
     """Two stretches that show one place."""
 
-    # Middle frames of the two.
-    earlier_frame: int
+    earlier_frame: int  # middle frames of the two
     later_frame: int
     pairs: IntArray  # (k, 2): labels of the same landmark in the earlier and the later stretch
-    # (3,): pose that maps the later stretch's landmarks, in the map, onto the earlier one's.
-    motion: FloatArray
-    # Logarithm of the expected number of matches at least as good by chance.
-    log10_false_alarms: float
+    motion: FloatArray  # (3,): maps the later stretch's landmarks onto the earlier one's
+    log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
 def stretches_of(
@@ -246,8 +238,7 @@ def stretches_of(
     """The constellations with enough landmarks along a run of `count` frames.
 
     They consist of `length` frames, and begin every `stride` frames, by default a fifth of it. Of
-    more landmarks than `most`, those with most rows are used. Takes `frames, labels` (n,), `xy`
-    (M, 2).
+    more landmarks than `most`, those with most rows count. `frames, labels` (n,), `xy` (M, 2).
     """
     found = []
     for start in range(0, max(count - length // 2, 1), stride or length // _OVERLAPPING):
@@ -278,8 +269,7 @@ def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
 def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
     """All pairs of stretches that show one place significantly, the most significant first.
 
-    Landmarks that two stretches already share are ignored; stretches that share three or more need
-    no match.
+    Landmarks that two stretches share are ignored; if these are three or more, they need no match.
     """
     candidates: list[tuple[Stretch, Stretch, Motion]] = []
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
@@ -292,9 +282,8 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
         apart = (gap >= search.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
         if search.attached_frames and np.any(~apart & (gap >= search.attached_frames)):
             continue
-        near = np.linalg.norm(centres[:k] - centres[k], axis=1) < (
-            search.most_shift_m + extents[:k] + extents[k]
-        )
+        reach = search.most_shift_m + extents[:k] + extents[k]
+        near = np.linalg.norm(centres[:k] - centres[k], axis=1) < reach
         near[np.arange(k) % search.earlier_step != 0] = False
         for i in np.flatnonzero(near & apart):
             fixed, moved = stretches[i].without(later), later.without(stretches[i])
@@ -306,10 +295,9 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
         for earlier, later, motion in candidates
         if motion.agreeing >= search.least_agreeing
     ]
-    return sorted(
-        (m for m in matches if m and m.log10_false_alarms <= np.log10(search.false_alarms)),
-        key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame),
-    )
+    most = np.log10(search.false_alarms)
+    significant = (match for match in matches if match and match.log10_false_alarms <= most)
+    return sorted(significant, key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame))
 
 
 class Motion(NamedTuple):
@@ -378,8 +366,13 @@ def log10_false_alarms(agreeing: int, present: int, chance: float, tried: int) -
 
 
 def chance_of_agreeing(xy: FloatArray) -> float:
-    """Probability that a landmark anywhere falls on one of (n, 2) landmarks by chance."""
-    return float(len(xy) * np.pi * REACH_M**2 / covered_area(xy))
+    """Probability that a landmark in the covered area falls on one of (n, 2) by chance."""
+    low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
+    xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
+    x, y = xy.T[:, :, None, None]
+    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
+    area_m2 = float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
+    return float(len(xy) * np.pi * REACH_M**2 / area_m2)
 
 
 def _refined(
@@ -400,12 +393,3 @@ def _refined(
         pose,
         log10_false_alarms(len(pairs), present, chance_of_agreeing(earlier.xy), tried),
     )
-
-
-def covered_area(xy: FloatArray) -> float:
-    """Area within the cover distance of any point (m^2), on a grid."""
-    low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
-    xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
-    x, y = xy.T[:, :, None, None]
-    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
-    return float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)

@@ -57,9 +57,8 @@ class GlobalPose:
 
 
 def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose | None:
-    """The pose at the start of a run from the discs of its first frames; None if not certain.
-
-    Identifiers are not used. Takes the map's discs (M, 2) (m).
+    """The pose at the start of a run from the discs of the first frames, whatever their IDs, and
+    those of the map (M, 2) (m); None if it is not certain.
     """
     most = min(len(recording), _MOST_FRAMES)
     poses = chain_steps(recording.steps[:most])

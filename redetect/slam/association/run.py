@@ -27,6 +27,7 @@ from scipy.special import chdtri
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import chain_steps, compose, rotation
+from redetect.slam.association import loops
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
@@ -38,16 +39,6 @@ from redetect.slam.association.loop_closing import (
     pairs_by_position,
     pairs_by_votes,
     solve_path,
-)
-from redetect.slam.association.loops import (
-    MOST_COMPARED,
-    REACH_M,
-    STRETCH_FRAMES,
-    Match,
-    Search,
-    Stretch,
-    find_matches,
-    stretches_of,
 )
 from redetect.slam.association.registration import ANYWHERE, register_maps
 from redetect.slam.errors import SlamError
@@ -77,20 +68,18 @@ _LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
 # Least gap between frames, longer than a landmark stays visible or is waited for locally.
-_EVERYWHERE = Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
+_EVERYWHERE = loops.Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
 
 
 @dataclass(frozen=True, eq=False)
 class RunAssociation:
     """Labels of a run's rows, numbered from 0 in the order of first sight."""
 
-    # (n,): final label of each row; -1 if a row of a disc fits none, or none that is seen often.
-    circle_labels: IntArray
+    circle_labels: IntArray  # (n,): final; -1 for rows that fit no disc that is seen often
     line_labels: IntArray
-    # (n,): from frame to frame only.
-    local_circle_labels: IntArray
+    local_circle_labels: IntArray  # (n,): from frame to frame only
     local_line_labels: IntArray
-    matches: tuple[Match, ...]  # the loops that were closed
+    matches: tuple[loops.Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the corresponding path; None without map level
 
 
@@ -117,33 +106,23 @@ def associate_run(
     report = progress or (lambda _: None)
     local = _associated_locally(recording, settings, camera_xy, report)
     circle_labels, line_labels = local
-    matches: tuple[Match, ...] = ()
+    matches: tuple[loops.Match, ...] = ()
     path = None
-    if settings.map_level:
-        by_discs = len(recording.circles) > 0
-        closed = _closed_by_parts(
-            _without_lines(recording) if by_discs else recording,
-            circle_labels if by_discs else line_labels,
-            settings,
-            camera_xy,
-            report,
-        )
-        path, matches = closed.path, closed.matches
-        if by_discs:
-            labels = closed.labels
-            circle_labels = without_clutter(recording, labels, path, settings)
-            if len(line_labels):
-                report("verticals on the path of the discs")
-                line_labels, path_of_both = lines_by_points(
-                    *(recording, path, labels, line_labels),
-                    camera_xy=camera_xy,
-                    disc_sigma_scale=settings.sigma_scale,
-                )
-                line_labels = _merged_lines(
-                    recording, path_of_both, line_labels, settings, camera_xy
-                )
-        else:
-            line_labels = closed.labels
+    if settings.map_level and len(recording.circles):
+        run = _Run(_without_lines(recording), settings, camera_xy, report)
+        labels, path, _, matches, _ = _closed_by_parts(run, circle_labels)
+        circle_labels = without_clutter(recording, labels, path, settings)
+        if len(line_labels):
+            report("verticals on the path of the discs")
+            line_labels, path_of_both = lines_by_points(
+                *(recording, path, labels, line_labels),
+                camera_xy=camera_xy,
+                disc_sigma_scale=settings.sigma_scale,
+            )
+            line_labels = _merged_lines(recording, path_of_both, line_labels, settings, camera_xy)
+    elif settings.map_level:
+        run = _Run(recording, settings, camera_xy, report)
+        line_labels, path, _, matches, _ = _closed_by_parts(run, line_labels)
     return RunAssociation(
         in_order(circle_labels),
         in_order(line_labels),
@@ -175,7 +154,7 @@ def _associated_locally(
 class _Solved(NamedTuple):
     """Least squares of a run with some labels."""
 
-    labels: IntArray  # (n,): see `_Closed`
+    labels: IntArray  # (n,): see `_Run`
     path: FloatArray  # (N + 1, 3)
     xy: FloatArray  # (M, 2): the landmarks' positions (m)
     cost: float
@@ -184,47 +163,72 @@ class _Solved(NamedTuple):
 class _Closed(NamedTuple):
     """A run whose loops are closed."""
 
-    labels: IntArray  # (n,): of discs, whose rows give positions, if there are any, else of lines
+    labels: IntArray  # (n,): see `_Run`
     path: FloatArray  # (N + 1, 3): the path solved with these labels
     xy: FloatArray  # (M, 2): the landmarks' positions (m)
-    matches: tuple[Match, ...]  # the loops
+    matches: tuple[loops.Match, ...]  # the loops
     stretch_frames: int  # length of the stretches that were matched
 
 
-def _closed_by_parts(
-    recording: Recording,
-    labels: IntArray,
-    settings: AssociateSettings,
-    camera_xy: ArrayLike,
-    report: Progress,
-) -> _Closed:
+class _Run(NamedTuple):
+    """A run to be associated by its discs, whose rows give positions, or else by its lines."""
+
+    recording: Recording
+    settings: AssociateSettings
+    camera_xy: ArrayLike
+    report: Progress
+
+    @property
+    def by_discs(self) -> bool:
+        return len(self.recording.circles) > 0
+
+    @property
+    def frames(self) -> IntArray:
+        """(n,) frames of the labels' rows."""
+        return self.recording.circles.frame if self.by_discs else self.recording.lines.frame
+
+    def merged(self, labels: IntArray, pairs: Sequence[tuple[int, int]]) -> tuple[IntArray, int]:
+        return merge_labels(self.frames, labels, pairs, _MOST_TOGETHER if self.by_discs else 0.0)
+
+    def solved(self, labels: IntArray, path: FloatArray | None) -> _Solved:
+        recording, none, line_xy = self.recording, np.zeros(0, dtype=np.int64), None
+        if not self.by_discs:
+            start = chain_steps(recording.steps) if path is None else path
+            line_xy = intersect_bearings(recording, start, labels, camera_xy=self.camera_xy)
+        of_kinds = (labels, none) if self.by_discs else (none, labels)
+        found = solve_path(
+            *(_with_sway(recording, self.settings), *of_kinds, path, line_xy),
+            camera_xy=self.camera_xy,
+            sigma_scale=self.settings.sigma_scale,
+        )
+        xy = found.circle_xy if self.by_discs else found.line_xy
+        return _Solved(labels, found.path, xy, found.cost)
+
+
+def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     """Close loops in each part between lost steps of odometry, and then in the whole.
 
     In between, the parts' maps are registered; the first one stays.
     """
-    frames = _frames_of_labels(recording)
+    recording, frames = run.recording, run.frames
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
-    stretches: list[list[Stretch]] = []
+    stretches: list[list[loops.Stretch]] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # a part begins with its own start, not with the end of the one before
             known = np.concatenate([_HARDLY_ANY[None], part.step_covariance[1:]])
             part = replace(part, step_covariance=known)
         rows = slice(*np.searchsorted(frames, [first, end]))
-        closed = _closed(part, in_order(labels[rows]), settings, camera_xy, report)
+        own = run._replace(recording=part)
+        closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        stretches.append(
-            stretches_of(
-                *(_frames_of_labels(part), closed.labels, closed.xy, len(part)),
-                length=closed.stretch_frames,
-                stride=closed.stretch_frames,
-                least=ANYWHERE.least_agreeing,
-            )
-        )
+        some, length = (own.frames, closed.labels, closed.xy, len(part)), closed.stretch_frames
+        least = ANYWHERE.least_agreeing
+        stretches.append(loops.stretches_of(*some, length=length, stride=length, least=least))
     if len(parts) == 1:
         return parts[0]
-    report("laying parts on each other")
+    run.report("laying parts on each other")
     motions, pairs, left = register_maps([part.xy for part in parts], stretches)
     if left:
         raise SlamError(
@@ -234,124 +238,85 @@ def _closed_by_parts(
     counts = np.cumsum([0, *(len(part.xy) for part in parts)])
     together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
     laid = [compose(motions[k], part.path[int(k > 0) :]) for k, part in enumerate(parts)]
-    labels, _ = merge_labels(frames, together, pairs_by_votes(pairs), _most_together(recording))
-    whole = _closed(recording, labels, settings, camera_xy, report, np.concatenate(laid))
+    labels, _ = run.merged(together, pairs_by_votes(pairs))
+    whole = _closed(run, labels, np.concatenate(laid))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
     return whole._replace(matches=tuple(matches))
 
 
-def _closed(
-    recording: Recording,
-    labels: IntArray,
-    settings: AssociateSettings,
-    camera_xy: ArrayLike,
-    report: Progress,
-    path: FloatArray | None = None,
-) -> _Closed:
+def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Closed:
     """Close all loops, starting from a path (by default odometry)."""
-    by_discs = len(recording.circles) > 0
-    frames = _frames_of_labels(recording)
-    swayed, search = _with_sway(recording, settings), Search()
-    none = np.zeros(0, dtype=np.int64)
+    recording, settings, frames, search = run.recording, run.settings, run.frames, loops.Search()
     if path is not None:  # most of it is in its place already
         search = _EVERYWHERE._replace(
             most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
         )
-
-    def solved(labels: IntArray, path: FloatArray | None) -> _Solved:
-        line_xy = None
-        if not by_discs:
-            start = chain_steps(recording.steps) if path is None else path
-            line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
-        of_kinds = (labels, none) if by_discs else (none, labels)
-        found = solve_path(
-            *(swayed, *of_kinds, path, line_xy),
-            camera_xy=camera_xy,
-            sigma_scale=settings.sigma_scale,
-        )
-        xy = found.circle_xy if by_discs else found.line_xy
-        return _Solved(labels, found.path, xy, found.cost)
-
-    at = solved(labels, path)
-    matches: list[Match] = []
+    at = run.solved(labels, path)
+    matches: list[loops.Match] = []
     length = search.stretch_frames
     while True:
         for number in range(1, _MOST_ROUNDS + 1):
-            report(f"loops, stretches of {length} frames, round {number}")
+            run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
             some = (frames, at.labels, at.xy, len(recording))
-            found = find_matches(stretches_of(*some, length=length, most=MOST_COMPARED), search)
+            compared = loops.stretches_of(*some, length=length, most=loops.MOST_COMPARED)
+            found = loops.find_matches(compared, search)
             found = consistent_matches(found, matches, at.path, recording.step_covariance)
-            at, found = _with_matches(recording, at, found, solved)
-            stretches = stretches_of(frames, at.labels, at.xy, len(recording), length=length)
-            spread = _isotropic(len(at.xy), REACH_M)
-            if by_discs:
+            at, found = _with_matches(run, at, found)
+            stretches = loops.stretches_of(frames, at.labels, at.xy, len(recording), length=length)
+            spread = _isotropic(len(at.xy), loops.REACH_M)
+            if run.by_discs:
+                swayed = _with_sway(recording, settings)
                 spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
             pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
-            labels, by_position = merge_labels(frames, at.labels, pairs, _most_together(recording))
+            labels, by_position = run.merged(at.labels, pairs)
             if by_position:
-                at = solved(labels, at.path)
+                at = run.solved(labels, at.path)
             matches += found
             if len(at.xy) == before and search.most_shift_m == math.inf:
                 break
-            search = _EVERYWHERE._replace(
-                stretch_frames=length,
-                attached_frames=_EVERYWHERE.attached_frames * length // STRETCH_FRAMES,
-            )
-        if not by_discs or length == _LONGEST or not _sparse(frames, at, len(recording), length):
+            attached = _EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES
+            search = _EVERYWHERE._replace(stretch_frames=length, attached_frames=attached)
+        if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
             return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
         length = min(2 * length, _LONGEST)
-        search = Search(stretch_frames=length)
+        search = loops.Search(stretch_frames=length)
 
 
-def _sparse(frames: IntArray, at: _Solved, count: int, length: int) -> bool:
+def _sparse(run: _Run, at: _Solved, length: int) -> bool:
     """Whether stretches of a length have too few discs to be recognised."""
     often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
-    stretches = stretches_of(
-        frames[often], at.labels[often], at.xy, count, length=length, stride=length, least=0
-    )
+    some = (run.frames[often], at.labels[often], at.xy, len(run.recording))
+    stretches = loops.stretches_of(*some, length=length, stride=length, least=0)
     return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
 
 
 def _with_matches(
-    recording: Recording,
-    before: _Solved,
-    matches: Sequence[Match],
-    solved: Callable[[IntArray, FloatArray | None], _Solved],
-) -> tuple[_Solved, list[Match]]:
+    run: _Run, before: _Solved, matches: Sequence[loops.Match]
+) -> tuple[_Solved, list[loops.Match]]:
     """The run with matches closed, except those that its rows contradict, and the closed ones.
 
     In a regular pattern of discs, odometry cannot exclude every wrong match. These bend the path,
     so that errors of all rows along it increase the cost far more than those of a right match.
     """
-    by_discs, frames = len(recording.circles) > 0, _frames_of_labels(recording)
     if not matches:
         # Lines intersect elsewhere along the solved path.
-        return (before if by_discs else solved(before.labels, before.path)), []
-    at, closed = before, list[Match]()
+        return (before if run.by_discs else run.solved(before.labels, before.path)), []
+    at, closed = before, list[loops.Match]()
     waiting = [sorted(matches, key=lambda match: (match.later_frame, match.earlier_frame))]
     fewest = math.ceil(len(matches) / _MOST_PARTS)
     while waiting:
         some = waiting.pop()
         together = [*closed, *some]
         pairs = pairs_by_votes(match.pairs for match in together)
-        labels, _ = merge_labels(frames, before.labels, pairs, _most_together(recording))
-        trial = solved(labels, closed_path(before.path, together, recording.lost))
-        if not by_discs or trial.cost - at.cost <= _MOST_COST * (len(at.xy) - len(trial.xy)):
+        labels, _ = run.merged(before.labels, pairs)
+        trial = run.solved(labels, closed_path(before.path, together, run.recording.lost))
+        if not run.by_discs or trial.cost - at.cost <= _MOST_COST * (len(at.xy) - len(trial.xy)):
             at, closed = trial, together
         elif len(some) > fewest:
             half = len(some) // 2
             waiting += [some[half:], some[:half]]
     return at, closed
-
-
-def _frames_of_labels(recording: Recording) -> IntArray:
-    """(n,) frames of the rows of discs, or of lines if there are none."""
-    return recording.circles.frame if len(recording.circles) else recording.lines.frame
-
-
-def _most_together(recording: Recording) -> float:
-    return _MOST_TOGETHER if len(recording.circles) else 0.0
 
 
 def _without_lines(recording: Recording) -> Recording:
@@ -396,7 +361,7 @@ def without_clutter(
         if not last and np.any(kept):
             known, numbers = np.unique(labels[kept], return_inverse=True)
             rows = replace(swayed, circles=swayed.circles.only(kept))
-            stretches = stretches_of(frames[kept], numbers, places[known], len(recording))
+            stretches = loops.stretches_of(frames[kept], numbers, places[known], len(recording))
             spread = _spread(rows, path, numbers, settings.sigma_scale)
             pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
             merged, _ = merge_labels(frames[kept], numbers, pairs)
@@ -451,7 +416,7 @@ def _merged_lines(
         return labels
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
-        stretches = stretches_of(recording.lines.frame, labels, xy, len(recording))
+        stretches = loops.stretches_of(recording.lines.frame, labels, xy, len(recording))
         pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:

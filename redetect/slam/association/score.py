@@ -17,20 +17,15 @@ class AssociationScore:
     """Scores of labels against the file's IDs; rows without ID are ignored."""
 
     rows: int  # number of rows scored
-    # Of these, rows without a label: they count as landmarks seen once, and not as splits.
-    unlabelled_rows: int
-    # Different IDs, and different labels, among them.
-    true_landmarks: int
-    found_landmarks: int
-    # Of the pairs of rows with one label, the share that shows one landmark; 1 without pairs.
-    pair_precision: float
-    # Of the pairs of rows of one landmark, the share that has one label; 1 without pairs.
-    pair_recall: float
+    unlabelled_rows: int  # of these, without a label: landmarks seen once, and no splits
+    true_landmarks: int  # different IDs among them
+    found_landmarks: int  # different labels among them
+    pair_precision: float  # share of pairs of rows with one label that show one landmark
+    pair_recall: float  # share of pairs of rows of one landmark with one label; 1 without pairs
     # Share of rows whose label is that of their landmark, where labels and landmarks are matched
     # one to one so that this share is largest. A row with several IDs may be any of them.
     right_rows: float
-    # Sum over labels of the number of landmarks that they contain besides the first.
-    wrong_merges: int
+    wrong_merges: int  # sum over labels of the number of their landmarks besides the first
     splits: int  # sum over landmarks of the number of labels of their rows besides the first
 
 

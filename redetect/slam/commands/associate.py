@@ -17,13 +17,7 @@ from redetect.bounds import NOT_NEGATIVE, demand, whole
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.slam.association.run import RunAssociation, associate_run
 from redetect.slam.association.score import AssociationScore, score_association
-from redetect.slam.commands.files import (
-    camera_xy_of,
-    files_of,
-    lengths_of,
-    recordings_of,
-    write_json,
-)
+from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
@@ -38,15 +32,15 @@ def perform(options: Associate) -> int:
     """Execute the command; returns the exit code."""
     demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
     settings = options.settings
-    sources = [(k, f) for k, run in enumerate(options.runs) for f in files_of(options, run)]
+    sources = [(k, f) for k, run in enumerate(options.runs) for f in files.files_of(options, run)]
     targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
     report = (options.output or targets[0]).with_suffix(".json")
     demand_free([*targets, report], overwrite=options.force)
-    runs = recordings_of(options)
+    runs = files.recordings_of(options)
     recording = joined(runs)
-    camera_xy = camera_xy_of(recording, options.run, options.camera)
+    camera_xy = files.camera_xy_of(recording, options.run, options.camera)
 
     tries: list[dict[str, Any]] = []
     for factor in (0.0, *options.noise):
@@ -86,7 +80,7 @@ def perform(options: Associate) -> int:
         "seed": options.seed,
         "runs": tries,
     }
-    write_json(report, content, overwrite=options.force)
+    files.write_json(report, content, overwrite=options.force)
     return 0
 
 
@@ -157,7 +151,7 @@ def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray
 
 def _doubt(run: Recording) -> str:
     """What may be wrong with a run most of whose rows of discs match none."""
-    way, reach = lengths_of(run)
+    way, reach = files.lengths_of(run)
     return (
         "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
         f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "

@@ -13,28 +13,9 @@ from numpy.typing import ArrayLike
 from redetect import __version__
 from redetect.array_types import FloatArray
 from redetect.bounds import demand
-from redetect.landmarks import squared_mahalanobis, wrap_angle
-from redetect.landmarks.map_file import (
-    LandmarkMap,
-    Path2D,
-    covariance_file,
-    read_map,
-    read_path,
-    with_joint_covariance,
-    write_map,
-    write_path,
-)
+from redetect.landmarks import map_file, squared_mahalanobis, wrap_angle
 from redetect.slam.association.registration import localise_globally
-from redetect.slam.commands.files import (
-    MAP_NAME,
-    MAP_PICTURE,
-    PATH_NAME,
-    camera_xy_of,
-    default_output,
-    flags_of,
-    recording_of,
-    write_json,
-)
+from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.frames import Associator, FilterRun, run_filter
@@ -51,22 +32,21 @@ _LOST_FRAMES = 20
 # Factor of innovations with known identifiers above which some are wrong, or covariances too small.
 _MOST_FACTOR = 2.5
 
-
 #: Results of a filter: the run, the map, and further lines for the terminal.
-_Result = tuple[FilterRun, LandmarkMap, list[str]]
+_Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
 
 
 def perform(command: Localize | Ekf) -> int:
     """Execute the command; returns the exit code."""
     demand(command, SlamError, start=PLACE)
     name = type(command).__name__.lower()
-    output = command.output or default_output(command.run, name)
-    names = [PATH_NAME, f"{name}.json", MAP_PICTURE]
+    output = command.output or files.default_output(command.run, name)
+    names = [files.PATH_NAME, f"{name}.json", files.MAP_PICTURE]
     names += [ERROR_PICTURE] * (command.reference is not None)
     if isinstance(command, Ekf):
-        names += [MAP_NAME, covariance_file(Path(MAP_NAME)).name]
+        names += [files.MAP_NAME, map_file.covariance_file(Path(files.MAP_NAME)).name]
     demand_free([output / name for name in names], overwrite=command.force)
-    recording = recording_of(command)
+    recording = files.recording_of(command)
     began = time.perf_counter()
     if isinstance(command, Localize):
         run, landmark_map, said = _localized(command, recording)
@@ -80,55 +60,55 @@ def perform(command: Localize | Ekf) -> int:
     elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
         said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
-    reference = None if command.reference is None else read_path(command.reference)
+    reference = None if command.reference is None else map_file.read_path(command.reference)
     distance = None
     if reference is not None:
         distance = path_distance(run.path, reference.poses, f"{command.reference}: ")
 
     output.mkdir(parents=True, exist_ok=True)
     head = [f"slam {name} {__version__}: {source}"]
-    write_path(output / PATH_NAME, run.path, head, overwrite=command.force)
+    map_file.write_path(output / files.PATH_NAME, run.path, head, overwrite=command.force)
     content: dict[str, Any] = {
         "version": __version__,
-        "settings": flags_of(command),
+        "settings": files.flags_of(command),
         "figures": _figures(run, distance),
     }
     if isinstance(command, Ekf):
         content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
         if command.reference_map:
-            off = map_distance(landmark_map, read_map(command.reference_map))
+            off = map_distance(landmark_map, map_file.read_map(command.reference_map))
             content["distance_from_reference_map"] = off
             said.append(
                 "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
                 "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
             )
-    write_json(output / f"{name}.json", content, overwrite=command.force)
+    files.write_json(output / f"{name}.json", content, overwrite=command.force)
     print("\n".join([*_table(run, distance), *said]))
     title = f"{command.run.name}: {title}"
     shown = command.interactive
     drawn = draw_map(landmark_map, run.path, reference=reference, title=title, interactive=shown)
-    write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
+    write_bytes(output / files.MAP_PICTURE, drawn, overwrite=command.force)
     if reference is not None:
         drawn = draw_errors(run.path, reference.poses, title=title, interactive=shown)
         write_bytes(output / ERROR_PICTURE, drawn, overwrite=command.force)
     if isinstance(command, Ekf):
-        write_map(output / MAP_NAME, landmark_map, head, overwrite=command.force)
+        map_file.write_map(output / files.MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
-    landmark_map = read_map(command.map)
+    landmark_map = map_file.read_map(command.map)
     said: list[str] = []
     if command.association == "known":
-        landmark_map = with_joint_covariance(landmark_map, command.map)
+        landmark_map = map_file.with_joint_covariance(landmark_map, command.map)
         if landmark_map.joint_covariance is None:
-            name = covariance_file(command.map).name
+            name = map_file.covariance_file(command.map).name
             said.append(f"errors of the map are assumed independent: no {name}")
     return localized_run_of(command, recording, landmark_map), landmark_map, said
 
 
 def localized_run_of(
-    command: Localize, recording: Recording, landmark_map: LandmarkMap
+    command: Localize, recording: Recording, landmark_map: map_file.LandmarkMap
 ) -> FilterRun:
     """Localise a run's rows in a map, as a command asks.
 
@@ -142,7 +122,7 @@ def localized_run_of(
         landmark_map,
         start,
         covariance,
-        camera_xy_of(recording, command.run, command.camera),
+        files.camera_xy_of(recording, command.run, command.camera),
         # Considering the map's errors makes the filter slow to converge to it, which does little
         # harm with known pairs, but loses track if pairs have to be found.
         exact=command.association != "known",
@@ -175,7 +155,7 @@ def lost_lines(run: FilterRun, recording: Recording) -> list[str]:
 
 
 def _global_start(
-    command: Localize, recording: Recording, landmark_map: LandmarkMap
+    command: Localize, recording: Recording, landmark_map: map_file.LandmarkMap
 ) -> tuple[FloatArray, FloatArray]:
     """The pose at the start and its covariance, from the discs of the first frames."""
     if any(command.start) or any(command.start_sigma):
@@ -195,7 +175,7 @@ def _global_start(
 
 
 def _mapped(command: Ekf, recording: Recording) -> _Result:
-    camera_xy = camera_xy_of(recording, command.run, command.camera)
+    camera_xy = files.camera_xy_of(recording, command.run, command.camera)
     ekf = EkfSlam(command.start, camera_xy=camera_xy)
     associator = Associator(command.association, command.gate_probability)
     run = run_ekf(recording, ekf, associator)
@@ -212,11 +192,11 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     return run, landmark_map, said
 
 
-def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
+def path_distance(path: map_file.Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
     """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
 
-    Root mean square, median and largest distance of positions (m) and headings (rad), and those of
-    the last pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
+    Rms, median and largest distance of positions (m) and headings (rad), and those of the last
+    pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
     """
     other = np.asarray(reference, dtype=np.float64)
     if len(other) != len(path.poses):
@@ -235,7 +215,9 @@ def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[st
     }
 
 
-def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
+def map_distance(
+    landmark_map: map_file.LandmarkMap, reference: map_file.LandmarkMap
+) -> dict[str, float]:
     """Distance of landmarks from those of another map with the same identifiers."""
     offsets, covariances = [], []
     kinds = (landmark_map.discs, reference.discs), (landmark_map.lines, reference.lines)

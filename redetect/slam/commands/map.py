@@ -15,29 +15,21 @@ from camera import write_camera
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks.map_file import covariance_file, write_map, write_path
-from redetect.slam.commands.files import (
-    MAP_NAME,
-    MAP_PICTURE,
-    PATH_NAME,
-    camera_of_run,
-    default_output,
-    flags_of,
-    recordings_of,
-    write_json,
-)
+from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
+from redetect.slam.mapping import run_map
 from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.odometry_check import OdometryCheck
-from redetect.slam.mapping.run_map import MappedRun, Mounting, as_json, map_run, table_lines
+from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
+from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.slam.settings import PLACE
 from redetect.storage import demand_free, write_bytes
+from redetect.tables import plain
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
-
 
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
 # changes of lengths (%), turns (rad/m) and lags (intervals between frames).
@@ -45,19 +37,17 @@ _SIGNIFICANT, _LEAST_PERCENT, _LEAST_TURN, _LEAST_LAG = 5.0, 2.0, 0.01, 0.1
 # Factor of odometry or of rows alone above which their covariances are too small.
 _MOST_FACTOR = 2.5
 
-#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
-MOST_LANDMARKS_TOGETHER = 5000
-
 
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
-    output = command.output or default_output(command.run)
-    joint_name = covariance_file(Path(MAP_NAME)).name
+    output = command.output or files.default_output(command.run)
+    joint_name = covariance_file(Path(files.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
-    paths = several if command.more else [PATH_NAME]
-    names = [MAP_NAME, *paths, TABLE_NAME, MAP_PICTURE] + [CAMERA_NAME] * command.calibrate
+    paths = several if command.more else [files.PATH_NAME]
+    names = [files.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
+    names += [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
-    runs = recordings_of(command)
+    runs = files.recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
     mapped = mapped_run_of(command, recording)
@@ -66,27 +56,25 @@ def perform(command: Map) -> int:
     output.mkdir(parents=True, exist_ok=True)
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {__version__}: {name}"]
-    final, path = mapped.landmarks, mapped.path
-    few = len(final.discs) + len(final.lines) <= MOST_LANDMARKS_TOGETHER
-    if few:
-        final = mapped.landmarks_jointly()
-    write_map(output / MAP_NAME, final, head, overwrite=command.force)
-    if not few:
+    final, path = mapped.landmarks_to_write(), mapped.path
+    write_map(output / files.MAP_NAME, final, head, overwrite=command.force)
+    if final.joint_covariance is None:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
-    check = mapped.odometry_check()
-    write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
+    check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
+    results = plain(_results(mapped, check, command))
+    files.write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
-    if not few:
+    if final.joint_covariance is None:
         print(
-            f"more than {MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that `slam "
-            "localize` assumes independent errors"
+            f"more than {run_map.MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that "
+            "`slam localize` assumes independent errors"
         )
     drawn = draw_map(final, path, before=mapped.before, title=name, interactive=command.interactive)
-    write_bytes(output / MAP_PICTURE, drawn, overwrite=command.force)
+    write_bytes(output / files.MAP_PICTURE, drawn, overwrite=command.force)
     if (found := mapped.mounting) is not None and mapped.graph.camera is not None:
         mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
@@ -99,7 +87,7 @@ def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
     demand(command, SlamError, start=PLACE, loss_scale=ABOVE_0)
     camera = None
     if command.calibrate or len(recording.lines):
-        camera = camera_of_run(command.run, command.camera)
+        camera = files.camera_of_run(command.run, command.camera)
     weighting = Weighting(
         loss=command.loss,
         loss_scale=command.loss_scale,
@@ -190,20 +178,20 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
 def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str, Any]:
     results: dict[str, Any] = {
         "version": __version__,
-        "configuration": flags_of(command, ("output", "force", "interactive")),
-        "table": as_json(mapped.table),
-        "odometry": as_json(check),
+        "configuration": files.flags_of(command, ("output", "force", "interactive")),
+        "table": asdict(mapped.table),
+        "odometry": asdict(check),
         "minimised": mapped.cost,
         "steps": mapped.steps,
         "left_out": asdict(mapped.left_out),
     }
     if (found := mapped.mounting) is not None:
         results["mounting"] = {
-            "rotation_rad": found.change[:3].tolist(),
-            "place_m": found.change[3:5].tolist(),
-            "height_m": float(found.change[5]),
-            "covariance": found.covariance.tolist(),
-            "robot_from_camera": found.robot_from_camera.tolist(),
+            "rotation_rad": found.change[:3],
+            "place_m": found.change[3:5],
+            "height_m": found.change[5],
+            "covariance": found.covariance,
+            "robot_from_camera": found.robot_from_camera,
             "chi_squared_gained": found.gain,
         }
     return results

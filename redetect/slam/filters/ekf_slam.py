@@ -28,18 +28,9 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import (
-    NO_CAMERA,
-    POSE_SIZE,
-    Associator,
-    Filter,
-    FilterRun,
-    FrameRows,
-    numbers_from,
-    run_filter,
-)
-from redetect.slam.models import tilt_jacobian
-from redetect.slam.recording import Recording
+from redetect.slam.filters import frames
+from redetect.slam.models import move, tilt_jacobian
+from redetect.slam.recording import LineRows, Recording
 
 #: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
 #: assume that bearings are linear in these.
@@ -52,12 +43,14 @@ _INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
 # of an inverse distance in one iteration (1/m).
 _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
-_POSE = np.arange(POSE_SIZE)
+_POSE = np.arange(frames.POSE_SIZE)
 # Increment of the state's size; some unused numbers cost less than copying its covariance often.
 _CHUNK = 64
+# For poses alone the state is limited to this many discs: its update costs their number squared.
+_MOST_DISCS = 300
 
 
-class EkfSlam(Filter):
+class EkfSlam(frames.Filter):
     """The filter.
 
     Parameters
@@ -75,7 +68,7 @@ class EkfSlam(Filter):
         self,
         start: ArrayLike = (0.0, 0.0, 0.0),
         start_covariance: ArrayLike | None = None,
-        camera_xy: ArrayLike = NO_CAMERA,
+        camera_xy: ArrayLike = frames.NO_CAMERA,
         *,
         tilt_sigma_rad: float = 0.0,
     ) -> None:
@@ -95,7 +88,7 @@ class EkfSlam(Filter):
         by_numbers[:, :, 3] = np.stack([x, y, np.ones(len(x))], axis=1)
         return points, by_numbers
 
-    def measure(self, rows: FrameRows) -> None:
+    def measure(self, rows: frames.FrameRows) -> None:
         """Update with the rows of the frame: known landmarks first, then new ones.
 
         Rows of several lines are ignored unless all of them are in the state then.
@@ -115,17 +108,16 @@ class EkfSlam(Filter):
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks with known positions, with their covariances."""
-        of_discs = numbers_from([*self.disc_slots.values()], 2)
-        of_lines = numbers_from([*self.line_slots.values()], self.line_size)
+        of_discs = frames.numbers_from([*self.disc_slots.values()], 2)
+        of_lines = frames.numbers_from([*self.line_slots.values()], self.line_size)
         inverse = of_lines[:, 3]
         sigma = np.sqrt(self._covariance[inverse, inverse])
         placed = sigma < LARGEST_RANGE_SIGMA * self._state[inverse]
         of_lines = of_lines[placed]
         points, by_numbers = self.line_points(of_lines)
         line_xy = points[:, :2] / points[:, 2:]
-        by_points = np.concatenate(
-            [np.tile(np.eye(2), (len(points), 1, 1)), -line_xy[..., None]], 2
-        )
+        by_xy = np.tile(np.eye(2), (len(points), 1, 1))
+        by_points = np.concatenate([by_xy, -line_xy[..., None]], axis=2)
         by_lines = by_points @ by_numbers / points[:, 2, None, None]
         jacobian = block_diag(np.eye(of_discs.size), *by_lines)
         joint = jacobian @ self.block(np.append(of_discs.ravel(), of_lines.ravel())) @ jacobian.T
@@ -149,13 +141,13 @@ class EkfSlam(Filter):
         if not discs and not lines:
             return
         sizes = ((self.disc_slots, 2, discs), (self.line_slots, self.line_size, lines))
-        kept = [np.arange(POSE_SIZE)]
+        kept = [np.arange(frames.POSE_SIZE)]
         for slots, size, dropped in sizes:
             for number in dropped:
                 del slots[number]
-            kept.append(numbers_from([*slots.values()], size).ravel())
+            kept.append(frames.numbers_from([*slots.values()], size).ravel())
         index = np.concatenate(kept)
-        at = POSE_SIZE
+        at = frames.POSE_SIZE
         for slots, size, _ in sizes:
             for number in slots:
                 slots[number], at = at, at + size
@@ -163,15 +155,16 @@ class EkfSlam(Filter):
         self._state, self._linearised = self._state[index], self._linearised[index]
         self._covariance = np.asfortranarray(self.block(index))
 
-    def _update(self, rows: FrameRows) -> None:
+    def _update(self, rows: frames.FrameRows) -> None:
         """Use rows whose landmarks are in the state."""
         if not len(rows.circles) and not len(rows.lines):
             return
         before = self._state.copy()
+        inverse = frames.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
-            nearer = np.abs(change[numbers_from([*self.line_slots.values()], self.line_size)[:, 3]])
+            nearer = np.abs(change[inverse])
             self._state += change * min(1.0, _LONGEST_STEP / max(nearer.max(initial=0.0), 1e-9))
             if np.max(np.abs(change)) < _CONVERGED:
                 break
@@ -226,17 +219,49 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
     return chosen
 
 
-def run_ekf(recording: Recording, ekf: EkfSlam, associator: Associator | None = None) -> FilterRun:
+def run_ekf(
+    recording: Recording, ekf: EkfSlam, associator: frames.Associator | None = None
+) -> frames.FilterRun:
     """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
-    If identities have to be found, discs far from all others are new ones, numbered from 1 in the
-    order of their first sight; lines may be anywhere on a ray at first, so that they cannot be
-    recognised: their rows must have identifiers, else `SlamError` is raised.
+    If identities have to be found, discs far from all others are new ones, numbered from 1. Lines
+    may be anywhere on a ray at first: `SlamError` is raised if their rows have no identifiers.
     """
-    pairing = associator or Associator()
+    pairing = associator or frames.Associator()
     if pairing.method != "known" and len(recording.lines):
         raise SlamError(
             f"association {pairing.method} with lines: EKF-SLAM finds identities of discs only: "
             "expected known association, or a run without lines"
         )
-    return run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
+    return frames.run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
+
+
+def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Poses by EKF-SLAM with the identifiers of discs: a start where odometry is too wrong.
+
+    Odometry with a systematic error winds up: after a loop its heading may be half a turn off, and
+    least squares from there end in a wrong minimum, with the path wound once too often. The filter
+    corrects the pose in each frame, so that no error winds up while discs are in view. It forgets
+    discs not seen for long, and begins again after a lost step.
+
+    Takes the first pose (3,) (m, m, rad); returns the start and the pose after each step (N + 1, 3)
+    as estimated at the time, theta not wrapped. Raises `SlamError` if covariances contradict each
+    other.
+    """
+    lost = set(recording.lost.tolist())
+    poses = np.empty((len(recording) + 1, 3))
+    poses[0] = start
+    ekf, seen = EkfSlam(poses[0]), dict[int, int]()
+    for k, rows in enumerate(frames.frames_of(recording)):
+        if k in lost:
+            ekf, seen = EkfSlam(move(poses[k], recording.steps[k])), {}
+        else:
+            ekf.predict(recording.steps[k], recording.step_covariance[k])
+        ekf.measure(rows._replace(lines=LineRows.of()))
+        seen.update(dict.fromkeys(rows.circles.ids[rows.circles.identified].tolist(), k))
+        if len(seen) > _MOST_DISCS:
+            kept = dict(sorted(seen.items(), key=lambda item: -item[1])[: _MOST_DISCS // 2])
+            ekf.forget(seen.keys() - kept.keys(), set())
+            seen = kept
+        poses[k + 1] = ekf.state[:3]
+    return poses

@@ -49,7 +49,7 @@ class FrameRows(NamedTuple):
     circles: CircleRows
     lines: LineRows
 
-    def only(self, discs: BoolArray, lines: BoolArray) -> FrameRows:
+    def only(self, discs: BoolArray | slice, lines: BoolArray | slice) -> FrameRows:
         """The selected rows."""
         return FrameRows(self.circles.only(discs), self.lines.only(lines))
 
@@ -76,14 +76,11 @@ class Innovation(NamedTuple):
 class RowCount:
     """Use of a run's rows."""
 
-    # Rows that were used.
-    discs: int = 0
+    discs: int = 0  # rows that were used
     lines: int = 0
     left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
-    # Sum of the squared innovations, normalised by their covariances.
-    innovation_squared: float = 0.0
-    # Their degrees of freedom: the expectation of the sum if the covariances are right.
-    innovation_numbers: int = 0
+    innovation_squared: float = 0.0  # sum of the squared normalised innovations
+    innovation_numbers: int = 0  # its expectation, the degrees of freedom
 
     def use(self, rows: FrameRows, whitened: FloatArray) -> None:
         """Count rows that are used, with their whitened innovation (m,)."""
@@ -102,25 +99,19 @@ class RowCount:
 class FilterRun:
     """Poses of a run as a filter estimated them at the time, and the use of the rows."""
 
-    # The start, and the pose after each step and its frame, with covariances; theta is not wrapped.
-    path: Path2D
+    path: Path2D  # the start, and the pose after each step and its frame; theta is not wrapped
     count: RowCount
-    # (n,): the disc of each row, -1 for none, from the file or from association; the same for
-    # lines, empty for none.
-    disc_ids: IntArray
-    line_ids: tuple[tuple[int, ...], ...]
+    disc_ids: IntArray  # (n,): the disc of each row, from the file or association; -1 for none
+    line_ids: tuple[tuple[int, ...], ...]  # the lines of each row; empty for none
 
 
 def frames_of(recording: Recording) -> Iterator[FrameRows]:
     """The rows of each frame of a run, in order."""
-    frames = np.arange(len(recording) + 1)
-    discs = np.searchsorted(recording.circles.frame, frames)
-    lines = np.searchsorted(recording.lines.frame, frames)
+    frames, rows = np.arange(len(recording) + 1), FrameRows(recording.circles, recording.lines)
+    discs = np.searchsorted(rows.circles.frame, frames)
+    lines = np.searchsorted(rows.lines.frame, frames)
     for k in range(len(recording)):
-        yield FrameRows(
-            recording.circles.only(slice(discs[k], discs[k + 1])),
-            recording.lines.only(slice(lines[k], lines[k + 1])),
-        )
+        yield rows.only(slice(discs[k], discs[k + 1]), slice(lines[k], lines[k + 1]))
 
 
 class Filter(ABC):
@@ -347,8 +338,7 @@ class Associator:
 
     method: Association = "known"  # `known`, `nearest` or `joint`
     gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of correct rows that pass
-    # The identifier of the next new disc; None: no new discs.
-    new_id: Callable[[], int] | None = None
+    new_id: Callable[[], int] | None = None  # gives the IDs of new discs; None: there are none
 
     def __post_init__(self) -> None:
         chi_squared_gates(self.gate_probability, 1, 1)

@@ -68,10 +68,8 @@ def discs_of_ranges(
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
     direction = np.stack([sin, -cos], axis=-1)
-    root = np.stack(
-        [sigma_m * direction, sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)],
-        axis=-1,
-    )
+    across = sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)
+    root = np.stack([sigma_m * direction, across], axis=-1)
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
@@ -169,9 +167,8 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
     xy = to_dataset(table[:, 1:3])
-    return LandmarkMap(
-        Landmarks(table[:, 0].astype(np.int64), xy, covariance, count), no_landmarks()
-    )
+    discs = Landmarks(table[:, 0].astype(np.int64), xy, covariance, count)
+    return LandmarkMap(discs, no_landmarks())
 
 
 def _velocity_steps(velocity: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -239,9 +236,8 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
 
 
 def trees_of(scan: FloatArray) -> FloatArray:
-    """Trunks in a scan: runs of beams with nearly equal range and a distant background.
-
-    Takes `scan` (361,); returns (n, 2).
+    """Ranges and bearings (n, 2) of trunks in a scan (361,): runs of beams of nearly equal range
+    with a distant background.
     """
     edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
     starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
@@ -254,9 +250,8 @@ def trees_of(scan: FloatArray) -> FloatArray:
         diameter = reach * np.radians(0.5 * (last - first))
         alone = min(right, left) > reach + _BEHIND_M
         if alone and reach < _FARTHEST_M and _LEAST_DIAMETER_M < diameter < _MOST_DIAMETER_M:
-            found.append(
-                (reach + 0.125 * np.pi * diameter, np.radians(0.25 * (first + last - 1) - 90.0))
-            )
+            bearing_rad = np.radians(0.25 * (first + last - 1) - 90.0)
+            found.append((reach + 0.125 * np.pi * diameter, bearing_rad))
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 

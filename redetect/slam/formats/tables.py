@@ -24,10 +24,7 @@ ODOMETRY_COLUMNS = (
     *(f"end_{name}" for name in _TRIANGLE_3),
 )
 DISC_COLUMNS = ("step", "prefix", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2")
-BEARING_COLUMNS = (
-    *("step", "prefix", "ids", "bearing_rad", "sigma_rad"),
-    *("camera_x_m", "camera_y_m"),
-)
+BEARING_COLUMNS = ("step", "prefix", "ids", "bearing_rad", "sigma_rad", "camera_x_m", "camera_y_m")
 
 
 class Table(NamedTuple):
@@ -44,9 +41,8 @@ def odometry_table(recording: Recording) -> Table:
     after = in_turned_axes(before, steps[:, 2])
     triangles = [spread[:, *np.triu_indices(3)] for spread in (before, after)]
     numbers = np.concatenate([steps, *triangles], axis=1).tolist()
-    rows = [
-        (k + 1, prefix, *row) for k, (prefix, row) in enumerate(zip(recording.prefixes, numbers))
-    ]
+    steps_named = enumerate(zip(recording.prefixes, numbers), 1)
+    rows = [(number, prefix, *row) for number, (prefix, row) in steps_named]
     return Table(ODOMETRY_COLUMNS, rows)
 
 

@@ -48,10 +48,8 @@ def write_tum(
 def read_tum(path: str | os.PathLike[str]) -> Path2D:
     """Read a TUM trajectory of a path on the floor; the result is in the data set's axes.
 
-    Angles are in [-pi, pi). The first pose is called ``start``, the others by their time.
-
-    Raises `SlamError` if the file cannot be read, is not a path on the floor, or its times do not
-    ascend; the message names file and line.
+    Angles are in [-pi, pi). The first pose is called ``start``, the others by their time. Raises
+    `SlamError` with file and line if it is not on the floor, or its times do not ascend.
     """
     prefixes: list[str] = []
     numbers: list[list[float]] = []

@@ -48,13 +48,11 @@ class Group:
 
     rows: IntArray  # (k,): indices of the rows among the recording's discs
     id: int  # their identifier in the file
-    # Whether they show another landmark, a new one, or nothing that is known.
-    kind: Kind
+    kind: Kind  # whether they show another landmark, a new one, or nothing that is known
     new_id: int  # that landmark; -1 for `drop`
     xy: FloatArray  # (k, 2): positions of the rows in the map (m)
     own_m: float  # distance of their median from the landmark of that identifier
-    # (k,): squared error of each row against the map without any of the suspects.
-    row_chi_squared: FloatArray
+    row_chi_squared: FloatArray  # (k,): of each row against the map without all suspects
     # Squared errors of all rows together, as the file has them and with `new_id`; NaN for `drop`.
     chi_squared: float
     mended_chi_squared: float
@@ -134,9 +132,8 @@ def _fit(
     weighting: Weighting,
 ) -> _Fit:
     """The map with these identifiers; discs start at the median of their rows' positions."""
-    graph = graph_of_recording(
-        replace(recording, circles=replace(recording.circles, ids=ids)), camera
-    )
+    circles = replace(recording.circles, ids=ids)
+    graph = graph_of_recording(replace(recording, circles=circles), camera)
     places = apply(start.poses[graph.disc_pose], graph.disc_xy)
     order = np.argsort(graph.disc_index, kind="stable")
     parts = np.split(places[order], np.cumsum(graph.disc_row_counts)[:-1])
@@ -150,38 +147,28 @@ def _misfit(
     recording: Recording, fit: _Fit, rows: IntArray, number: int, at: FloatArray | None = None
 ) -> float:
     """Increase of chi-squared if rows are added to a landmark, a new one near `at` if given."""
-    error, spread, by_new = _innovation(recording, fit, rows, np.full(len(rows), number), at)
-    root = np.linalg.cholesky(spread)
-    error, by_new = np.linalg.solve(root, error), np.linalg.solve(root, by_new)
-    if at is not None:
-        error = error - by_new @ np.linalg.lstsq(by_new, error)[0]
-    return float(error @ error)
-
-
-def _innovation(
-    recording: Recording, fit: _Fit, rows: IntArray, ids: IntArray, at: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whitened errors (2 k,) of rows against a map without them, and their covariance.
-
-    With `at` they show a new landmark near there: the third result (2 k, 2) is the derivative by
-    its position. The camera's mounting is assumed to be known.
-    """
     circles, graph, estimate = recording.circles, fit.graph, fit.estimate
     if at is not None:
-        graph = replace(graph, disc_ids=np.append(graph.disc_ids, ids[0]))
+        graph = replace(graph, disc_ids=np.append(graph.disc_ids, number))
         estimate = replace(estimate, disc_xy=np.vstack([estimate.disc_xy, at]))
     graph = replace(
         graph,
         disc_pose=circles.frame[rows] + 1,
-        disc_index=np.searchsorted(graph.disc_ids, ids),
+        disc_index=np.searchsorted(graph.disc_ids, np.full(len(rows), number)),
         disc_xy=circles.xy[rows],
         disc_whitening=whitening(circles.covariance[rows]),
     )
+    # The camera's mounting is assumed to be known.
     problem = linearise(graph, estimate, fit.weighting)
     first, known = 3 * len(graph.steps), fit.information.shape[0]
-    jacobian = problem.jacobian[first:].toarray()
-    spread = jacobian[:, :known] @ fit.information.solve(jacobian[:, :known].T.copy())
-    return problem.residual[first:], np.eye(len(spread)) + spread, jacobian[:, known:]
+    by_known, by_new = np.split(problem.jacobian[first:].toarray(), [known], axis=1)
+    spread = np.eye(len(by_known)) + by_known @ fit.information.solve(by_known.T.copy())
+    root = np.linalg.cholesky(spread)
+    error = np.linalg.solve(root, problem.residual[first:])
+    if at is not None:
+        by_new = np.linalg.solve(root, by_new)
+        error = error - by_new @ np.linalg.lstsq(by_new, error)[0]
+    return float(error @ error)
 
 
 def _groups(recording: Recording, accused: IntArray) -> list[IntArray]:

@@ -18,16 +18,14 @@ from redetect.slam.recording import LineRows, Recording
 class Graph:
     """The measurements of a run, each with a root of its information.
 
-    A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 that after
-    step k.
+    A whitening W of a covariance C has W C W^T = I. Pose 0 is the start, pose k + 1 after step k.
     """
 
     steps: FloatArray  # (N, 3): odometry (m, m, rad)
     step_whitening: FloatArray  # (N, 3, 3)
     disc_ids: IntArray  # (M,): ascending
-    # (n,): pose of each row, and its disc as an index of `disc_ids`.
-    disc_pose: IntArray
-    disc_index: IntArray
+    disc_pose: IntArray  # (n,): pose of each row
+    disc_index: IntArray  # (n,): its disc, as an index of `disc_ids`
     disc_xy: FloatArray  # (n, 2): measured position in the robot frame (m)
     disc_whitening: FloatArray  # (n, 2, 2)
     line_ids: IntArray  # (K,): of vertical lines, ascending
@@ -39,10 +37,8 @@ class Graph:
     member_line: IntArray
     camera_xy: FloatArray  # (2,): origin of bearings in the robot frame (m)
     camera: Camera | None = None  # as calibrated; needed if the mounting is estimated
-    # (K, 2): priors of lines (m), which bound those that bearings do not determine.
-    line_prior: FloatArray | None = None
-    # Whether discs of all frames may be displaced by a common tilt, part of their covariances.
-    tilted: bool = False
+    line_prior: FloatArray | None = None  # (K, 2): priors of lines (m), if bearings are too few
+    tilted: bool = False  # whether a common tilt, part of the covariances, may displace all discs
 
     @property
     def disc_row_counts(self) -> IntArray:
@@ -96,10 +92,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
 
 
 def with_lines(graph: Graph, rows: LineRows, line_ids: IntArray) -> Graph:
-    """The problem with the bearings of some lines.
-
-    Takes `line_ids` (K,).
-    """
+    """The problem with the bearings of some lines, `line_ids` (K,)."""
     place = {int(number): k for k, number in enumerate(line_ids)}
     usable = [k for k, ids in enumerate(rows.ids) if ids and all(i in place for i in ids)]
     members = [(r, place[i]) for r, k in enumerate(usable) for i in rows.ids[k]]

@@ -12,16 +12,9 @@ from redetect.bounds import Bounded, Positive
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
 from redetect.plane import between
+from redetect.slam import models
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.models import (
-    bearing_jacobians,
-    bearing_of_vertical,
-    between_jacobians,
-    disc_in_robot,
-    disc_jacobians,
-    tilt_jacobian,
-)
 from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
 
 RowErrors = Literal["corrected", "recorded"]
@@ -106,16 +99,9 @@ def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
 def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
     """The function to minimise; infinite if the camera could not see a disc."""
     error = errors(graph, estimate, weighting)
-    loss = Loss(weighting.loss, weighting.loss_scale)
-    return robust_cost(
-        [
-            (error.odometry, Loss()),
-            (error.discs, loss),
-            (error.lines[:, None], loss),
-            (error.prior, Loss()),
-            (error.place, Loss()),
-        ]
-    )
+    plain, loss = Loss(), Loss(weighting.loss, weighting.loss_scale)
+    parts = (error.odometry, error.discs, error.lines[:, None], error.prior, error.place)
+    return robust_cost(zip(parts, (plain, loss, loss, plain, plain)))
 
 
 def linearise(
@@ -123,18 +109,16 @@ def linearise(
 ) -> Linear:
     """The problem linearised at an estimate, with unknowns as in `Layout`; the mounting is shared.
 
-    The mounting changes by a rotation vector in the robot frame, applied from the left, and a
-    translation, restricted to the unknown numbers. `by_tilt`: instead of these, by pitch and roll
-    that all frames share.
+    The unknown numbers of the mounting change by a rotation vector in the robot frame, applied from
+    the left, and a translation; with `by_tilt` pitch and roll of all frames take their place.
     """
     layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
     loss = Loss(weighting.loss, weighting.loss_scale)
-    by_first, by_second = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
+    by_first, by_second = models.between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     step = 3 * np.arange(len(graph.steps), dtype=np.int64)
-    by_pose, by_disc, by_mounting = (
-        graph.disc_whitening @ by for by in _disc_rows(graph, estimate, weighting)[1:]
-    )
+    _, *derivatives = _disc_rows(graph, estimate, weighting)
+    by_pose, by_disc, by_mounting = (graph.disc_whitening @ by for by in derivatives)
     unknown = weighting.unknown_mounting
     by_shared = by_mounting[:, :, unknown] if unknown else None
     if by_tilt:
@@ -169,7 +153,7 @@ def _disc_rows(
     Also their derivatives (n, 2, k) by pose, disc and mounting.
     """
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
-    seen, (by_pose, by_disc) = disc_in_robot(pose, disc), disc_jacobians(pose, disc)
+    seen, (by_pose, by_disc) = models.disc_in_robot(pose, disc), models.disc_jacobians(pose, disc)
     if estimate.mounting is None:
         return seen - graph.disc_xy, by_pose, by_disc, np.zeros((len(seen), 2, 0))
     assert graph.camera is not None
@@ -182,7 +166,7 @@ def _disc_rows(
 
 def rows_by_tilt(graph: Graph) -> FloatArray:
     """(n, 2, 2) derivatives of rows of discs by a tilt about the robot's origin (m / rad)."""
-    return tilt_jacobian(graph.disc_xy) - tilt_jacobian(np.zeros((1, 2)))
+    return models.tilt_jacobian(graph.disc_xy) - models.tilt_jacobian(np.zeros((1, 2)))
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:
@@ -196,9 +180,8 @@ def _bearing_errors(graph: Graph, estimate: Estimate) -> FloatArray:
     if len(graph.line_pose) == 0:
         return np.zeros(0)
     pose, share = _members(graph)
-    bearing = bearing_of_vertical(
-        estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
-    )
+    line_xy = estimate.line_xy[graph.member_line]
+    bearing = models.bearing_of_vertical(estimate.poses[pose], line_xy, graph.camera_xy)
     off = wrap_angle(bearing - graph.bearing_rad[graph.member_row])
     mean = np.bincount(graph.member_row, share * off, minlength=len(graph.line_pose))
     return np.asarray(mean / graph.bearing_sigma_rad)
@@ -210,9 +193,8 @@ def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss
         return []
     layout = layout_of(graph)
     pose, share = _members(graph)
-    by_pose, by_line = bearing_jacobians(
-        estimate.poses[pose], estimate.line_xy[graph.member_line], graph.camera_xy
-    )
+    line_xy = estimate.line_xy[graph.member_line]
+    by_pose, by_line = models.bearing_jacobians(estimate.poses[pose], line_xy, graph.camera_xy)
     scale = (share / graph.bearing_sigma_rad[graph.member_row])[:, None]
     by_pose, by_line = by_pose * scale, by_line * scale
     # The k-th line of each row; rows with fewer lines have none there.

@@ -63,10 +63,7 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
 
 
 def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
-    """Mask of the lines of an estimate whose position the bearings determine.
-
-    Returns (K,).
-    """
+    """(K,) mask of the lines of an estimate whose position the bearings determine."""
     line, row = graph.member_line, graph.member_row
     pose = estimate.poses[graph.line_pose[row]]
     to_line = disc_in_robot(pose, estimate.line_xy[line]) - graph.camera_xy

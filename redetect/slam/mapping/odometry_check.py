@@ -68,14 +68,11 @@ def check_odometry(
     # Of each pose with the next; the first one is known.
     pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
     found, spread = diagonal_blocks(equations, [pairs, (3, np.zeros(1, dtype=np.int64))])
-    by_poses = graph.step_whitening @ np.concatenate(
-        between_jacobians(estimate.poses[:-1], estimate.poses[1:]), axis=2
-    )
+    jacobians = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
+    by_poses = graph.step_whitening @ np.concatenate(jacobians, axis=2)
     first, others = by_poses[:1, :, 3:], by_poses[1:]
-    estimated = sum(
-        float(np.einsum("nij,njk,nik->", by, covariance, by))
-        for by, covariance in ((others, found[0]), (first, found[1]))
-    )
+    parts = ((others, found[0]), (first, found[1]))
+    estimated = sum(float(np.einsum("nij,njk,nik->", by, c, by)) for by, c in parts)
     odometry, rows = 3.0 * count - estimated, expected - 3.0 * count + estimated
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -20,16 +20,14 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landm
 from redetect.least_squares.solver import Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.filtered_start import filtered_poses
+from redetect.slam.filters.ekf_slam import filtered_poses
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
-from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.recording import Recording
-from redetect.tables import plain
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
@@ -42,6 +40,9 @@ _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 Solver = Literal["separable", "gtsam"]
 
+#: The joint covariance of more landmarks than this is not written: it would be gigabytes.
+MOST_LANDMARKS_TOGETHER = 5000
+
 
 @dataclass(frozen=True)
 class ChiSquared:
@@ -51,16 +52,12 @@ class ChiSquared:
     landmarks: int  # n: discs and lines
     steps: int  # t: odometry measurements, the start's pose counted as one
     measurements: int  # m: landmark rows used
-    # Parts of chi-squared.
-    odometry: float
+    odometry: float  # parts of chi-squared
     discs: float
     lines: float
-    # Their sum: squared errors in units of the files' covariances, whatever loss was minimised.
-    chi_squared: float
+    chi_squared: float  # their sum, by the files' covariances, whatever loss was minimised
     expected: int  # dim(z) - dim(x): numbers measured minus numbers estimated
-    # chi_squared / expected: the factor on the variances that would make both equal; NaN without
-    # redundancy.
-    factor: float
+    factor: float  # chi_squared / expected, of the variances; NaN without redundancy
     root: float  # its root: the factor on the standard deviations
 
 
@@ -69,9 +66,8 @@ def chi_squared(
 ) -> ChiSquared:
     """Tabulate the squared errors of an estimate."""
     error = errors(graph, estimate, weighting)
-    odometry, discs, lines = (
-        float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)
-    )
+    parts = (error.odometry, error.discs, error.lines)
+    odometry, discs, lines = (float(np.sum(part**2)) for part in parts)
     total = odometry + discs + lines
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
@@ -112,20 +108,13 @@ def table_lines(table: ChiSquared) -> list[str]:
     return [f"{name:<28}{value:>12}" for name, value in rows]
 
 
-def as_json(table: ChiSquared | OdometryCheck) -> dict[str, float | int | None]:
-    """A table for a JSON file; NaN becomes null."""
-    figures: dict[str, float | int | None] = plain(asdict(table))
-    return figures
-
-
 @dataclass(frozen=True)
 class LeftOut:
     """Rows and landmarks that a map cannot use, or cannot check."""
 
     rows_without_id: int
     discs_seen_once: int  # they are in the map, but nothing checks them
-    # Lines without enough parallax in rows of their own, or whose position is lost later.
-    lines_without_parallax: int
+    lines_without_parallax: int  # in rows of their own, or whose position is lost later
     line_rows: int  # rows of these lines
     line_ids: tuple[int, ...]  # their identifiers
 
@@ -134,8 +123,7 @@ class LeftOut:
 class Mounting:
     """A camera's mounting as estimated from the run."""
 
-    # (6,): rotation vector in the robot frame (rad) and position (m), true minus calibrated.
-    change: FloatArray
+    change: FloatArray  # (6,): rotation vector (rad) and position (m), true minus calibrated
     covariance: FloatArray  # (6, 6), zero for numbers that were not estimated
     robot_from_camera: FloatArray  # (3, 4)
     gain: float  # decrease of the sum of squares from the mounting as calibrated
@@ -183,9 +171,10 @@ class MappedRun:
         joint = joint_covariance(self.graph, self.estimate, self.weighting)
         return replace(self.landmarks, joint_covariance=joint)
 
-    def odometry_check(self) -> OdometryCheck:
-        """Do odometry and rows fit each other?"""
-        return check_odometry(self.graph, self.estimate, self.weighting, self.table.expected)
+    def landmarks_to_write(self) -> LandmarkMap:
+        """The map with its joint covariance, unless that would be gigabytes."""
+        few = len(self.landmarks.discs) + len(self.landmarks.lines) <= MOST_LANDMARKS_TOGETHER
+        return self.landmarks_jointly() if few else self.landmarks
 
 
 def map_run(
@@ -257,7 +246,14 @@ def map_run(
     as_calibrated = trail[-1].costs[-1]
     if wanted.calibrate:
         estimate = keep(descend(graph, estimate, wanted))
-    covariance = marginals(graph, estimate, wanted)
+    covariance, mounting = marginals(graph, estimate, wanted), None
+    if camera and estimate.mounting is not None and covariance.mounting is not None:
+        mounting = Mounting(
+            change=mounting_change(camera, estimate.mounting),
+            covariance=covariance.mounting,
+            robot_from_camera=estimate.mounting,
+            gain=as_calibrated - trail[-1].costs[-1],
+        )
     return MappedRun(
         prefixes=("start", *recording.prefixes),
         graph=graph,
@@ -269,7 +265,7 @@ def map_run(
         left_out=_left_out(recording, graph, placed),
         cost=trail[-1].costs[-1],
         steps=sum(len(solution.costs) - 1 for solution in trail),
-        mounting=_mounting(camera, estimate, covariance, as_calibrated - trail[-1].costs[-1]),
+        mounting=mounting,
     )
 
 
@@ -281,24 +277,21 @@ def _plain(
     If the errors are much larger than their covariances, the start may have been wrong: then also
     from the poses of a filter, and the lower minimum counts.
     """
-    found, error = None, None
+    minima = []
     try:
-        found = solve(graph, begin, Weighting(), tolerance=tolerance)
+        minima.append(solve(graph, begin, Weighting(), tolerance=tolerance))
     except SlamError as raised:
         error = raised
     expected = max(2 * (len(graph.disc_pose) - len(graph.disc_ids)), 1)
-    if found is not None and found.costs[-1] <= _PLAUSIBLE_FACTOR * expected:
-        return found
+    if minima and minima[0].costs[-1] <= _PLAUSIBLE_FACTOR * expected:
+        return minima[0]
     with suppress(SlamError):
         poses = filtered_poses(recording, begin.poses[0])
         again = _in_place(recording, graph, first_sight(graph, poses=poses), name)
-        other = solve(graph, again, Weighting(), tolerance=tolerance)
-        if found is None or other.costs[-1] < found.costs[-1]:
-            found = other
-    if found is None:
-        assert error is not None
+        minima.append(solve(graph, again, Weighting(), tolerance=tolerance))
+    if not minima:
         raise error
-    return found
+    return min(minima, key=lambda minimum: minimum.costs[-1])
 
 
 def _in_place(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
@@ -414,17 +407,4 @@ def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftO
         lines_without_parallax=len(unused),
         line_rows=identified - len(graph.line_pose),
         line_ids=tuple(unused.tolist()),
-    )
-
-
-def _mounting(
-    camera: Camera | None, estimate: Estimate, covariance: Marginals, gain: float
-) -> Mounting | None:
-    if estimate.mounting is None or covariance.mounting is None or camera is None:
-        return None
-    return Mounting(
-        change=mounting_change(camera, estimate.mounting),
-        covariance=covariance.mounting,
-        robot_from_camera=estimate.mounting,
-        gain=gain,
     )

@@ -16,16 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
+from redetect.least_squares import solver
 from redetect.least_squares.covariance import chosen_covariance, diagonal_blocks
-from redetect.least_squares.solver import (
-    Linear,
-    Minimum,
-    NormalEquations,
-    StartError,
-    factor,
-    minimise,
-    normal_equations,
-)
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import (
@@ -50,8 +42,7 @@ class Marginals:
     poses: FloatArray  # (N + 1, 3, 3): zero for the first, which is given
     discs: FloatArray  # (M, 2, 2)
     lines: FloatArray  # (K, 2, 2)
-    # (6, 6): of the rotation vector (rad) and the position (m), zero for known numbers.
-    mounting: FloatArray | None
+    mounting: FloatArray | None  # (6, 6): of rotation vector (rad) and position (m); 0 if known
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +55,7 @@ class _MapProblem:
     def cost(self, at: Estimate) -> float:
         return cost(self.graph, at, self.weighting)
 
-    def linear(self, at: Estimate) -> Linear:
+    def linear(self, at: Estimate) -> solver.Linear:
         return linearise(self.graph, at, self.weighting)
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
@@ -81,7 +72,7 @@ class _MapProblem:
         jacobian = problem.jacobian.tocsc()[:, np.flatnonzero(free)]
         step = np.zeros(layout.size)
         try:
-            normal = factor((jacobian.T @ jacobian).tocsc())
+            normal = solver.factor((jacobian.T @ jacobian).tocsc())
         except np.linalg.LinAlgError:
             return trial, reached
         step[free] = -normal.solve(jacobian.T @ problem.residual)
@@ -92,7 +83,7 @@ class _MapProblem:
 
 def solve(
     graph: Graph, start: Estimate, weighting: Weighting, *, tolerance: float = 1e-10
-) -> Minimum[Estimate]:
+) -> solver.Minimum[Estimate]:
     """Minimise the sum of squared (or robust) whitened errors.
 
     Odometry and first sight are a sufficient start for thousands of poses. The iteration ends at a
@@ -108,14 +99,14 @@ def solve(
     problem = _MapProblem(graph, weighting)
     try:
         with _determined("least squares"):
-            found = minimise(
+            found = solver.minimise(
                 problem,
                 start,
                 tolerance=tolerance,
                 most_steps=_MOST_STEPS,
                 refined=problem.with_best_positions,
             )
-    except StartError:
+    except solver.StartError:
         raise SlamError(
             "least squares cannot begin: the camera as mounted could not see one of the discs"
         ) from None
@@ -138,15 +129,15 @@ def _determined(what: str) -> Iterator[None]:
         ) from None
 
 
-def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> NormalEquations:
+def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> solver.NormalEquations:
     """Normal equations of a map near an estimate, with the considered tilt of all frames.
 
     Covariances of rows do not state how much of their tilt is common to all frames, such as that of
     the camera, but they have to contain it: half of the largest possible variance is assumed.
     """
     if weighting.calibrate or not graph.tilted or not len(graph.disc_xy):
-        return normal_equations(linearise(graph, estimate, weighting))
-    found = normal_equations(linearise(graph, estimate, weighting, by_tilt=True))
+        return solver.normal_equations(linearise(graph, estimate, weighting))
+    found = solver.normal_equations(linearise(graph, estimate, weighting, by_tilt=True))
     spread = np.linalg.norm(np.linalg.inv(graph.disc_whitening), axis=(1, 2))
     most = np.max(np.linalg.norm(rows_by_tilt(graph), axis=(1, 2)) / spread)
     return replace(found, considered=_COMMON_SHARE / most**2 * np.eye(2))

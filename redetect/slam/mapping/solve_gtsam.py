@@ -17,6 +17,7 @@ import numpy as np
 
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Minimum
+from redetect.messages import imported_for
 from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
@@ -26,7 +27,6 @@ from redetect.slam.models import with_heading
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
 _TOLERANCE, _MOST_STEPS = 1e-10, 200
-_MISSING = "--solver gtsam needs GTSAM, which is not installed: pip install 'redetect[slam]'"
 
 
 def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[Estimate]:
@@ -56,18 +56,13 @@ def solve_gtsam(graph: Graph, start: Estimate, weighting: Weighting) -> Minimum[
 
 def load_gtsam() -> Any:
     """GTSAM; `SlamError` if it is not installed."""
-    try:
+    with imported_for("--solver gtsam needs the package gtsam", "slam", SlamError):
         import gtsam
-    except ImportError:
-        raise SlamError(_MISSING) from None
     return gtsam
 
 
 def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
-    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`.
-
-    Pose k has key k, disc j key N + 1 + j.
-    """
+    """GTSAM's graph (`NonlinearFactorGraph`) and initial `Values`: keys of poses, then discs."""
     gtsam = load_gtsam()
     noise = gtsam.noiseModel
     root = noise.Gaussian.SqrtInformation
@@ -89,9 +84,8 @@ def gtsam_problem(graph: Graph, start: Estimate) -> tuple[Any, Any]:
         graph.disc_pose.tolist(), graph.disc_index.tolist(), graph.disc_xy, graph.disc_whitening
     ):
         model = root(whiten, False)
-        factors.add(
-            gtsam.PlanarProjectionFactor2(pose, first_disc + disc, xy, looking_up, lens, model)
-        )
+        key = first_disc + disc
+        factors.add(gtsam.PlanarProjectionFactor2(pose, key, xy, looking_up, lens, model))
     on_floor = root(np.diag([0.0, 0.0, _HEIGHT_ROOT_INFORMATION]), False)
     for j in range(len(graph.disc_ids)):
         factors.add(gtsam.PriorFactorPoint3(first_disc + j, np.zeros(3), on_floor))

@@ -134,6 +134,21 @@ def test_another_radius_is_offered(run: Path, capsys: Captured) -> None:
     assert offered == pytest.approx(0.06, rel=0.02)
 
 
+def test_another_radius_is_offered_although_a_look_alike_is_found(
+    run: Path, published_camera: Camera, capsys: Captured
+) -> None:
+    floor = PaintedFloor(published_camera)
+    for place in PLACES:
+        floor.disc(place, radius_m=0.06)
+    floor.disc((-0.5, -2.6), radius_m=0.1)
+    for path in (run / "images").iterdir():
+        cv2.imwrite(str(path), floor.image(seed=0))
+    assert main(["circles", str(run)]) == 0
+    said = capsys.readouterr()
+    assert "12 discs in 12 frames" in said.out
+    assert number_in(said.err, "radius seems to be") == pytest.approx(0.06, rel=0.02)
+
+
 def test_the_other_polarity_is_offered(run: Path, capsys: Captured) -> None:
     assert main(["circles", str(run), "--radius-m", "0.06", "--polarity", "dark"]) == 0
     assert "--polarity any finds 48 in 12 of the images" in capsys.readouterr().err

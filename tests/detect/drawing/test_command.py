@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.cli import main
-from detect.drawing.frame import draw_rows, line_curves, sigma_bars
+from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bars
 from detect.row_files import SeenRows, read_head
 from detect.seen import Sight
 from detect.settings import CircleSettings
@@ -186,6 +187,34 @@ def test_video_has_a_picture_per_frame(small_run: Path, tmp_path: Path) -> None:
     assert not reader.read()[0]
 
 
+OPENCVS_WRITER = cv2.VideoWriter
+
+
+class FullDisk:
+    """OpenCV's writer of videos, which drops frames silently; its own class has no subclasses."""
+
+    fourcc = OPENCVS_WRITER.fourcc
+
+    def __init__(self) -> None:
+        self._writer = OPENCVS_WRITER()
+        self.open, self.isOpened = self._writer.open, self._writer.isOpened
+        self.release = self._writer.release
+
+    def write(self, image: object) -> None:
+        """Drop a frame."""
+
+
+def test_a_video_that_could_not_be_written_is_none(
+    small_run: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["circles", str(small_run)]) == 0
+    capsys.readouterr()
+    monkeypatch.setattr(cv2, "VideoWriter", FullDisk)
+    draw = ["draw", str(small_run), "--video", str(tmp_path / "v.mp4")]
+    assert_refused(draw, small_run, "No space left on device", capsys)
+    assert not list(tmp_path.glob("*.mp4"))
+
+
 def test_markers_are_drawn_without_a_calibration(small_run: Path, tmp_path: Path) -> None:
     (small_run / "s.cam").unlink()
     corners = "100 50 1 0 1 160 50 1 0 1 160 110 1 0 1 100 110 1 0 1"
@@ -217,6 +246,33 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert video.read_bytes() == b"mine"
     (small_run / "s.cam").unlink()
     assert_refused(["draw", run, "-o", out], small_run, "--camera", capsys)
+
+
+def test_no_picture_is_written_if_one_exists(
+    small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    drawn = tmp_path / "d"
+    drawn.mkdir()
+    (drawn / "s.0002.png").write_bytes(b"mine")
+    circles = ["circles", str(small_run), "--draw", str(drawn)]
+    assert_refused(circles, small_run, "s.0002.png: exists already", capsys)
+    assert main(circles[:2]) == 0
+    capsys.readouterr()
+    assert_refused(["draw", str(small_run), "-o", str(drawn)], small_run, "s.0002.png", capsys)
+    assert [path.name for path in drawn.iterdir()] == ["s.0002.png"]
+
+
+def test_labels_of_verticals_do_not_cover_each_other(published_camera: Camera) -> None:
+    image = np.full((288, 768), 90, np.uint8)
+    rows = [replace(vertical(published_camera, 0.02 * k, 0.01), ids=(k,)) for k in range(4)]
+
+    def orange(*rows: LineLandmark) -> int:
+        frame = Frame(STEP, rows)
+        seen = SeenRows(lines=frame, reference_lines=frame)
+        picture = draw_rows(image, Sight(published_camera), seen, SETTINGS).astype(int)
+        return int(np.sum((picture == SIGMA_COLOUR).all(axis=2)))
+
+    assert orange(*rows) >= 0.97 * sum(orange(row) for row in rows)
 
 
 def test_an_image_that_cannot_be_read_costs_its_frame(

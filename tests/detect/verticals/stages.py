@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from detect.line_settings import DEFAULT, LineNumbers, LineSettings
 from detect.verticals import starts
-from detect.verticals.judgement import Judgement, fit_and_judge
+from detect.verticals.judgement import JudgedTracks, fit_and_judge
 from detect.verticals.refinement import step_filters
 from detect.verticals.response import line_filter, strip_of
 from detect.verticals.starts import LineStarts, StartBand, band_response, start_band
@@ -61,8 +61,8 @@ def judge_tracks(
     table: VerticalTable,
     settings: LineSettings,
     steps: int | None = None,
-    before: Judgement | None = None,
-) -> Judgement:
+    before: JudgedTracks | None = None,
+) -> JudgedTracks:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
     numbers = LineNumbers.of(settings, table.row_aspect)
     filters = step_filters(replace(settings, refine_steps_px=settings.refine_steps_px[:steps]))

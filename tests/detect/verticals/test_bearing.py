@@ -14,7 +14,8 @@ from hypothesis.extra import numpy as hnp
 from camera import Camera
 from detect.verticals.joining import chain_neighbours, join_mixtures
 from detect.verticals.tilt import TiltEstimate, level_matrix
-from redetect.landmarks import LineLandmark, parse_record
+from redetect.landmarks import LineLandmark
+from tests.landmarks.rows import parse_record
 from tests.reference.verticals import (
     close_groups,
     compensated_bearings,

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
-from detect.verticals.tilt import TiltEstimate, agree_on_tilt, gather, level_matrix
+from detect.verticals.tilt import TiltEstimate, agree_on_tilt, group_around_strongest, level_matrix
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import consensus, verticals
@@ -120,7 +120,9 @@ def edges_at(
 ) -> np.ndarray:
     """Edges of lines at bearings in a camera of a thousand pixels per radian."""
     near = np.full(len(place), 1e-3 * DEFAULT.same_edge_px)
-    return gather(place, near, evidence, np.ones(len(place)) if polarity is None else polarity)
+    return group_around_strongest(
+        place, near, evidence, np.ones(len(place)) if polarity is None else polarity
+    )
 
 
 def test_lines_of_one_edge_tell_as_much_as_one() -> None:

@@ -14,7 +14,7 @@ from detect.verticals.tilt import (
     STRAY_RAD,
     TOGETHER_RAD,
     TiltEstimate,
-    gather,
+    group_around_strongest,
     merge_lines,
     with_error,
 )
@@ -136,7 +136,7 @@ def test_lines_are_gathered_round_the_strongest() -> None:
     bearing = np.array([0.0, 0.5, 0.1, 0.2, 0.9]) * TOGETHER_RAD * 2.0
     weight = np.array([1.0, 4.0, 3.0, 2.0, 5.0])
 
-    group = gather(bearing, np.full(5, TOGETHER_RAD), weight, np.zeros(5))
+    group = group_around_strongest(bearing, np.full(5, TOGETHER_RAD), weight, np.zeros(5))
 
     np.testing.assert_array_equal(group, [0, 1, 0, 0, 1])
 

@@ -16,13 +16,13 @@ from redetect.groundtruth.fusion.fuse import fuse
 from redetect.groundtruth.fusion.inputs import noise_of
 from redetect.groundtruth.fusion.movement import movement_problem
 from redetect.groundtruth.settings import FuseSettings
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import log_motion
 from tests.groundtruth.fusion.drives import (
@@ -39,7 +39,7 @@ FloatArray = NDArray[np.float64]
 def arc_ends(arcs: FloatArray) -> FloatArray:
     """(N, 3) where constant rates lead within one unit of time."""
     flat = np.zeros(len(arcs))
-    ends = exp_se3(np.column_stack([arcs[:, 0], arcs[:, 1], flat, flat, flat, arcs[:, 2]]))
+    ends = se3.exp(np.column_stack([arcs[:, 0], arcs[:, 1], flat, flat, flat, arcs[:, 2]]))
     return np.column_stack([ends[:, 0, 3], ends[:, 1, 3], np.arctan2(ends[:, 1, 0], ends[:, 0, 0])])
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from redetect.groundtruth.fusion.kernels import STATE, arc_integrals, predict
 from redetect.groundtruth.fusion.movement import movement_problem
 from redetect.groundtruth.settings import FuseSettings
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
-from redetect.groundtruth.trajectories.transforms import exp_se3
 from redetect.landmarks import wrap_angle
 from redetect.plane import between, compose, log_motion
 
@@ -50,7 +50,7 @@ def moved(
 
 
 def planar_exp(twist: FloatArray) -> FloatArray:
-    full = exp_se3(np.array([twist[0], twist[1], 0.0, 0.0, 0.0, twist[2]]))
+    full = se3.exp(np.array([twist[0], twist[1], 0.0, 0.0, 0.0, twist[2]]))
     return np.array([full[0, 3], full[1, 3], math.atan2(full[1, 0], full[0, 0])])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -190,3 +191,13 @@ def test_the_map_of_a_session_is_found(tmp_path: Path) -> None:
     assert find_building(tmp_path).name == "building.csv"
     with pytest.raises(GroundTruthError, match="no such file"):
         read_building(tmp_path / "other.csv")
+
+
+def test_without_ezdxf_it_is_said_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_drawing(tmp_path / "building.dxf", np.array([[0.0, 0.0, 4.0, 0.0]]))
+    for name in ("ezdxf", "ezdxf.enums", "ezdxf.filemanagement"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(GroundTruthError, match=r"pip install 'redetect\[dxf\]'"):
+        read_building(tmp_path / "building.dxf")

@@ -12,12 +12,7 @@ from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_
 from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.markers.session import MarkerFrame, Network, Rig
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import (
-    apply,
-    exp_se3,
-    inverse,
-    transform,
-)
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 from tools.simulator.driving import planar_transform
 
@@ -44,7 +39,7 @@ def looking_at(position: FloatArray, target: FloatArray) -> FloatArray:
     z /= np.linalg.norm(z)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
-    return transform(np.stack([x, np.cross(z, x), z], axis=1), position)
+    return se3.transform(np.stack([x, np.cross(z, x), z], axis=1), position)
 
 
 def hall_cameras(count: int) -> FloatArray:
@@ -67,7 +62,7 @@ def box_rig(count: int = 6, width_m: float = 0.24) -> Rig:
         right = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         rotation = np.stack([right, np.cross(out, right), out], axis=1)
         centre = [distance * np.cos(yaw), distance * np.sin(yaw), height]
-        poses.append(transform(rotation, centre))
+        poses.append(se3.transform(rotation, centre))
     ids = tuple(range(31, 31 + count))
     return Rig(
         "rawseeds",
@@ -91,13 +86,13 @@ def visible(
     for c, camera in enumerate(cameras):
         for m in range(len(rig.ids)):
             camera_from_marker = (
-                inverse(world_from_camera[c]) @ world_from_robot @ rig.robot_from_marker[m]
+                se3.inverse(world_from_camera[c]) @ world_from_robot @ rig.robot_from_marker[m]
             )
             centre = camera_from_marker[:3, 3]
             towards = -camera_from_marker[:3, 2] @ centre / np.linalg.norm(centre)
             if towards < np.cos(np.radians(steepest_deg)):
                 continue
-            pixels = camera.project(apply(camera_from_marker, rig.corners[m]))
+            pixels = camera.project(se3.apply(camera_from_marker, rig.corners[m]))
             if np.all((pixels > 2) & (pixels < [camera.width - 3, camera.height - 3])):
                 found.append((c, m))
     return found
@@ -172,7 +167,7 @@ def robot_pose(generator: np.random.Generator, extent_m: float = 1.0) -> FloatAr
     x, y = generator.uniform(-extent_m, extent_m, 2)
     level = planar_transform(float(x), float(y), float(generator.uniform(-np.pi, np.pi)))
     tilt = np.concatenate([[0, 0, generator.normal(0, 0.01)], generator.normal(0, 0.01, 2), [0]])
-    return np.asarray(level @ exp_se3(tilt))
+    return np.asarray(level @ se3.exp(tilt))
 
 
 def marker_rows(

@@ -17,7 +17,7 @@ from redetect.groundtruth.markers.adjustment import (
     adjust_bundle,
     linearised,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, inverse, log_se3
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import (
     box_rig,
     hall_cameras,
@@ -68,17 +68,17 @@ def watched_robot(
 
     def disturbed(poses: FloatArray, free: NDArray[np.bool_]) -> FloatArray:
         steps = generator.normal(0.0, off, (len(poses), 6)) * free[:, None]
-        return np.asarray(poses @ exp_se3(steps))
+        return np.asarray(poses @ se3.exp(steps))
 
     of_parts = [False] + [free_parts] * (len(rig.ids) - 1)
     free = np.array([False, *[free_cameras] * 3, *of_parts, *[free_bodies] * times])
     parts, body = 4, 4 + len(rig.ids)
     priors: list[PosePrior] = []
     if free_cameras:
-        known = world_from_camera[2] @ exp_se3(generator.normal(0.0, 1e-3, 6))
+        known = world_from_camera[2] @ se3.exp(generator.normal(0.0, 1e-3, 6))
         priors.append(PosePrior(2, known, 1e-6 * np.diag([1, 2, 3, 1, 1, 1.0])))
     if free_parts:
-        known = rig.robot_from_marker[3] @ exp_se3(generator.normal(0.0, 1e-3, 6))
+        known = rig.robot_from_marker[3] @ se3.exp(generator.normal(0.0, 1e-3, 6))
         priors.append(PosePrior(parts + 3, known, 1e-6 * np.eye(6)))
     if free_bodies:
         priors.append(PosePrior(body + 4, bodies[4], 1e-6 * np.eye(6)))
@@ -132,7 +132,7 @@ def test_the_minimum_and_the_covariances_are_scipys() -> None:
         (bundle.world_from_body, best.world_from_body),
         (bundle.body_from_part, best.body_from_part),
     ):
-        np.testing.assert_allclose(log_se3(inverse(theirs) @ mine), 0.0, atol=3e-7)
+        np.testing.assert_allclose(se3.log(se3.inverse(theirs) @ mine), 0.0, atol=3e-7)
     jacobian = dense_jacobian(bundle)
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     sigmas = np.sqrt(np.diagonal(covariance))

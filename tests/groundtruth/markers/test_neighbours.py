@@ -10,14 +10,14 @@ from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import RefinedPose
 from redetect.groundtruth.markers.track import choose_candidates
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import exp_se3
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import hall_cameras, pose_problem
 from tools.simulator.driving import planar_transform
 
 FloatArray = NDArray[np.float64]
 
 COVARIANCE = np.diag([0.01, 0.01, 0.01, 0.02, 0.02, 0.02]) ** 2
-FLIP = exp_se3(np.array([0.0, 0.0, 0.0, 0.5, 0.3, 0.0]))
+FLIP = se3.exp(np.array([0.0, 0.0, 0.0, 0.5, 0.3, 0.0]))
 
 
 def estimate(*poses: FloatArray, odds: float = 0.5) -> PoseEstimate:

@@ -30,7 +30,7 @@ from redetect.groundtruth.markers.network_estimation import (
     hand_eye,
 )
 from redetect.groundtruth.settings import NetworkSettings
-from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse, log_se3, transform
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import hall_cameras, lens
 
 FloatArray = NDArray[np.float64]
@@ -38,8 +38,8 @@ FloatArray = NDArray[np.float64]
 NAMES = ("a", "b", "c", "d")
 BOARD = Board("checkerboard", 7, 6, 0.08)
 BOARDS = {"first": BOARD, "second": BOARD, "world": Board("checkerboard", 9, 6, 0.12)}
-OFFSET = exp_se3(np.array([0.02, -0.01, -0.03, 0.02, 3.1, 0.03]))  # back to back
-WORLD = exp_se3(np.array([-0.6, -0.4, 0.0, 0.0, 0.0, 0.4]))
+OFFSET = se3.exp(np.array([0.02, -0.01, -0.03, 0.02, 3.1, 0.03]))  # back to back
+WORLD = se3.exp(np.array([-0.6, -0.4, 0.0, 0.0, 0.0, 0.4]))
 
 
 def facing(place: FloatArray, towards: FloatArray, generator: np.random.Generator) -> FloatArray:
@@ -48,8 +48,8 @@ def facing(place: FloatArray, towards: FloatArray, generator: np.random.Generato
     z /= np.linalg.norm(z)
     x = np.cross([0.0, 0.0, 1.0], z)
     x /= np.linalg.norm(x)
-    turn = exp_se3(np.concatenate([np.zeros(5), [generator.normal(0, 0.4)]]))
-    return np.asarray(transform(np.stack([x, np.cross(z, x), z], axis=1), place) @ turn)
+    turn = se3.exp(np.concatenate([np.zeros(5), [generator.normal(0, 0.4)]]))
+    return np.asarray(se3.transform(np.stack([x, np.cross(z, x), z], axis=1), place) @ turn)
 
 
 def seen(
@@ -57,10 +57,10 @@ def seen(
 ) -> BoardView | None:
     """The board in the camera's image; None if it is not whole or not from its printed side."""
     number = NAMES.index(camera)
-    camera_from_board = inverse(hall_cameras(4)[number]) @ pose
+    camera_from_board = se3.inverse(hall_cameras(4)[number]) @ pose
     if -camera_from_board[:3, 2] @ camera_from_board[:3, 3] < 0.3 * camera_from_board[2, 3]:
         return None
-    pixels = lens().project(apply(camera_from_board, BOARDS[board].points))
+    pixels = lens().project(se3.apply(camera_from_board, BOARDS[board].points))
     if not np.all((pixels > 5) & (pixels < [1274, 954])):
         return None
     return BoardView(camera, board, pixels + generator.normal(0, sigma_px, pixels.shape))
@@ -104,7 +104,7 @@ def estimated(
 
 
 def errors_of(estimate: NetworkEstimate) -> FloatArray:
-    return log_se3(inverse(hall_cameras(4)) @ estimate.world_from_camera)
+    return se3.log(se3.inverse(hall_cameras(4)) @ estimate.world_from_camera)
 
 
 def test_the_network_comes_back_without_noise() -> None:
@@ -125,7 +125,7 @@ def test_its_covariance_is_true(kind: str) -> None:
     for seed in range(draws):
         found = shots(0.15, 10 + seed, per_pair=3)
         offset: FloatArray | None = {"known": OFFSET, "unknown": None}.get(
-            kind, OFFSET @ exp_se3(sigmas * generator.normal(size=6))
+            kind, OFFSET @ se3.exp(sigmas * generator.normal(size=6))
         )
         estimate = estimated(found, offset, sigmas if kind == "measured" else None, sigma_px=0.15)
         error = errors_of(estimate).ravel()
@@ -161,9 +161,9 @@ def test_what_does_not_determine_a_network_is_refused() -> None:
 
 def test_hand_eye_finds_the_common_transform() -> None:
     generator = np.random.default_rng(7)
-    truth = exp_se3(generator.normal(size=6))
-    left = exp_se3(generator.normal(size=(5, 6)))
-    found = hand_eye(left, inverse(truth) @ left @ truth)
+    truth = se3.exp(generator.normal(size=6))
+    left = se3.exp(generator.normal(size=(5, 6)))
+    found = hand_eye(left, se3.inverse(truth) @ left @ truth)
     np.testing.assert_allclose(found, truth, atol=1e-10)
 
 
@@ -177,7 +177,7 @@ def painted(board: Board, camera: Camera, pose: FloatArray) -> NDArray[np.uint8]
     pixels = np.stack([(columns + 0.5) / fine - 0.5, (rows + 0.5) / fine - 0.5], axis=-1)
     rays = camera.unproject(pixels)
     # Where the rays meet the board's plane, in its own coordinates.
-    board_from_camera = inverse(pose)
+    board_from_camera = se3.inverse(pose)
     directions = rays @ board_from_camera[:3, :3].T
     along = -board_from_camera[2, 3] / directions[..., 2]
     xy = board_from_camera[:2, 3] + along[..., None] * directions[..., :2]
@@ -200,13 +200,13 @@ def test_corners_come_in_the_boards_order_however_it_is_held(
     board = Board("checkerboard", 7, 6, 0.08)
     facing_camera = np.diag([1.0, -1.0, -1.0, 1.0])
     facing_camera[:3, 3] = [0.02, -0.03, 0.9]
-    pose = facing_camera @ exp_se3(np.array([0, 0, 0, 0.3, -0.25, 0.0]))
-    pose = pose @ exp_se3(np.array([0, 0, 0, 0, 0, np.radians(turn_deg)]))
+    pose = facing_camera @ se3.exp(np.array([0, 0, 0, 0.3, -0.25, 0.0]))
+    pose = pose @ se3.exp(np.array([0, 0, 0, 0, 0, np.radians(turn_deg)]))
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), painted(board, camera, pose))
     image = BoardImage("a", "first", 0, path)
     corners = find_boards(image, board, camera).corners
-    expected = camera.project(apply(pose, board.points))
+    expected = camera.project(se3.apply(pose, board.points))
     assert np.abs(corners - expected).max() < 0.3
     if turn_deg == 0.0:
         with pytest.raises(GroundTruthError, match="no checkerboard of 9 x 4"):

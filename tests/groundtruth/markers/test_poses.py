@@ -15,10 +15,7 @@ from redetect.groundtruth.markers.adjustment import ChainPoints
 from redetect.groundtruth.markers.poses import PoseEstimate, estimate_pose
 from redetect.groundtruth.markers.refinement import PoseProblem
 from redetect.groundtruth.settings import PoseSettings, Solver
-from redetect.groundtruth.trajectories.transforms import (
-    inverse,
-    log_se3,
-)
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import box_rig, hall_cameras, pose_problem, robot_pose
 from tools.simulator.driving import planar_transform
 
@@ -34,7 +31,7 @@ def with_pixels(problem: PoseProblem, pixels: FloatArray) -> PoseProblem:
 
 
 def error_of(pose: FloatArray, truth: FloatArray) -> float:
-    return float(np.abs(log_se3(inverse(truth) @ pose)).max())
+    return float(np.abs(se3.log(se3.inverse(truth) @ pose)).max())
 
 
 SETTINGS = PoseSettings()
@@ -95,7 +92,7 @@ def test_the_planar_ambiguity_occurs_and_is_reported() -> None:
         wrong += best != 0
         if estimate.ambiguous:
             first, second = (c.world_from_robot for c in estimate.candidates[:2])
-            assert np.linalg.norm(log_se3(inverse(first) @ second)[3:]) > 0.1
+            assert np.linalg.norm(se3.log(se3.inverse(first) @ second)[3:]) > 0.1
             assert estimate.log_odds[0] == 0.0 <= estimate.log_odds[1] < np.log(1000.0)
     assert np.median(nearest) < 0.1
     assert max(nearest) < 0.3

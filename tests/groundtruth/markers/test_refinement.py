@@ -23,16 +23,7 @@ from redetect.groundtruth.markers.refinement import (
     refine_pose,
 )
 from redetect.groundtruth.settings import Solver
-from redetect.groundtruth.trajectories.transforms import (
-    composed_covariance,
-    exp_se3,
-    heading,
-    inverse,
-    inverse_covariance,
-    log_se3,
-    planar_covariance,
-    planar_jacobian,
-)
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import (
     box_rig,
     hall_cameras,
@@ -46,7 +37,7 @@ FloatArray = NDArray[np.float64]
 
 
 def planar(pose: FloatArray) -> FloatArray:
-    return np.array([pose[0, 3], pose[1, 3], heading(pose)])
+    return np.array([pose[0, 3], pose[1, 3], se3.heading(pose)])
 
 
 # -- Jacobians ------------------------------------------------------------------------------
@@ -77,7 +68,7 @@ def test_the_chains_jacobians_are_its_derivatives() -> None:
             moved = []
             for sign in (1.0, -1.0):
                 changed = dict(poses)
-                changed[name] = poses[name] @ exp_se3(sign * step * np.eye(6)[k])
+                changed[name] = poses[name] @ se3.exp(sign * step * np.eye(6)[k])
                 moved.append(project(changed))
             numeric = (moved[0] - moved[1]) / (2.0 * step)
             np.testing.assert_allclose(analytic[..., k], numeric, rtol=1e-5, atol=2e-3)
@@ -87,28 +78,28 @@ def test_the_planes_jacobians_are_derivatives() -> None:
     generator = np.random.default_rng(3)
     step = 1e-6
     for _ in range(20):
-        pose = exp_se3(generator.normal(0.0, 0.4, 6))
-        to_plane = planar_jacobian(pose)
+        pose = se3.exp(generator.normal(0.0, 0.4, 6))
+        to_plane = se3.planar_jacobian(pose)
         for k in range(6):
-            ahead = pose @ exp_se3(step * np.eye(6)[k])
-            behind = pose @ exp_se3(-step * np.eye(6)[k])
+            ahead = pose @ se3.exp(step * np.eye(6)[k])
+            behind = pose @ se3.exp(-step * np.eye(6)[k])
             numeric = (planar(ahead) - planar(behind)) / (2 * step)
             np.testing.assert_allclose(numeric, to_plane[:, k], atol=1e-8)
 
 
 def test_covariances_of_composed_and_inverse_poses() -> None:
     generator = np.random.default_rng(4)
-    a, b = exp_se3(generator.normal(size=(2, 6)))
+    a, b = se3.exp(generator.normal(size=(2, 6)))
     root_a, root_b = generator.normal(0, 1e-3, (2, 6, 6))
     draws = 40000
-    moved_a = a @ exp_se3(generator.normal(size=(draws, 6)) @ root_a.T)
-    moved_b = b @ exp_se3(generator.normal(size=(draws, 6)) @ root_b.T)
+    moved_a = a @ se3.exp(generator.normal(size=(draws, 6)) @ root_a.T)
+    moved_b = b @ se3.exp(generator.normal(size=(draws, 6)) @ root_b.T)
     for sample, expected in (
         (
-            log_se3(inverse(a @ b) @ moved_a @ moved_b),
-            composed_covariance(root_a @ root_a.T, b, root_b @ root_b.T),
+            se3.log(se3.inverse(a @ b) @ moved_a @ moved_b),
+            se3.composed_covariance(root_a @ root_a.T, b, root_b @ root_b.T),
         ),
-        (log_se3(a @ inverse(moved_a)), inverse_covariance(a, root_a @ root_a.T)),
+        (se3.log(a @ se3.inverse(moved_a)), se3.inverse_covariance(a, root_a @ root_a.T)),
     ):
         scale = np.sqrt(np.diagonal(expected))
         empirical = np.cov(sample.T) / np.outer(scale, scale)
@@ -143,7 +134,7 @@ def test_every_solver_recovers_the_pose_exactly(solver: Solver, cameras: int, ma
 
 def test_both_solutions_of_a_single_marker_are_given_the_better_first() -> None:
     corners = box_rig(1).corners[0]
-    pose = np.diag([1.0, -1.0, -1.0, 1.0]) @ exp_se3(np.array([0, 0, 0, 0.4, 0.2, 0.1]))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0]) @ se3.exp(np.array([0, 0, 0, 0.4, 0.2, 0.1]))
     pose[:3, 3] = [0.2, -0.1, 4.0]
     camera = lens()
     pixels = camera.project(corners @ pose[:3, :3].T + pose[:3, 3])
@@ -163,7 +154,7 @@ def test_what_is_no_pose_is_refused() -> None:
     with pytest.raises(GeometryError, match="lens sees nothing"):
         solve_camera(folding, square, np.full((4, 2), 1e5))
     problem = pose_problem(robot_pose(np.random.default_rng(6)), cameras=2)
-    behind = problem.network.world_from_camera[0] @ exp_se3(np.array([0, 0, -3.0, 0, 0, 0]))
+    behind = problem.network.world_from_camera[0] @ se3.exp(np.array([0, 0, -3.0, 0, 0, 0]))
     with pytest.raises(GeometryError, match="behind its camera"):
         refine_pose(problem, behind)
 
@@ -187,10 +178,10 @@ def normalised_errors(
     for _ in range(draws):
         truth = robot_pose(generator)
         true = pose_problem(truth, cameras=cameras, noise=generator, sigma_px=0.15)
-        moved_rig = rig.robot_from_marker @ exp_se3(
+        moved_rig = rig.robot_from_marker @ se3.exp(
             (marker_factor @ generator.normal(size=36)).reshape(6, 6)
         )
-        moved_cameras = true.network.world_from_camera @ exp_se3(
+        moved_cameras = true.network.world_from_camera @ se3.exp(
             generator.normal(size=(cameras, 6)) * sigmas
         )
         believed = replace(
@@ -199,11 +190,11 @@ def normalised_errors(
             rig=replace(rig, robot_from_marker=moved_rig, covariance=marker_covariance),
         )
         result = refine_pose(believed, truth)
-        error = log_se3(inverse(truth) @ result.world_from_robot)
+        error = se3.log(se3.inverse(truth) @ result.world_from_robot)
         squares.append(error @ np.linalg.solve(result.covariance, error))
         difference = planar(result.world_from_robot) - planar(truth)
         difference[2] = (difference[2] + np.pi) % (2 * np.pi) - np.pi
-        covariance = planar_covariance(result.world_from_robot, result.covariance)
+        covariance = se3.planar_covariance(result.world_from_robot, result.covariance)
         plane.append(difference @ np.linalg.solve(covariance, difference))
         costs.append(result.cost / result.degrees_of_freedom)
     return np.array(squares), np.array(plane), np.array(costs)
@@ -234,10 +225,10 @@ def test_without_the_calibrations_uncertainty_the_error_is_underestimated() -> N
     for _ in range(50):
         truth = robot_pose(generator)
         true = pose_problem(truth, cameras=2, noise=generator)
-        moved = true.rig.robot_from_marker @ exp_se3(generator.normal(0, 5e-3, (6, 6)))
+        moved = true.rig.robot_from_marker @ se3.exp(generator.normal(0, 5e-3, (6, 6)))
         believed = replace(true, rig=replace(true.rig, robot_from_marker=moved))
         result = refine_pose(believed, truth)
-        error = log_se3(inverse(truth) @ result.world_from_robot)
+        error = se3.log(se3.inverse(truth) @ result.world_from_robot)
         squares.append(error @ np.linalg.solve(result.covariance, error))
     assert np.mean(squares) > 5 * 6
 
@@ -266,7 +257,7 @@ def test_a_bad_view_has_little_say(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def error() -> float:
         result = refine_pose(spoilt, truth)
-        return float(np.linalg.norm(log_se3(inverse(truth) @ result.world_from_robot)))
+        return float(np.linalg.norm(se3.log(se3.inverse(truth) @ result.world_from_robot)))
 
     robust = error()
     monkeypatch.setattr(refinement, "_HUBER", np.inf)

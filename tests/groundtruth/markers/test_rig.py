@@ -23,12 +23,7 @@ from redetect.groundtruth.markers.rig_estimation import (
 from redetect.groundtruth.markers.session import MarkerFrame, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.groundtruth.settings import RigSettings
-from redetect.groundtruth.trajectories.transforms import (
-    exp_se3,
-    inverse,
-    log_se3,
-    mean_pose,
-)
+from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import (
     box_rig,
     frames_of,
@@ -97,11 +92,11 @@ def estimated(
 
 def truth_in(rig: Rig, reference: int) -> FloatArray:
     root = rig.ids.index(reference)
-    return inverse(rig.robot_from_marker[root]) @ rig.robot_from_marker
+    return se3.inverse(rig.robot_from_marker[root]) @ rig.robot_from_marker
 
 
 def normalised_error(estimate: RigEstimate, rig: Rig, covariance: FloatArray) -> tuple[float, int]:
-    error = log_se3(inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
+    error = se3.log(se3.inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
     free = np.repeat(np.array(rig.ids) != estimate.reference, 6)
     vector = error.ravel()[free]
     return float(vector @ np.linalg.solve(covariance[np.ix_(free, free)], vector)), int(free.sum())
@@ -151,24 +146,24 @@ def test_wrong_solutions_of_small_markers_do_not_reach_the_rig() -> None:
     assert second > 10  # it does happen
     square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
     assert square / dof < 2.5
-    error = log_se3(inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
+    error = se3.log(se3.inverse(truth_in(rig, estimate.reference)) @ estimate.rig.robot_from_marker)
     assert np.abs(error).max() < 0.03
 
 
 def test_a_consensus_stands_thirty_percent_of_flipped_solutions() -> None:
     generator = np.random.default_rng(4)
-    truth = exp_se3(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
+    truth = se3.exp(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
     sigma = np.array([0.003, 0.003, 0.01, 0.02, 0.02, 0.01])
     covariance = np.diag(sigma**2)
     for flipped in (0.3, 0.45):
         times = []
         for _ in range(60):
-            near = truth @ exp_se3(sigma * generator.normal(size=6))
+            near = truth @ se3.exp(sigma * generator.normal(size=6))
             # A mirror image depends on where the camera stood: everywhere else.
-            flip = near @ exp_se3(
+            flip = near @ se3.exp(
                 np.concatenate([generator.normal(0, 0.05, 3), generator.normal(0, 0.6, 3)])
             )
-            others = [near @ exp_se3(generator.normal(0, 0.5, 6)) for _ in range(2)]
+            others = [near @ se3.exp(generator.normal(0, 0.5, 6)) for _ in range(2)]
             first_is_wrong = generator.random() < flipped
             poses = np.stack(
                 [flip if first_is_wrong else near, near if first_is_wrong else flip, *others]
@@ -177,7 +172,7 @@ def test_a_consensus_stands_thirty_percent_of_flipped_solutions() -> None:
                 MarkerPose(poses, np.tile(covariance, (4, 1, 1)), np.array([1.0, 2.0, 4.0, 6.0]))
             )
         consensus = pair_consensus(times)
-        error = log_se3(inverse(truth) @ consensus.a_from_b)
+        error = se3.log(se3.inverse(truth) @ consensus.a_from_b)
         assert np.all(np.abs(error) < 4 * sigma / np.sqrt(60) + 1e-3)
         assert consensus.support >= 57
         assert 0.55 - flipped < consensus.first.mean() < 1.15 - flipped
@@ -186,14 +181,14 @@ def test_a_consensus_stands_thirty_percent_of_flipped_solutions() -> None:
 def test_a_consensus_stands_misread_markers() -> None:
     """Times without any right estimate are outvoted and said not to agree."""
     generator = np.random.default_rng(5)
-    truth = exp_se3(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
+    truth = se3.exp(np.array([0.3, 0.1, -0.2, 0.4, 1.2, -0.3]))
     covariance = np.tile(np.diag(np.full(6, 0.01) ** 2), (1, 1, 1))
     times = [
         MarkerPose(
             (
-                exp_se3(generator.normal(0, 1.0, 6))
+                se3.exp(generator.normal(0, 1.0, 6))
                 if i % 3 == 0
-                else truth @ exp_se3(generator.normal(0, 0.01, 6))
+                else truth @ se3.exp(generator.normal(0, 0.01, 6))
             )[None],
             covariance,
             np.zeros(1),
@@ -206,12 +201,12 @@ def test_a_consensus_stands_misread_markers() -> None:
 
 def test_estimates_of_a_pair_are_all_combinations() -> None:
     generator = np.random.default_rng(6)
-    poses = exp_se3(generator.normal(size=(4, 6)))
+    poses = se3.exp(generator.normal(size=(4, 6)))
     covariances = np.tile(np.eye(6) * 1e-4, (2, 1, 1))
     a = MarkerPose(poses[:2], covariances, np.array([1.0, 3.0]))
     b = MarkerPose(poses[2:], covariances, np.array([0.0, 5.0]))
     pairs = pair_estimates(a, b)
-    np.testing.assert_allclose(pairs.poses[2], inverse(poses[1]) @ poses[2], atol=1e-12)
+    np.testing.assert_allclose(pairs.poses[2], se3.inverse(poses[1]) @ poses[2], atol=1e-12)
     np.testing.assert_array_equal(pairs.costs, [1.0, 6.0, 3.0, 8.0])
 
 
@@ -251,7 +246,7 @@ def test_a_misread_marker_is_left_out_of_the_adjustment() -> None:
     clean = estimated(walk_round(rig, 30, seed=10), rig)
     estimate = estimated(groups, rig)
     assert not estimate.adjusted.used.all()
-    error = log_se3(inverse(clean.rig.robot_from_marker) @ estimate.rig.robot_from_marker)
+    error = se3.log(se3.inverse(clean.rig.robot_from_marker) @ estimate.rig.robot_from_marker)
     assert np.abs(error).max() < 2e-3
 
 
@@ -285,7 +280,7 @@ def test_cameras_of_a_network_see_the_rig_together() -> None:
 
 def frame_error(estimate: RigEstimate, rig: Rig, known: tuple[int, ...] = ()) -> float:
     """Normalised error squared per degree of freedom of all markers but the known ones."""
-    error = log_se3(inverse(rig.robot_from_marker) @ estimate.rig.robot_from_marker)
+    error = se3.log(se3.inverse(rig.robot_from_marker) @ estimate.rig.robot_from_marker)
     free = np.repeat(~np.isin(rig.ids, known), 6)
     vector = error.ravel()[free]
     covariance = estimate.adjusted.part_covariance[np.ix_(free, free)]
@@ -315,7 +310,7 @@ def test_several_measured_markers_define_the_frame_together() -> None:
     groups = walk_round(rig, 40, seed=13)
     measured = replace(
         rig,
-        robot_from_marker=rig.robot_from_marker @ exp_se3(sigmas * generator.normal(size=(6, 6))),
+        robot_from_marker=rig.robot_from_marker @ se3.exp(sigmas * generator.normal(size=(6, 6))),
         covariance=np.diag(np.tile(sigmas**2, 6)),
     )
     moved = estimated(groups, rig, known=measured)
@@ -327,22 +322,22 @@ def test_several_measured_markers_define_the_frame_together() -> None:
 
 def test_the_tree_prefers_support() -> None:
     pairs = {(0, 1): 5, (0, 2): 50, (1, 2): 40, (3, 4): 9}
-    poses = exp_se3(np.random.default_rng(4).normal(size=(3, 6)))
-    relative = {(a, b): inverse(poses[a]) @ poses[b] for a, b in ((0, 2), (1, 2))}
+    poses = se3.exp(np.random.default_rng(4).normal(size=(3, 6)))
+    relative = {(a, b): se3.inverse(poses[a]) @ poses[b] for a, b in ((0, 2), (1, 2))}
     relative |= {(0, 1): np.eye(4), (3, 4): np.eye(4)}
     found = chained_poses(relative, pairs, 5, 0)
-    np.testing.assert_allclose(found[:3], inverse(poses[0]) @ poses, atol=1e-12)
+    np.testing.assert_allclose(found[:3], se3.inverse(poses[0]) @ poses, atol=1e-12)
     assert np.all(np.isnan(found[3:]))
 
 
 def test_the_mean_of_poses_weights_by_covariance() -> None:
     generator = np.random.default_rng(15)
-    truth = exp_se3(generator.normal(size=6))
+    truth = se3.exp(generator.normal(size=6))
     roots = generator.normal(0, 0.01, (400, 6, 6))
-    poses = np.stack([truth @ exp_se3(root @ generator.normal(size=6)) for root in roots])
+    poses = np.stack([truth @ se3.exp(root @ generator.normal(size=6)) for root in roots])
     covariances = roots @ roots.transpose(0, 2, 1) + 1e-9 * np.eye(6)
-    mean, covariance = mean_pose(poses, covariances)
-    error = log_se3(inverse(truth) @ mean)
+    mean, covariance = se3.mean_pose(poses, covariances)
+    error = se3.log(se3.inverse(truth) @ mean)
     assert error @ np.linalg.solve(covariance, error) < 25.0
 
 

@@ -23,7 +23,7 @@ from redetect.groundtruth.markers.session import (
 )
 from redetect.groundtruth.markers.track import excess_of, report_entry, track_by_markers
 from redetect.groundtruth.settings import PoseSettings
-from redetect.groundtruth.trajectories.transforms import inverse, log_se3
+from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerCorner
 from tests.groundtruth.markers.scene import (
     box_rig,
@@ -135,7 +135,7 @@ def test_every_time_is_accounted_for() -> None:
             assert len(entry["candidates"]) > 1
             assert entry["margin"] > np.log(1000.0)
         if tracked.pose is not None:
-            wrong = np.linalg.norm(log_se3(inverse(truth) @ tracked.pose.world_from_robot)[3:])
+            wrong = np.linalg.norm(se3.log(se3.inverse(truth) @ tracked.pose.world_from_robot)[3:])
             assert np.degrees(wrong) < 10.0
     planar = track.planar()
     assert len(planar) == sum(t.pose is not None for t in track.times)

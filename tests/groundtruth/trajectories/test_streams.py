@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     format_planar_poses,
@@ -18,7 +19,6 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
-from redetect.groundtruth.trajectories.transforms import exp_se3, transform
 from redetect.storage import OutputExistsError
 
 SESSIONS = ("Bicocca_2009-02-25a", "Bicocca_2009-02-26a")
@@ -137,7 +137,7 @@ def test_poses_that_cannot_be_are_refused() -> None:
 
 
 def test_tum_rows_are_the_pose(tmp_path: Path) -> None:
-    poses = exp_se3(np.random.default_rng(1).normal(size=(3, 6)))
+    poses = se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
     rows = [
         [float(word) for word in line.split()]
         for line in format_tum(np.array([1.5, 2.0, 2.5]), poses).splitlines()
@@ -145,5 +145,5 @@ def test_tum_rows_are_the_pose(tmp_path: Path) -> None:
     for row, time, pose in zip(rows, (1.5, 2.0, 2.5), poses):
         assert row[0] == time
         turn = Rotation.from_quat(row[4:]).as_matrix()
-        np.testing.assert_allclose(transform(turn, row[1:4]), pose, atol=1e-6)
+        np.testing.assert_allclose(se3.transform(turn, row[1:4]), pose, atol=1e-6)
     assert format_tum(np.zeros(0), np.zeros((0, 4, 4))) == ""

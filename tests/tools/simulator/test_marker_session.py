@@ -17,8 +17,8 @@ from camera.boards.board import Board
 from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.groundtruth.trajectories.transforms import apply, inverse, log_se3, transform
 from redetect.landmarks.times import read_times
 from tests.pictures import read_grey
 from tools.simulator.__main__ import main
@@ -202,7 +202,7 @@ def test_errors_have_the_covariance_that_the_files_state(full_plan: SessionPlan)
             (full_plan.network.world_from_camera, network.world_from_camera, network.covariance),
             (full_plan.rig.robot_from_marker, rig.robot_from_marker, rig.covariance),
         ):
-            tangents = log_se3(inverse(said) @ true).ravel()
+            tangents = se3.log(se3.inverse(said) @ true).ravel()
             squared.append(tangents @ np.linalg.solve(covariance, tangents))
         pairs = list(zip(network.cameras, full_plan.network.cameras))
         focal += [c.scale_x / t.scale_x - 1.0 for c, t in pairs]
@@ -262,7 +262,7 @@ def test_calibration_set(tmp_path: Path) -> None:
         pose = _pose(known["world_from_board"])
         placements.setdefault(row["placement"], {})[row["board"]] = pose
         camera = network.names.index(row["camera"])
-        points = apply(inverse(network.world_from_camera[camera]) @ pose, board.points)
+        points = se3.apply(se3.inverse(network.world_from_camera[camera]) @ pose, board.points)
         corners = np.array(known["corners"])
         np.testing.assert_allclose(network.cameras[camera].project(points), corners, atol=1e-3)
         image = read_grey(tmp_path / "network" / row["image"])
@@ -292,7 +292,7 @@ def test_calibration_set(tmp_path: Path) -> None:
 
 
 def _pose(entry: dict[str, list[float]]) -> np.ndarray:
-    return transform(
+    return se3.transform(
         Rotation.from_quat(entry["quaternion_xyzw"]).as_matrix(), entry["translation_m"]
     )
 
@@ -347,6 +347,6 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(
         light = render_light(camera, [[board_surface(board, camera_from_board)]], empty)
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), grey_image(light, 1.0, imaging, np.random.default_rng(0)))
-        truth = camera.project(apply(camera_from_board, board.points))
+        truth = camera.project(se3.apply(camera_from_board, board.points))
         found = find_boards(BoardImage("a", "b", 0, path), same, camera)
         assert np.abs(found.corners - truth).max() < 0.5

@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.landmarks import Step, parse_record
+from redetect.landmarks import Step
 from redetect.plane import between
+from tests.landmarks.rows import parse_record
 from tools.simulator.driving import DriveStyle, drive, measured_steps, robot_tilt, step_covariance
 
 PRINTED_STEPS = [

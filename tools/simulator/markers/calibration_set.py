@@ -19,7 +19,7 @@ from camera.boards.board import Board
 from redetect.array_types import FloatArray
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers.session import pose_entries
-from redetect.groundtruth.trajectories.transforms import apply, inverse
+from redetect.groundtruth.trajectories.se3 import apply, inverse
 from tools.simulator.driving import planar_transform
 from tools.simulator.markers.room import facing_pose, lit
 from tools.simulator.markers.session import (

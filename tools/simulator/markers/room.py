@@ -15,7 +15,7 @@ from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import MarkerDictionary, marker_dictionary
 from redetect.array_types import FloatArray
 from redetect.groundtruth.markers.session import Rig
-from redetect.groundtruth.trajectories.transforms import transform
+from redetect.groundtruth.trajectories import se3
 from tools.simulator.driving import planar_transform
 from tools.simulator.markers.surface import (
     Surface,
@@ -86,7 +86,7 @@ def robot_surfaces(rig: Rig, rng: np.random.Generator) -> list[Surface]:
         marker_surface(known, marker, float(width), pose, _QUIET_CELLS)
         for marker, width, pose in zip(rig.ids, rig.widths_m, rig.robot_from_marker)
     ]
-    lifted = transform(np.eye(3), [0.0, 0.0, _GROUND_M])
+    lifted = se3.transform(np.eye(3), [0.0, 0.0, _GROUND_M])
     paint = {side: _panel(rng) for side in ("front", "rear", "left", "right")}
     body = box_sides(_BODY_M, {**paint, "top": plain(0.3)}, lifted)
     wheels = [
@@ -154,7 +154,7 @@ def looking_at(position: FloatArray, target: FloatArray, roll_rad: float = 0.0) 
     down = np.cross(forward, right)
     c, s = np.cos(roll_rad), np.sin(roll_rad)
     rotation = np.column_stack([c * right + s * down, c * down - s * right, forward])
-    return transform(rotation, position)
+    return se3.transform(rotation, position)
 
 
 def room_surfaces(

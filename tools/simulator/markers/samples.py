@@ -15,7 +15,7 @@ from camera import Camera, format_camera, write_camera
 from camera.uncertainty import IDENTITY
 from detect.markers.dictionaries import marker_dictionary
 from redetect.array_types import ByteArray, Float32Array, FloatArray
-from redetect.groundtruth.trajectories.transforms import transform
+from redetect.groundtruth.trajectories import se3
 from redetect.storage import write_bytes
 from tools.simulator.files import encoded, write_truth
 from tools.simulator.markers.kernels import SurfaceArrays
@@ -354,7 +354,7 @@ def _motion(
     axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
     angles = [length / camera.scale_x * ((k + 0.5) / count - 0.5) for k in range(count)]
     turns = (Rotation.from_rotvec(angle * axis).as_matrix() for angle in angles)
-    return [transform(turn, np.zeros(3)) for turn in turns], length
+    return [se3.transform(turn, np.zeros(3)) for turn in turns], length
 
 
 def _occluder(rng: np.random.Generator, card: Surface) -> Surface:

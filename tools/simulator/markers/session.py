@@ -14,8 +14,8 @@ import numpy as np
 from camera import Camera, format_camera, write_camera
 from redetect.array_types import ByteArray, Float32Array, FloatArray
 from redetect.groundtruth.markers.session import Network, Rig, write_network, write_rig
+from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
-from redetect.groundtruth.trajectories.transforms import apply, exp_se3, inverse
 from redetect.storage import write_bytes
 from tools.simulator.driving import planar_transform
 from tools.simulator.files import encoded, rounded, write_lines, write_truth
@@ -64,7 +64,7 @@ def disturbed_network(
     """The network as a calibration with such errors would have it, covariances included."""
     count = len(network.names)
     sigmas = _sigmas(errors.network_m, errors.network_deg)
-    poses = network.world_from_camera @ exp_se3(sigmas * rng.standard_normal((count, 6)))
+    poses = network.world_from_camera @ se3.exp(sigmas * rng.standard_normal((count, 6)))
     cameras = tuple(_disturbed_lens(camera, errors, rng) for camera in network.cameras)
     return replace(
         network, cameras=cameras, world_from_camera=poses,
@@ -76,7 +76,7 @@ def disturbed_rig(rig: Rig, errors: CalibrationErrors, rng: np.random.Generator)
     """The rig as a calibration with such errors would have it; see `disturbed_network`."""
     count = len(rig.ids)
     sigmas = _sigmas(errors.rig_m, errors.rig_deg)
-    poses = rig.robot_from_marker @ exp_se3(sigmas * rng.standard_normal((count, 6)))
+    poses = rig.robot_from_marker @ se3.exp(sigmas * rng.standard_normal((count, 6)))
     return replace(rig, robot_from_marker=poses, covariance=np.diag(np.tile(sigmas**2, count)))
 
 
@@ -154,7 +154,7 @@ class SessionPlan:
     @cached_property
     def camera_from_world(self) -> FloatArray:
         """(C, 4, 4) inverses of the cameras' poses."""
-        return inverse(self.network.world_from_camera)
+        return se3.inverse(self.network.world_from_camera)
 
     def prefix(self, frame: int) -> str:
         """Name of a frame's image, without extension; the same for all cameras."""
@@ -281,8 +281,8 @@ def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArra
     ends = []
     for offset in (-0.5, 0.5):
         moved = pose + offset * plan.settings.exposure_s * speed
-        world = apply(planar_transform(*moved.tolist()), points)
-        seen = apply(plan.camera_from_world[camera], world)
+        world = se3.apply(planar_transform(*moved.tolist()), points)
+        seen = se3.apply(plan.camera_from_world[camera], world)
         ends.append(plan.network.cameras[camera].project(seen))
     way = np.nan_to_num(np.linalg.norm(ends[1] - ends[0], axis=1)).max()
     count = int(np.clip(np.ceil(way), 1, _MOST_EXPOSURES))
@@ -294,8 +294,8 @@ def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     background, model = plan.background(camera), plan.network.cameras[camera]
     x, y = 1.15 * np.array(FOOTPRINT_M)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    world = apply(planar_transform(*pose.tolist()), corners)
-    pixels = model.project(apply(plan.camera_from_world[camera], world))
+    world = se3.apply(planar_transform(*pose.tolist()), corners)
+    pixels = model.project(se3.apply(plan.camera_from_world[camera], world))
     if np.isnan(pixels).any():
         return background
     mask = np.zeros(background.shape, np.uint8)

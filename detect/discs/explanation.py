@@ -27,7 +27,7 @@ from detect.circles import (
     vote_shape,
     within_margins,
 )
-from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, Judgement
+from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, JudgedCandidates
 from detect.discs.radius import FACTOR, find_radius
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
@@ -93,7 +93,7 @@ class DiscExplanation(Table):
     settings : CircleSettings
     at : (float, float) or None
         The given pixel.
-    candidates : tuple of detect.discs.unfound.Candidate
+    candidates : tuple of detect.discs.explanation.Candidate
         Accepted ones first, then in order of decreasing votes.
     place : str
         Description of the given pixel; empty without one.
@@ -203,7 +203,7 @@ class _Scene:
         return detect_circles(self.image, self.camera, self.table, self.settings)
 
     @cached_property
-    def judgement(self) -> tuple[FloatArray, Judgement]:
+    def judgement(self) -> tuple[FloatArray, JudgedCandidates]:
         """Votes for the candidates of both polarities, and their classification."""
         settings = replace(self.settings, polarity="any")
         image, camera, table, _ = within_margins(self.image, self.camera, self.table, settings)

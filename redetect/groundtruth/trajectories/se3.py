@@ -52,14 +52,14 @@ def apply(transforms: ArrayLike, points: ArrayLike) -> FloatArray:
     return np.asarray((t[..., :3, :3] @ p[..., None])[..., 0] + t[..., :3, 3])
 
 
-def exp_se3(tangents: ArrayLike) -> FloatArray:
+def exp(tangents: ArrayLike) -> FloatArray:
     """(..., 4, 4) transforms of (..., 6) tangents (v, w)."""
     xi = np.asarray(tangents, dtype=np.float64)
     w = xi[..., 3:]
     return transform(rotation_of(w), (left_jacobian(w) @ xi[..., :3, None])[..., 0])
 
 
-def log_se3(transforms: ArrayLike) -> FloatArray:
+def log(transforms: ArrayLike) -> FloatArray:
     """(..., 6) tangents (v, w) of (..., 4, 4) transforms, with rotation angles of at most pi."""
     t = np.asarray(transforms, dtype=np.float64)
     w = Rotation.from_matrix(t[..., :3, :3].reshape(-1, 3, 3)).as_rotvec()
@@ -109,10 +109,8 @@ def planar_jacobian(world_from_robot: FloatArray) -> FloatArray:
 
 
 def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(..., 3, 3) covariance of (x, y, theta) (m, m, rad).
-
-    `world_from_robot`: (..., 4, 4). `covariance`: (..., 6, 6), of the right perturbation
-    (translation m, rotation rad).
+    """(..., 3, 3) covariance of (x, y, theta) (m, m, rad) of poses (..., 4, 4), from that of their
+    right perturbations (..., 6, 6) (translation m, rotation rad).
     """
     jacobian = planar_jacobian(world_from_robot)
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
@@ -143,9 +141,9 @@ def mean_pose(
     mean, information = stack[0], np.linalg.inv(covariances)
     covariance = np.linalg.inv(information.sum(axis=0))
     for _ in range(20):
-        apart = log_se3(inverse(mean) @ stack)
+        apart = log(inverse(mean) @ stack)
         step = covariance @ np.einsum("nij,nj->i", information, apart)
-        mean = mean @ exp_se3(step)
+        mean = mean @ exp(step)
         if np.abs(step).max() < 1e-13:
             break
     return mean, covariance
