@@ -92,8 +92,8 @@ class MovementProblem:
     # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
     # one, else 0.
     controls: FloatArray
-    # (N, 4): more distance (m) and turn (rad) that pauses may hide; and variances of where the robot
-    # is if it is measured within a pause (m^2, rad^2)
+    # (N, 4): more distance (m) and turn (rad) that pauses may hide, and, of a movement to a
+    # measurement within a pause, additional variances (m^2, rad^2)
     unseen: FloatArray
     measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
