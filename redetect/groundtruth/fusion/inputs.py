@@ -66,8 +66,8 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
     """Movements between nodes, each a share of an arc between two samples of odometry.
 
     `odometry` has two or more samples at distinct times; (N,) node times ascend within its time.
-    Returns the controls (N, 4) of a `MovementProblem`, and the additional distance (m) and turn
-    (rad) (N, 2) that are possible in pauses of odometry, at the robot's usual rates.
+    Returns the controls (N, 4) of a `MovementProblem`, and its motion (N, 4) that is possible in
+    pauses of odometry, at the robot's usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
     way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
@@ -77,7 +77,9 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
     last = len(odometry) - 2
     at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
     share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
-    shares = np.concatenate([np.zeros((1, 6)), share[:, None] * arcs[at]])
+    shares = np.concatenate([np.zeros((1, 8)), share[:, None] * arcs[at]])
+    # What is not of the usual movement in a part of a pause is in the rest of it.
+    shares[1:, 6:] = np.square(np.minimum(share, 1.0 - share)[:, None] * arcs[at, 6:])
     return shares[:, :4].copy(), shares[:, 4:].copy()
 
 
@@ -91,9 +93,9 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
 
 
 def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:
-    """(N - 1, 2) distance and turn that pauses may hide, beyond the arcs over them."""
+    """(N - 1, 4) distance and turn that pauses may hide beyond the arcs over them; usual ones."""
     paused = _paused(times_s)
-    hidden = np.zeros((len(way), 2))
+    hidden = np.zeros((len(way), 4))
     if not np.any(paused) or np.all(paused):
         return hidden
     usual = []
@@ -103,6 +105,7 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
     passed = np.diff(times_s)[paused]
     for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
         hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
+        hidden[paused, 2 + column] = rate * passed
     # Some odometry is written on change only: if all digits are equal, the robot was at rest.
     hidden[(way == 0.0) & (turn == 0.0)] = 0.0
     return hidden

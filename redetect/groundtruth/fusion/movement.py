@@ -92,7 +92,9 @@ class MovementProblem:
     # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
     # one, else 0.
     controls: FloatArray
-    unseen: FloatArray  # (N, 2): more distance (m) and turn (rad) that pauses may hide
+    # (N, 4): more distance (m) and turn (rad) that pauses may hide, and, of a movement to a
+    # measurement within a pause, additional variances (m^2, rad^2)
+    unseen: FloatArray
     measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     repaired: dict[str, int]  # Number of covariances that had to be increased, by stream
@@ -247,11 +249,12 @@ class MovementProblem:
         along, across, by_turn, by_way = np.square(noise)
         way, turn = np.hypot(self.controls[:, 0], self.controls[:, 1]), np.abs(self.controls[:, 2])
         passed = np.concatenate([[0.0], np.diff(self.times_s)])
-        hidden_way, hidden_turn = self.unseen.T
+        hidden_way, hidden_turn, anywhere, any_turn = self.unseen.T
         bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_way)
         hidden = by_turn * hidden_turn + by_way * hidden_way + bend
-        aside = hidden * hidden_way**2 / 12.0 + inputs.CREEP_M2_PER_S * passed
+        aside = hidden * hidden_way**2 / 12.0 + anywhere + inputs.CREEP_M2_PER_S * passed
         rest = by_turn * turn + by_way * way + hidden + inputs.CREEP_RAD2_PER_S * passed
+        rest += any_turn
         way = way + hidden_way
         return np.column_stack([along * way + aside, across * way + aside, rest])
 

@@ -40,7 +40,11 @@ STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "fro
 #: Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 
-_VELOCITY_WINDOW_S = 0.3
+# Residuals over this time tell whether covariances are too small (s).
+_RESIDUALS_S = 0.48
+# Velocities are from this time before and after, at least from this number of sets; the robot is
+# lost without a pose in this number of sets at least.
+_VELOCITY_WINDOW_S, _VELOCITY_SETS, _COASTED_SETS = 0.3, 2.01, 2.5
 _LARGEST_CHI2 = 9.0
 # An outline is moved if readings are farther from it on average (m), or more than half of their
 # standard deviation, and at most by this share of its radius.
@@ -109,8 +113,9 @@ class Tracker:
         # last search.
         before_s = posed_s = determined_s = searched_s = -math.inf
         segment, begun, tracked = -1, 0, False
+        coast_s = max(self.settings.coast_s, _COASTED_SETS * _interval_s(self.sets.times_s))
         for i, t in enumerate(self.sets.times_s.tolist()):
-            tracked = tracked and t - posed_s <= self.settings.coast_s
+            tracked = tracked and t - posed_s <= coast_s
             if not tracked:
                 if t - searched_s < self.settings.acquire_s:
                     continue
@@ -321,8 +326,9 @@ class Tracker:
         From the residuals of half a second, since one set's are too few.
         """
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
+        sets = 2 * round(0.5 * _RESIDUALS_S / max(_interval_s(self.sets.times_s), 1e-3)) + 1
         total, squared = (
-            convolve1d(values, np.ones(37), mode="constant")
+            convolve1d(values, np.ones(sets), mode="constant")
             for values in (freedom, self.track.chi2[good] * freedom)
         )
         # A ratio above 1 within its own scatter is not significant.
@@ -330,22 +336,23 @@ class Tracker:
         return np.where(ratio > 1.0 + 4.0 * np.sqrt(2.0 / total), ratio, 1.0)
 
 
+def _interval_s(times_s: FloatArray) -> float:
+    """The usual time between sets (s)."""
+    return float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+
+
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
-    """(n, 3) slopes of lines through the poses of the window around each time."""
-    values = poses.copy()
-    values[:, 2] = np.unwrap(poses[:, 2])
-    out = np.zeros_like(values)
-    first = np.searchsorted(times_s, times_s - _VELOCITY_WINDOW_S)
-    last = np.searchsorted(times_s, times_s + _VELOCITY_WINDOW_S, side="right")
-    t = (times_s - times_s[:1])[:, None]
-    terms = (t, t**2, values, values * t)
-    sums = [np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(v, axis=0)]) for v in terms]
-    n = (last - first)[:, None].astype(np.float64)
-    st, stt, sx, stx = (total[last] - total[first] for total in sums)
-    spread = stt - st * st / n
-    enough = (n[:, 0] > 4) & (spread[:, 0] > 1e-6)
-    out[enough] = ((stx - st * sx / n) / np.where(spread > 0.0, spread, 1.0))[enough]
-    return out
+    """(n, 3) mean velocities in the robot's frame around each time, turned to the world."""
+    heading = np.unwrap(poses[:, 2])
+    way = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-0.5j * (heading[1:] + heading[:-1]))
+    driven = np.concatenate([[0.0], np.cumsum(way)])
+    window_s = max(_VELOCITY_WINDOW_S, _VELOCITY_SETS * _interval_s(times_s))
+    first = np.searchsorted(times_s, times_s - window_s)
+    last = np.searchsorted(times_s, times_s + window_s, side="right") - 1
+    span_s = times_s[last] - times_s[first]
+    span_s[span_s < LARGEST_GAP_S] = np.inf
+    ahead = (driven[last] - driven[first]) / span_s * np.exp(1j * heading)
+    return np.column_stack([ahead.real, ahead.imag, (heading[last] - heading[first]) / span_s])
 
 
 def track_by_lasers(
@@ -407,10 +414,7 @@ def usual_sets_per_pose(track: LaserTrack) -> int:
     If the robot speeds up or begins to turn, the mean over a time T is off by a T^2/24: less than
     the noise over this time only.
     """
-    intervals = np.diff(track.times_s)
-    if not len(intervals):
-        return 1
-    return max(1, round(_AVERAGED_S / max(float(np.median(intervals)), 1e-9)))
+    return max(1, round(_AVERAGED_S / max(_interval_s(track.times_s), 1e-9)))
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:

@@ -133,8 +133,10 @@ def new_points(
                 continue
             age = ages_s[s] - fixed.beam_times_s[s, i]
             c, sn = math.cos(motion[2] * age), math.sin(motion[2] * age)
-            # From where the robot was at the beam's time.
-            dx, dy = x - (motion[3] - motion[0] * age), y - (motion[4] - motion[1] * age)
+            # From where the robot was at the beam's time, along an arc.
+            ca, sa = math.cos(0.5 * motion[2] * age), math.sin(0.5 * motion[2] * age)
+            dx = x - motion[3] + (ca * motion[0] + sa * motion[1]) * age
+            dy = y - motion[4] + (ca * motion[1] - sa * motion[0]) * age
             points[n, 0] = motion[3] + c * dx - sn * dy
             points[n, 1] = motion[4] + sn * dx + c * dy
             bx, by = fixed.direction[s, i, 0], fixed.direction[s, i, 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.fusion.fuse import fuse
@@ -70,6 +71,25 @@ def test_where_odometry_pauses_the_way_is_not_known() -> None:
     both = PlanarPoses(still.times_s[[0, -1]], stood[:2], np.tile(LASER_COVARIANCE, (2, 1, 1)))
     problem = movement_problem(still, {"laser": both}, FuseSettings())
     assert not np.any(problem.unseen)
+
+
+@pytest.mark.parametrize("seen_s", [8.0, 4.0])
+def test_measurements_within_a_pause_of_odometry_are_used(seen_s: float) -> None:
+    """They contradict the arc over the pause, and are right."""
+    settings = FuseSettings(
+        distance_sigma=0.01, lateral_sigma=0.005, turn_sigma=0.01, turn_per_metre_sigma=0.005
+    )
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        truth, odometry = drive(rng, 60.0, settings, rate_hz=20.0)
+        times = np.arange(3.0, 57.0, 0.08)
+        times = times[(times < 20.0 + seen_s) | (times > 28.0)]
+        laser = measure(rng, truth, times, np.diag([9e-6, 9e-6, 16e-6]))
+        there = (odometry.times_s < 20.0) | (odometry.times_s > 28.0)
+        fusion = fuse(odometry.only(there), {"laser": laser})
+        assert len(fusion.rejected) < 5
+        assert not fusion.slips_s
+        assert float(np.mean(normalised_error(fusion.poses, truth))) / 3.0 < 1.3
 
 
 def test_a_buffer_read_every_other_second_makes_no_pauses() -> None:

@@ -91,15 +91,16 @@ def record(
     outline: FloatArray,
     seed: int,
     others: Callable[[float], FloatArray] | None = None,
+    rate_hz: float = 75.0,
 ) -> list[Scans]:
-    """Scans at 75 Hz, each scanner with a phase of its own, of a robot on a path.
+    """Scans, each scanner with a phase of its own, of a robot on a path.
 
     `path` gives None where the robot is away; `others` gives segments of what else moves.
     """
     rng = np.random.default_rng(seed)
     scans = []
     for k, one in enumerate(scanners):
-        times = np.arange(span_s[0] + 0.003 * k, span_s[1], 1.0 / 75.0)
+        times = np.arange(span_s[0] + 0.225 * k / rate_hz, span_s[1], 1.0 / rate_hz)
         rows = []
         for t in times.tolist():
             pose = path(t)

@@ -295,6 +295,22 @@ def test_a_track_through_a_loss(recorded: ScanSets, tables: FixedScanners) -> No
     assert np.abs(track.motion[good] @ [0.0, 0.0, 1.0] - 0.5).mean() < 0.1
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0])
+def test_scans_of_slow_scanners_are_moved_on_along_the_arc(
+    rate_hz: float, scanners: tuple[Scanner, ...], tables: FixedScanners
+) -> None:
+    """They are up to a fifth of a second apart, in which the robot drives and turns."""
+    scans = record(scanners, circle, (0.0, 6.0), FRONTED, 5, rate_hz=rate_hz)
+    track = track_by_lasers(sets_of_scans(scans), tables, Robot(FRONTED, 1.0, 1.0))
+    good = np.isin(track.status, (OK, REACQUIRED))
+    assert good.mean() > 0.95
+    assert len(track.fronts) == 1
+    error = errors(track.times_s[good], track.poses[good])
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(track.covariances[good]), error)
+    assert float(squared.mean()) / 3.0 < 1.5
+    assert float(squared.max()) < 30.0
+
+
 def test_combined_poses(recorded: ScanSets, tables: FixedScanners) -> None:
     track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     one, six = combined_poses(track, 1), combined_poses(track, 6)
