@@ -283,9 +283,8 @@ class DiscComparison(Comparison):
         if not self.reference_whole_pixels or error is None or error <= 1.5:
             return super()._agreement()
         return (
-            "The reference's rows are at whole pixels: errors of about a pixel are its own, and do "
-            f"not tell whether the stated covariances are right (the mean squared normalised error "
-            f"is {error:.2f})."
+            "The reference's rows are at whole pixels: errors of about a pixel are its own, so the "
+            f"mean squared normalised error, {error:.2f}, is not that of the stated covariances."
         )
 
 

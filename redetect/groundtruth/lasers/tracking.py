@@ -40,7 +40,7 @@ STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "fro
 #: Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 
-# Residuals over this time tell whether covariances are too small (s).
+# Residuals over this time show whether covariances are too small (s).
 _RESIDUALS_S = 0.48
 # Velocities are from this time before and after, at least from this number of sets; the robot is
 # lost without a pose in this number of sets at least.
