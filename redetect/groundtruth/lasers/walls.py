@@ -120,7 +120,7 @@ class WallCurves(NamedTuple):
 def wall_curves(walls: FloatArray, bulge_m: float = BULGE_M) -> WallCurves:
     """Chords among walls (S, 4): similar neighbours, from which their curve bulges by less.
 
-    Otherwise their corners would be features that fix how scanners in a circular hall are turned.
+    Otherwise their corners would be features that fix how scanners in a round hall are turned.
     """
     along, count = walls[:, 2:] - walls[:, :2], len(walls)
     pairs = cKDTree(walls.reshape(-1, 2)).query_pairs(_SAME_CORNER_M, output_type="ndarray")
@@ -254,7 +254,7 @@ class MapProblem(NamedTuple):
         )
 
     def _by_curvature(self, poses: FloatArray, offsets: FloatArray, found: _Solution) -> FloatArray:
-        """(3 poses, 3 poses) covariance since poses that fit are on a curve, as in a circular hall."""
+        """(3 poses, 3 poses) covariance since poses that fit are on a curve, as in a round hall."""
         parts = range(0, poses.size, 3)
         values, vectors = np.linalg.eigh([found.covariance[k : k + 3, k : k + 3] for k in parts])
         far, off = np.sqrt(values[:, -1:]) * vectors[:, :, -1], np.zeros_like(poses)
