@@ -67,8 +67,9 @@ def exit_code_of(work: Callable[[], int]) -> int:
             with interrupts_noted():
                 return work()
         finally:
-            # Flushing can fail, too, if the output is a closed pipe.
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed by the caller
+                # Flushing can fail, too, if the output is a closed pipe.
+                sys.stdout.flush()
     except KeyboardInterrupt:
         return say_interrupted()
     except Exception as error:

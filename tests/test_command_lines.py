@@ -6,6 +6,8 @@ import io
 import json
 import re
 import shlex
+import subprocess
+import sys
 from contextlib import redirect_stdout
 from functools import cache
 from importlib import import_module
@@ -137,3 +139,11 @@ def test_a_wrong_word_is_named_on_one_line(
     assert said in err
     assert not out
     assert err.count("\n") == 1
+
+
+def test_a_closed_standard_output_costs_nothing(tmp_path: Path, project_root: Path) -> None:
+    command = f"{sys.executable} -m redetect camera convert images/e/e.cam {tmp_path}/e.opencv.yaml"
+    done = subprocess.run(
+        f"{command} >&-", shell=True, cwd=project_root, stderr=subprocess.PIPE, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
