@@ -73,6 +73,12 @@ def perform(options: Laser) -> int:
             f"{'small' if track.outline_moved_m > 0.0 else 'large'} on each side: one that fits "
             "the readings was used"
         )
+    if track.outline_sigma_m:
+        warn(
+            f"the sides of the outline in robot.json are off by some "
+            f"{1e3 * track.outline_sigma_m:.0f} mm each: so are all poses, and their covariances "
+            "include it"
+        )
     share = seen_through(track)
     if share > _MOST_SEEN_THROUGH:
         warn(
@@ -162,6 +168,7 @@ def describe(
     return {
         "sets": {status: count for status, count in zip(tracking.STATUS, counts) if count},
         "outline_moved_m": track.outline_moved_m,
+        "outline_sigma_m": track.outline_sigma_m,
         "segments": segments,
         COMMON: (shared.mean(axis=0) if len(shared) else np.zeros((3, 3))).tolist(),
         "scanners": entries,

@@ -32,7 +32,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, compose, invert
+from redetect.plane import apply, compose, invert, rotation
 
 LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
 STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
@@ -81,6 +81,8 @@ class LaserTrack:
     correction_sigma: FloatArray  # (scanners, 3)
     fronts: dict[int, str]  # How the front was found, by segment
     outline_moved_m: float = 0.0  # By how much its faces were moved outward to fit (m)
+    # Standard deviation of its faces from the readings (m), where it is noticed; else 0
+    outline_sigma_m: float = 0.0
 
 
 class Tracker:
@@ -250,18 +252,36 @@ class Tracker:
         self.information += found.information
         self.gradient += found.gradient
 
-    def outside_m(self) -> float:
-        """Mean distance of most readings from the outline, outward, in a sample of the sets (m)."""
+    def outline_errors(self) -> tuple[float, float, FloatArray]:
+        """Errors of the outline, from the readings' distances from it in a sample of the sets.
+
+        The mean of most, outward, and the deviation of the halves of its faces (m), of which poses
+        have a covariance (3, 3), in the robot's frame.
+        """
         rows = np.flatnonzero(np.isin(self.track.status, (OK, REACQUIRED)))
-        normals, off = face_normals(self.body.faces), [np.zeros(0)]
+        faces, normals = self.body.faces, face_normals(self.body.faces)
+        off, halves = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i in rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(np.int64)]:
             pose = self.track.poses[i]
             seen = apply(invert(pose), self._points(i, pose, self.track.motion[i], 0.0).points)
-            nearest, face, squared = nearest_on_segments(seen, self.body.faces)
-            across = np.sum((seen - nearest) * normals[face], axis=1)
-            off.append(across[squared < self.settings.gate_m**2])
-        whole = np.concatenate(off)
-        return float(trim_mean(whole, _TRIMMED)) if len(whole) else 0.0
+            nearest, face, squared = nearest_on_segments(seen, faces)
+            near = squared < self.settings.gate_m**2
+            off.append(np.sum((seen - nearest) * normals[face], axis=1)[near])
+            to_ends = [np.hypot(*(nearest - faces[face, k : k + 2]).T) for k in (0, 2)]
+            halves.append((2 * face + (to_ends[0] > to_ends[1]))[near])
+        whole, half = np.concatenate(off), np.concatenate(halves)
+        used = np.flatnonzero(np.bincount(half, minlength=2 * len(faces)) >= _SAMPLE)
+        if len(used) <= 4:
+            return float(trim_mean(whole, _TRIMMED)) if len(whole) else 0.0, 0.0, np.zeros((3, 3))
+        face, end = np.divmod(used, 2)
+        at = faces[face, :2] + (0.25 + 0.5 * end)[:, None] * (faces[face, 2:] - faces[face, :2])
+        turn = at[:, 0] * normals[face, 1] - at[:, 1] * normals[face, 0]
+        design = np.column_stack([normals[face], turn, np.ones(len(used))])
+        values = np.array([np.median(whole[half == k]) for k in used])
+        rest = values - design @ np.linalg.lstsq(design, values)[0]
+        sigma_m = math.sqrt(float(rest @ rest) / (len(used) - 4))
+        covariance = sigma_m**2 * np.linalg.pinv(design[:, :3].T @ design[:, :3])
+        return float(trim_mean(whole, _TRIMMED)), sigma_m, covariance
 
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.
@@ -368,11 +388,16 @@ def track_by_lasers(
     for _ in range(_OUTLINE_ROUNDS):
         body = robot_body(robot.outline, settings.symmetry_m, moved_m)
         tracker = Tracker(sets, fixed, body, robot.largest_speed_m_s, settings)
-        track, off_m = tracker.run(), tracker.outside_m()
-        track = replace(track, outline_moved_m=moved_m)
+        track = replace(tracker.run(), outline_moved_m=moved_m)
+        off_m, sigma_m, by_outline = tracker.outline_errors()
         if abs(off_m) <= allowed_m or abs(moved_m + off_m) > _MOST_MOVED * body.radius_m:
             break
         moved_m += off_m
+    if sigma_m > 0.5 * allowed_m:
+        turned = np.tile(np.eye(3), (len(sets), 1, 1))
+        turned[:, :2, :2] = rotation(track.poses[:, 2])
+        covariances = track.covariances + turned @ by_outline @ np.swapaxes(turned, 1, 2)
+        track = replace(track, outline_sigma_m=sigma_m, covariances=covariances)
     return track
 
 

@@ -471,3 +471,18 @@ def test_an_outline_of_a_wrong_size_is_moved_to_the_readings(
     assert seen_through(wrong) < 0.08
     assert np.array_equal(np.isfinite(exact.poses), np.isfinite(wrong.poses))
     assert np.nanmedian(np.hypot(*(exact.poses - wrong.poses)[:, :2].T)) < 0.005
+
+
+def test_errors_of_single_sides_of_an_outline_are_in_the_covariance(
+    recorded: ScanSets, tables: FixedScanners
+) -> None:
+    assert track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0)).outline_sigma_m == 0.0
+    squares = []
+    for seed in range(3):
+        drawn = FRONTED + np.random.default_rng(seed).normal(0.0, 0.012, FRONTED.shape)
+        track = track_by_lasers(recorded, tables, Robot(drawn, 1.0, 1.0))
+        assert track.outline_sigma_m > 0.002
+        good = np.isin(track.status, (OK, REACQUIRED))
+        error, inverse = errors(track.times_s, track.poses)[good], np.linalg.inv(track.covariances)
+        squares.append(float(np.mean(np.einsum("ni,nij,nj->n", error, inverse[good], error))) / 3.0)
+    assert np.mean(squares) < 2.5
