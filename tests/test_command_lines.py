@@ -123,7 +123,7 @@ def test_json_alone_on_standard_output(
         ("slam map images/e --camera", "slam map: --camera: expected a path"),
         ("slam export images/e -o x y z", "slam export: '"),
         ("camera calibrate a --rows 6", "camera calibrate: expected --output --columns --square-m"),
-        ("groundtruth laser --robot x", "groundtruth laser: expected SESSION"),
+        ("groundtruth laser", "groundtruth laser: expected SESSION"),
         ("detect draw", "detect draw: expected RUN"),
         ("slam", "slam: no command '': one of associate, audit"),
         ("slam --loss huber", "slam: no command '--loss': one of"),
