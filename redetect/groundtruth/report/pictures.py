@@ -116,7 +116,7 @@ def series_figure(
         least = 10.0 ** math.floor(math.log10(max(float(np.quantile(positive, 0.05)), 1e-9)))
         grid[0, 0].set_ylim(least, max(1.3 * float(positive.max()), 10.0 * least))
         grid[0, 0].set_ylabel(unit)
-        grid[0, -1].legend(loc="upper right", ncols=4, fontsize=8)
+        grid[0, -1].legend(loc="upper right", ncols=4, fontsize=8).set_in_layout(False)
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE_IN, 96.0 * _SERIES_HIGH_IN)
 
 
