@@ -71,9 +71,12 @@ def tilt_arrays(tilts: Sequence[FrameTilt]) -> tuple[FloatArray, FloatArray]:
 
 
 def level_discs(
-    camera: Camera, floor_xy: FloatArray, covariance: FloatArray, tilt: FloatArray,
+    camera: Camera,
+    floor_xy: FloatArray,
+    covariance: FloatArray,
+    tilt: FloatArray,
     tilt_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Positions (N, 2) on the floor (m) and their covariances, corrected for tilts.
 
     Positions are those of the calibrated camera on a level robot. Pitch and roll (rad) and their

@@ -1,5 +1,7 @@
 """``camera level``: a camera's mounting from a run: its constant lean, and its height.
 
+The command is one of the program `camera`; it is implemented here because it needs detection.
+
 The lean is estimated from the verticals of all frames (`detect.run_tilt`), the height from the
 outlines of discs of known size: with a wrong height, their pitch differs from that of the verticals
 (`detect.discs.outline_tilt`). Both assume that the lens is calibrated correctly.

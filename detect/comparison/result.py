@@ -154,7 +154,7 @@ class Comparison(Table, ABC):
     def columns(self) -> dict[str, Any]:
         """One row per frame that is in both files."""
         rows = [self._row(match) for match in self.frames]
-        return {name: [row[name] for row in rows] for name in rows[0]}
+        return {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
 
     def _row(self, match: FrameMatch) -> dict[str, Any]:
         counts = {count: len(getattr(match, count)) for count in self.counts}

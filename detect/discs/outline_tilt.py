@@ -118,9 +118,13 @@ def _contrast(grey: FloatArray) -> float:
 
 @kernel()
 def fit_outline(
-    point_xy: FloatArray, px_per_m: FloatArray, centre: FloatArray, x: float, y: float,
+    point_xy: FloatArray,
+    px_per_m: FloatArray,
+    centre: FloatArray,
+    x: float,
+    y: float,
     radius: float,
-) -> tuple[bool, float, float, float, float, float]:  # fmt: skip
+) -> tuple[bool, float, float, float, float, float]:
     """Estimate the tilt of one disc near (x, y) from (N, 2) points of its outline.
 
     Points are on the calibrated floor, relative to (x, y), metres; NaN where the outline is not

@@ -60,9 +60,14 @@ def perform(options: Draw) -> int:
 
 
 def draw_run(
-    run: ImageRun, rows: RunRows, folder: Path | None, plan: FramePlan | None = None,
-    *, video: Video | None = None, overwrite: bool,
-) -> tuple[int, int, list[str]]:  # fmt: skip
+    run: ImageRun,
+    rows: RunRows,
+    folder: Path | None,
+    plan: FramePlan | None = None,
+    *,
+    video: Video | None = None,
+    overwrite: bool,
+) -> tuple[int, int, list[str]]:
     """Draw rows into the images of a run, to PNG files in a folder, and to a video.
 
     With the plan of their detection, verticals are drawn as tracks, and markers with the rejected

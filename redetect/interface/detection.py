@@ -311,10 +311,15 @@ class RecordedFrame:
 
     @keywords_named()
     def detect(
-        self, radius_m: float | None = None, polarity: Polarity | None = None, *,
-        level: bool = True, axes: Axes = "dataset", settings: CircleSettings | None = None,
+        self,
+        radius_m: float | None = None,
+        polarity: Polarity | None = None,
+        *,
+        level: bool = True,
+        axes: Axes = "dataset",
+        settings: CircleSettings | None = None,
         line_settings: LineSettings | None = None,
-    ) -> Detection:  # fmt: skip
+    ) -> Detection:
         """Detect discs, verticals and tilt: see `detect`."""
         if axes not in MEANING:
             meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())

@@ -40,20 +40,20 @@ def perform(options: Validate) -> int:
         raise GroundTruthError(f"{session / 'distances.csv'}: no distances in it")
     poses = read_planar_poses(options.poses)
     files = [session / "fiducials.json", session / "distances.csv", options.poses]
-    boards: list[onboard.Onboard] = []
+    on_board: list[onboard.Onboard] = []
     clock, segments, clock_path = None, None, None
     if options.refine == "scans":
         map_file = find_building(session)
         segments = read_building(map_file)
-        boards, scan_files = _onboard(session)
+        on_board, scan_files = _onboard(session)
         beside = session / "clock.json"
         clock_path = options.clock or (beside if beside.is_file() else None)
-        if boards and clock_path is None:
+        if on_board and clock_path is None:
             warn("no clock.json: the times of the on-board scans are not corrected")
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     solved = reference_poses.poses_from_distances(survey, measured)
-    references, refused = onboard.reference_poses(solved, boards, segments, clock)
+    references, refused = onboard.reference_poses(solved, on_board, segments, clock)
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
@@ -188,7 +188,7 @@ def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     """The robot's scanners that have scans in the session, and the files read."""
     path = session / "robot.json"
     robot = read_robot(path)
-    boards, files = [], [path]
+    on_board, files = [], [path]
     for scanner in robot.scanners:
         try:
             found = find_scans(session, scanner.name)
@@ -196,11 +196,13 @@ def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
             warn(f"{error}: its scans are not used")
             continue
         # If a clock was set, times step back; the poses' own times are looked up.
-        boards.append(onboard.Onboard(scanner, read_scans(found, scanner.readings, ordered=False)))
+        on_board.append(
+            onboard.Onboard(scanner, read_scans(found, scanner.readings, ordered=False))
+        )
         files.append(found)
-    if not boards:
+    if not on_board:
         warn("no scans of a scanner on board: using distances only")
-    return boards, files
+    return on_board, files
 
 
 def _distance_figures(

@@ -56,6 +56,8 @@ _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 #: Sets farther apart than this are not of one block (s).
 LARGEST_GAP_S = 0.05
 _AVERAGED_S = 0.08
+# Velocities over a shorter time are unknown: the robot counts as at rest.
+_LEAST_SPAN_S = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +372,7 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     first = np.searchsorted(times_s, times_s - window_s)
     last = np.searchsorted(times_s, times_s + window_s, side="right") - 1
     span_s = times_s[last] - times_s[first]
-    span_s[span_s < LARGEST_GAP_S] = np.inf
+    span_s[span_s < _LEAST_SPAN_S] = np.inf
     ahead = (driven[last] - driven[first]) / span_s * np.exp(1j * heading)
     return np.column_stack([ahead.real, ahead.imag, (heading[last] - heading[first]) / span_s])
 
@@ -439,7 +441,8 @@ def usual_sets_per_pose(track: LaserTrack) -> int:
     If the robot speeds up or begins to turn, the mean over a time T is off by a T^2/24: less than
     the noise over this time only.
     """
-    return max(1, round(_AVERAGED_S / max(_interval_s(track.times_s), 1e-9)))
+    interval_s = _interval_s(track.times_s)
+    return max(1, round(_AVERAGED_S / interval_s)) if interval_s > 0.0 else 1
 
 
 def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:

@@ -275,3 +275,9 @@ def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path
     found = compare(camera, raw, level)
     assert found.recall == found.precision == 1.0
     assert found.image_95_px == pytest.approx(0.0, abs=1e-6)
+
+
+def test_runs_without_a_common_image_are_an_empty_table(published_camera: Camera) -> None:
+    result = compare(published_camera, [], [])
+    assert result.columns() == {}
+    assert "no discs" in str(result)

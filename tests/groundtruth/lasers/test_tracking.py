@@ -456,6 +456,7 @@ def test_sets_are_averaged_over_a_time_not_over_a_number(
     track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     for slower, expected in ((1.0, 6), (1.875, 3), (3.0, 2), (7.5, 1)):
         assert usual_sets_per_pose(replace(track, times_s=slower * track.times_s)) == expected
+    assert usual_sets_per_pose(replace(track, times_s=track.times_s[:1])) == 1
 
 
 @pytest.mark.parametrize("scale", [0.95, 1.06])
