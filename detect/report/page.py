@@ -13,13 +13,14 @@ from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
 from detect.drawing.frame import draw_rows, processed
+from detect.drawing.picture_files import picture_name
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import Report, RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight, summed_steps
-from detect.sources.image_files import image_name, picture_name
+from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from detect.sources.opening import demand_recording, open_source
 from redetect import __version__
