@@ -129,6 +129,14 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> Flo
     return np.stack([np.stack(rows, -1), np.stack(others, -1)], axis=1)
 
 
+def common_tilt_jacobian(disc_xy: FloatArray) -> FloatArray:
+    """Derivative of apparent floor positions by a small tilt about the robot's origin.
+
+    As `tilt_jacobian`, but for a tilt that stays: the place below the robot is its origin.
+    """
+    return tilt_jacobian(disc_xy) - tilt_jacobian(np.zeros((1, 2)))
+
+
 def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike) -> FloatArray:
     """Measurement model of a vertical line: the bearing under which the camera sees it.
 

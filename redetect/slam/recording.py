@@ -14,7 +14,7 @@ from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
-from redetect.slam.models import OdometryNoise
+from redetect.slam.models import OdometryNoise, common_tilt_jacobian
 
 UNKNOWN_ID = -1
 
@@ -32,6 +32,8 @@ PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".t
 # In the head of files by `detect`: the covariances of their discs include that of a tilt.
 _TILTED = re.compile(rb" refine=True .*tilt_sigma_deg=(?!0(\.0*)?\s)")
 _HEAD_BYTES = 1 << 16
+# Share of the variance of discs' tilts that is assumed to be common to all frames.
+_COMMON_SHARE = 0.5
 # Indices of the covariance's numbers in a STEP row.
 _STEP_COVARIANCE = np.array([[3, 4, 6], [4, 5, 7], [6, 7, 8]])
 
@@ -117,6 +119,20 @@ class Recording:
         way = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
         turn = self.step_covariance[:, 2, 2]
         return np.flatnonzero((way > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
+
+    @property
+    def common_tilt_variance(self) -> float:
+        """Variance of pitch, and of roll, that all frames may have in common (rad^2).
+
+        Covariances of rows do not state how much of their tilt is common to all frames, such as the
+        lean of the camera, but they have to contain it: half of the largest possible variance is
+        assumed, and none if the covariances contain no tilt.
+        """
+        if not self.tilted or not len(self.circles):
+            return 0.0
+        effect = np.sum(common_tilt_jacobian(self.circles.xy) ** 2, axis=(1, 2))
+        stated = np.trace(self.circles.covariance, axis1=1, axis2=2)
+        return _COMMON_SHARE / float(np.max(effect / stated))
 
     def part(self, first: int, last: int | None = None) -> Recording:
         """The frames from one on, up to another or the end."""

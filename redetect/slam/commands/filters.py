@@ -123,6 +123,7 @@ def localized_run_of(
         start,
         covariance,
         files.camera_xy_of(recording, command.run, command.camera),
+        common_tilt_variance=recording.common_tilt_variance,
         # Considering the map's errors makes the filter slow to converge to it, which does little
         # harm with known pairs, but loses track if pairs have to be found.
         exact=command.association != "known",
@@ -176,7 +177,9 @@ def _global_start(
 
 def _mapped(command: Ekf, recording: Recording) -> _Result:
     camera_xy = files.camera_xy_of(recording, command.run, command.camera)
-    ekf = EkfSlam(command.start, camera_xy=camera_xy)
+    ekf = EkfSlam(
+        command.start, camera_xy=camera_xy, common_tilt_variance=recording.common_tilt_variance
+    )
     associator = Associator(command.association, command.gate_probability)
     run = run_ekf(recording, ekf, associator)
     landmark_map = ekf.landmark_map()

@@ -29,7 +29,7 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.filters import frames
-from redetect.slam.models import move, tilt_jacobian
+from redetect.slam.models import common_tilt_jacobian, move, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 
 #: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
@@ -43,7 +43,6 @@ _INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
 # of an inverse distance in one iteration (1/m).
 _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
-_POSE = np.arange(frames.POSE_SIZE)
 # Increment of the state's size; some unused numbers cost less than copying its covariance often.
 _CHUNK = 64
 # For poses alone the state is limited to this many discs: its update costs their number squared.
@@ -55,7 +54,7 @@ class EkfSlam(frames.Filter):
 
     Parameters
     ----------
-    start, start_covariance, camera_xy : array_like
+    start, start_covariance, camera_xy, common_tilt_variance : array_like
         As in `Filter`.
     tilt_sigma_rad : float
         Standard deviation of the robot's sway about both axes of the floor, in addition to the
@@ -70,9 +69,10 @@ class EkfSlam(frames.Filter):
         start_covariance: ArrayLike | None = None,
         camera_xy: ArrayLike = frames.NO_CAMERA,
         *,
+        common_tilt_variance: float = 0.0,
         tilt_sigma_rad: float = 0.0,
     ) -> None:
-        super().__init__(start, start_covariance, camera_xy)
+        super().__init__(start, start_covariance, camera_xy, common_tilt_variance)
         self.tilt_sigma_rad = tilt_sigma_rad
         self.disc_rows: Counter[int] = Counter()
         self.line_rows: Counter[int] = Counter()
@@ -141,13 +141,13 @@ class EkfSlam(frames.Filter):
         if not discs and not lines:
             return
         sizes = ((self.disc_slots, 2, discs), (self.line_slots, self.line_size, lines))
-        kept = [np.arange(frames.POSE_SIZE)]
+        kept = [self._moving]
         for slots, size, dropped in sizes:
             for number in dropped:
                 del slots[number]
             kept.append(frames.numbers_from([*slots.values()], size).ravel())
         index = np.concatenate(kept)
-        at = frames.POSE_SIZE
+        at = len(self._moving)
         for slots, size, _ in sizes:
             for number in slots:
                 slots[number], at = at, at + size
@@ -159,11 +159,12 @@ class EkfSlam(frames.Filter):
         """Use rows whose landmarks are in the state."""
         if not len(rows.circles) and not len(rows.lines):
             return
-        before = self._state.copy()
+        before, tilt = self._state.copy(), self._covariance[self._tilt, self._tilt].copy()
         inverse = frames.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
+            change[self._tilt] = 0.0
             nearer = np.abs(change[inverse])
             self._state += change * min(1.0, _LONGEST_STEP / max(nearer.max(initial=0.0), 1e-9))
             if np.max(np.abs(change)) < _CONVERGED:
@@ -173,6 +174,7 @@ class EkfSlam(frames.Filter):
         self._covariance = dgemm(
             -1.0, factor, factor, 1.0, self._covariance, trans_b=1, overwrite_c=1
         )
+        self._covariance[self._tilt, self._tilt] = tilt  # it is not estimated
         self.disc_rows.update(rows.circles.ids.tolist())
         self.line_rows.update(number for numbers in rows.lines.ids for number in numbers)
 
@@ -181,7 +183,9 @@ class EkfSlam(frames.Filter):
         sway = self.tilt_sigma_rad * tilt_jacobian(seen_xy[None])[0]
         noise = by_seen @ (noise + sway @ sway.T) @ by_seen.T
         xy = self._state[:2] + by_seen @ seen_xy
-        self.disc_slots[number] = self._append(self._turned_about(xy), noise, xy)
+        by_tilt = -by_seen @ common_tilt_jacobian(seen_xy[None])[0]
+        by_all = np.column_stack([self._turned_about(xy), by_tilt])[:, : len(self._moving)]
+        self.disc_slots[number] = self._append(by_all, noise, xy)
         self.disc_rows[number] = 1
         self.count.discs += 1
 
@@ -199,12 +203,12 @@ class EkfSlam(frames.Filter):
         x, y = xy - self._linearised[:2]
         return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
-    def _append(self, by_pose: FloatArray, noise: FloatArray, value: FloatArray) -> int:
-        """`_put` numbers that depend on the pose at the end of the state; returns their slot."""
+    def _append(self, jacobian: FloatArray, noise: FloatArray, value: FloatArray) -> int:
+        """`_put` numbers that depend on the first ones at the end; returns their slot."""
         slot, self.size = self.size, self.size + len(value)
         if self.size > len(self._state):
             self._grow(_CHUNK)
-        self._put(slot, _POSE, by_pose, noise, value)
+        self._put(slot, self._moving[: jacobian.shape[1]], jacobian, noise, value)
         return slot
 
 

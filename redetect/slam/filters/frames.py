@@ -27,7 +27,13 @@ from redetect.slam.association.compatibility import (
     individual_distances,
 )
 from redetect.slam.errors import SlamError
-from redetect.slam.models import disc_in_robot, move, move_jacobians, tilt_jacobian
+from redetect.slam.models import (
+    common_tilt_jacobian,
+    disc_in_robot,
+    move,
+    move_jacobians,
+    tilt_jacobian,
+)
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
 NO_CAMERA = np.zeros(2)
@@ -130,6 +136,10 @@ class Filter(ABC):
         Its covariance; None if the start defines the map.
     camera_xy : (2,) array_like
         The camera's centre in the robot frame (m); only lines need it.
+    common_tilt_variance : float
+        Variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part
+        of the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry
+        looks the same.
 
     Attributes
     ----------
@@ -146,22 +156,31 @@ class Filter(ABC):
     tilt_sigma_rad = 0.0
 
     def __init__(
-        self, start: ArrayLike, start_covariance: ArrayLike | None, camera_xy: ArrayLike
+        self,
+        start: ArrayLike,
+        start_covariance: ArrayLike | None,
+        camera_xy: ArrayLike,
+        common_tilt_variance: float,
     ) -> None:
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
         self.count = RowCount()
-        self.size = POSE_SIZE
-        self._state = np.array(start, dtype=np.float64)
+        # Numbers of the pose, and of the common tilt, if there is one.
+        self._moving = np.arange(POSE_SIZE + 2 if common_tilt_variance else POSE_SIZE)
+        self._tilt = slice(POSE_SIZE, len(self._moving))
+        self.size = len(self._moving)
+        self._state = np.zeros(self.size)
+        self._state[_POSE] = start
         self._linearised = self._state.copy()
-        self._covariance = np.zeros((POSE_SIZE, POSE_SIZE))
-        if start_covariance is not None:
-            self._covariance += np.asarray(start_covariance, dtype=np.float64)
+        self._covariance = common_tilt_variance * np.eye(self.size)
+        self._covariance[:POSE_SIZE, :POSE_SIZE] = (
+            0.0 if start_covariance is None else start_covariance
+        )
 
     @property
     def state(self) -> FloatArray:
-        """The pose, then landmarks at their slots: (n,)."""
+        """The pose, the common tilt if there is one, then landmarks at their slots: (n,)."""
         return self._state[: self.size]
 
     @property
@@ -202,12 +221,15 @@ class Filter(ABC):
         of_discs = numbers_from(discs, 2)
         of_lines = numbers_from(lines, self.line_size)
         pose, turn, d, e = self._state[:3], rotation(self._state[2]), len(of_discs), len(of_lines)
-        numbers = np.concatenate([_POSE, of_discs.ravel(), of_lines.ravel()])
+        numbers = np.concatenate([self._moving, of_discs.ravel(), of_lines.ravel()])
+        first = len(self._moving)
         jacobian = np.zeros((2 * d + e, len(numbers)))
         seen = disc_in_robot(pose, self._state[of_discs])
+        if self._tilt.stop > self._tilt.start:
+            jacobian[: 2 * d, self._tilt] = common_tilt_jacobian(seen).reshape(-1, 2)
         by_disc = np.zeros((d, 2, d, 2))
         by_disc[np.arange(d), :, np.arange(d)] = turn.T
-        jacobian[: 2 * d, 3 : 3 + 2 * d] = by_disc.reshape(2 * d, 2 * d)
+        jacobian[: 2 * d, first : first + 2 * d] = by_disc.reshape(2 * d, 2 * d)
         jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
         sway = np.zeros((len(jacobian), 2))
         if self.tilt_sigma_rad:
@@ -222,7 +244,8 @@ class Filter(ABC):
             by_scale = -by_xy @ pose[:2] - by_off @ self.camera_xy
             by_line = np.einsum("ei,eij->ej", np.column_stack([by_xy, by_scale]), by_numbers)
             every = np.arange(e)[:, None]
-            jacobian[2 * d + every, 3 + 2 * d + np.arange(of_lines.size).reshape(e, -1)] = by_line
+            columns = first + 2 * d + np.arange(of_lines.size).reshape(e, -1)
+            jacobian[2 * d + every, columns] = by_line
             jacobian[2 * d :, :2] = -points[:, 2:] * by_xy
         # Rotating the robot is rotating the landmarks about it the other way.
         turned = [np.zeros(of_discs.shape), np.zeros(of_lines.shape)]
@@ -230,7 +253,7 @@ class Filter(ABC):
             x, y = (self._linearised[places] - self._linearised[:2]).T
             own[:, 0], own[:, 1] = -y, x
         turned[1][:, 2:3] = 1.0  # the direction of a ray
-        jacobian[:, 2] = -jacobian[:, 3:] @ np.concatenate([own.ravel() for own in turned])
+        jacobian[:, 2] = -jacobian[:, first:] @ np.concatenate([own.ravel() for own in turned])
         return Prediction(np.append(seen.ravel(), bearing), jacobian, numbers, sway)
 
     def innovation_of(self, rows: FrameRows) -> Innovation:

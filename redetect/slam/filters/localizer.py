@@ -27,7 +27,7 @@ class Localizer(Filter):
     ----------
     landmark_map : LandmarkMap
         The landmarks.
-    start, start_covariance, camera_xy : array_like
+    start, start_covariance, camera_xy, common_tilt_variance : array_like
         As in `Filter`; the pose is in the map.
     exact : bool
         Assume that the map is exact, whatever its covariances.
@@ -40,24 +40,26 @@ class Localizer(Filter):
         start_covariance: ArrayLike | None = None,
         camera_xy: ArrayLike = NO_CAMERA,
         *,
+        common_tilt_variance: float = 0.0,
         exact: bool = False,
     ) -> None:
-        super().__init__(start, start_covariance, camera_xy)
+        super().__init__(start, start_covariance, camera_xy, common_tilt_variance)
         discs, lines = landmark_map.discs, landmark_map.lines
-        self.disc_slots = {int(i): POSE_SIZE + 2 * k for k, i in enumerate(discs.ids)}
-        first = POSE_SIZE + 2 * len(discs)
-        self.line_slots = {int(i): first + 2 * k for k, i in enumerate(lines.ids)}
+        first = self.size
+        self.disc_slots = {int(i): first + 2 * k for k, i in enumerate(discs.ids)}
+        of_lines = first + 2 * len(discs)
+        self.line_slots = {int(i): of_lines + 2 * k for k, i in enumerate(lines.ids)}
         places = np.concatenate([discs.xy, lines.xy]).ravel()
         self._grow(len(places))
         self.size = len(self._state)
-        self._state[POSE_SIZE:] = self._linearised[POSE_SIZE:] = places
+        self._state[first:] = self._linearised[first:] = places
         if exact:  # such a map has a known orientation: Jacobians are those at the latest pose
             self._linearised = self._state
         elif len(places):
             joint = landmark_map.joint_covariance
             if joint is None:
                 joint = block_diag(*discs.covariance, *lines.covariance)
-            self._covariance[POSE_SIZE:, POSE_SIZE:] = joint
+            self._covariance[first:, first:] = joint
 
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame whose landmarks are in the map; others are ignored."""

@@ -38,7 +38,7 @@ class Graph:
     camera_xy: FloatArray  # (2,): origin of bearings in the robot frame (m)
     camera: Camera | None = None  # as calibrated; needed if the mounting is estimated
     line_prior: FloatArray | None = None  # (K, 2): priors of lines (m), if bearings are too few
-    tilted: bool = False  # whether a common tilt, part of the covariances, may displace all discs
+    common_tilt_variance: float = 0.0  # of pitch and roll common to all frames (rad^2)
 
     @property
     def disc_row_counts(self) -> IntArray:
@@ -87,7 +87,7 @@ def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Gr
         member_line=none,
         camera_xy=np.zeros(2) if camera is None else np.array(camera.centre[:2]),
         camera=camera,
-        tilted=recording.tilted,
+        common_tilt_variance=recording.common_tilt_variance,
     )
 
 

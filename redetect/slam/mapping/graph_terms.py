@@ -122,7 +122,7 @@ def linearise(
     unknown = weighting.unknown_mounting
     by_shared = by_mounting[:, :, unknown] if unknown else None
     if by_tilt:
-        by_shared = graph.disc_whitening @ rows_by_tilt(graph)
+        by_shared = graph.disc_whitening @ models.common_tilt_jacobian(graph.disc_xy)
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is not unknown
     seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
     whiten = graph.step_whitening
@@ -162,11 +162,6 @@ def _disc_rows(
         return seen - rows, by_pose, by_disc, -moves
     rows, by_floor, by_mounting = rows_as_recorded(graph.camera, seen, estimate.mounting)
     return rows - graph.disc_xy, by_floor @ by_pose, by_floor @ by_disc, by_mounting
-
-
-def rows_by_tilt(graph: Graph) -> FloatArray:
-    """(n, 2, 2) derivatives of rows of discs by a tilt about the robot's origin (m / rad)."""
-    return models.tilt_jacobian(graph.disc_xy) - models.tilt_jacobian(np.zeros((1, 2)))
 
 
 def _members(graph: Graph) -> tuple[IntArray, FloatArray]:

@@ -27,12 +27,9 @@ from redetect.slam.mapping.graph_terms import (
     cost,
     layout_of,
     linearise,
-    rows_by_tilt,
 )
 
 _MOST_STEPS = 200
-# Share of the variance of discs' tilts that is assumed to be common to all frames.
-_COMMON_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,17 +127,11 @@ def _determined(what: str) -> Iterator[None]:
 
 
 def equations_at(graph: Graph, estimate: Estimate, weighting: Weighting) -> solver.NormalEquations:
-    """Normal equations of a map near an estimate, with the considered tilt of all frames.
-
-    Covariances of rows do not state how much of their tilt is common to all frames, such as that of
-    the camera, but they have to contain it: half of the largest possible variance is assumed.
-    """
-    if weighting.calibrate or not graph.tilted or not len(graph.disc_xy):
+    """Normal equations of a map near an estimate, with the considered tilt of all frames."""
+    if weighting.calibrate or not graph.common_tilt_variance:
         return solver.normal_equations(linearise(graph, estimate, weighting))
     found = solver.normal_equations(linearise(graph, estimate, weighting, by_tilt=True))
-    spread = np.linalg.norm(np.linalg.inv(graph.disc_whitening), axis=(1, 2))
-    most = np.max(np.linalg.norm(rows_by_tilt(graph), axis=(1, 2)) / spread)
-    return replace(found, considered=_COMMON_SHARE / most**2 * np.eye(2))
+    return replace(found, considered=graph.common_tilt_variance * np.eye(2))
 
 
 def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Marginals:
