@@ -43,13 +43,16 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
 def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     """Reasons why hardly anything was found, and what to try."""
     plan, camera, found = job.plan, job.plan.camera, summary.found
+    seen = summary.frames - summary.failed
+    if not seen:
+        return  # the reasons are listed frame by frame
     if job.known != Known() and not summary.known:
         yield (
             "no image of this run is in the files of known tilts or IDs, or they have no rows: "
             "were they made from other images?"
         )
     others = summary.rejected["no matching pattern"]
-    if plan.markers and not found["markers"] and others >= summary.frames:
+    if plan.markers and not found["markers"] and others >= seen:
         yield (
             f"{others} squares look like markers, but not of the dictionary "
             f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
@@ -69,7 +72,6 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "according to the calibration, the distortion is not invertible in all of the image: "
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
-    seen = summary.frames - summary.failed
     run, settings = job.run, plan.circles
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
@@ -99,21 +101,23 @@ def _hints_on_discs(
     from detect.discs.radius import find_radius
 
     images, number = list(some_images(run)), summary.found["discs"]
+    seen = summary.frames - summary.failed
+    if not images:  # by chance, all of these failed
+        return
     in_images = f"in {len(images)} of the images"
     discs = (
-        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in "
-        f"{counted(summary.frames, 'frame')}. "
+        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in {counted(seen, 'frame')}. "
     )
     if not number:
         discs += f"{why_none(images, camera, settings)} "
-    if summary.frames < _FEWEST_FRAMES:
+    if seen < _FEWEST_FRAMES:
         yield discs + (
             "If discs are visible, try --radius-m auto, which estimates their radius, and check "
             "the calibration against the images (`detect draw`)."
         )
         return
     likely = find_radius(images, camera, replace(settings, polarity="any"))
-    if likely and likely.discs <= _MANY * len(images) * number / summary.frames:
+    if likely and likely.discs <= _MANY * len(images) * number / seen:
         likely = None  # not worth mentioning
     if likely and abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
         yield discs + (
@@ -123,9 +127,9 @@ def _hints_on_discs(
             "another height or pitch, or the calibration is not its own (`detect draw` shows "
             "outlines)."
         )
-    elif likely and settings.polarity != "any" and number < summary.frames:
+    elif likely and settings.polarity != "any" and number < seen:
         yield discs + f"--polarity any finds {likely.discs} {in_images}."
-    elif _MANY * number < summary.frames:
+    elif _MANY * number < seen:
         yield discs + (
             f"Other radii find no more {in_images}: is the calibration that of this camera "
             "(`detect draw` shows outlines; are its rows full or half?), are discs visible?"

@@ -83,7 +83,7 @@ class ImageNames:
         if path.is_symlink() and link_out(path, *self._homes):
             raise FrameError(
                 f"{path}: cannot be read: is a link that leads out of the run: expected an image "
-                "inside"
+                "inside, or that the whole folder is a link"
             )
         return path
 

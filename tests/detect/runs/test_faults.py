@@ -92,6 +92,17 @@ def log_of(output: Path) -> Any:
     return json.loads(output.with_name(f"{output.name}.log.json").read_text())
 
 
+def test_without_any_readable_image_nothing_is_said_about_discs(
+    small_run: Path, capsys: Captured
+) -> None:
+    for image in (small_run / "images").iterdir():
+        image.write_bytes(b"no image")
+    assert main(["circles", str(small_run)]) == 3
+    shown = capsys.readouterr().err
+    assert "could not be processed" in shown
+    assert "disc" not in shown.replace("detected", "")
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="makes pipes with names")
 def test_bad_frames_cost_themselves(spoilt_run: Path, capsys: Captured) -> None:
     output = spoilt_run / "detected.circles"
