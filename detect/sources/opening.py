@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from camera import Camera, read_camera
@@ -21,6 +22,7 @@ from detect.sources.poses import (
     velocity_poses,
 )
 from detect.sources.video import LiveCamera, VideoFile
+from redetect.landmarks import LandmarkError, read_steps
 
 #: Extensions of bags that are a single file.
 _BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
@@ -76,12 +78,11 @@ def open_source(
         camera = source.calibration(posed=posed)
     frames: Frames
     odometry: Path | None
-    # The odometry of a run folder in the data set's layout.
-    usual = name / f"{name.resolve().name}.txt", name / "map.circles"
-    own = next((path for path in usual if path.is_file()), None)
-    named = options.odometry or options.times
-    if own is not None and not named and isinstance(source, ImageFiles):
-        frames, odometry, has_times = source.along(own), own, False
+    own = None
+    if isinstance(source, ImageFiles) and not options.odometry:
+        own = _steps_of_folder(name)
+    if isinstance(source, ImageFiles) and own is not None:
+        frames, odometry, has_times = source.along(own), own, bool(options.times)
     else:
         frames, odometry = _frames(source, options)
         has_times = source.has_times
@@ -89,6 +90,21 @@ def open_source(
     base = source.output_base
     run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
     return run if camera is None else Run(**vars(run), camera=camera)
+
+
+def _steps_of_folder(folder: Path) -> Path | None:
+    """The STEP rows of a run folder in the data set's layout, which may have been renamed."""
+    for path in (folder / f"{folder.resolve().name}.txt", folder / "map.circles"):
+        if path.is_file():
+            return path
+    found = [path for path in sorted(folder.glob("*.txt")) if _has_steps(path)]
+    return found[0] if len(found) == 1 else None
+
+
+def _has_steps(path: Path) -> bool:
+    with suppress(LandmarkError, OSError):
+        return next(read_steps(path), None) is not None
+    return False
 
 
 def demand_recording(name: Path) -> None:

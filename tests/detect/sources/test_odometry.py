@@ -89,6 +89,28 @@ def test_a_run_folder_as_it_is_has_no_times_file(timed_run: Path) -> None:
     assert isinstance(open_source(timed_run).frames, RunFrames)
 
 
+def test_times_do_not_replace_the_steps_of_a_run_folder(timed_run: Path, tmp_path: Path) -> None:
+    (timed_run / "s.times").rename(tmp_path / "x.times")
+    steps = [frame.step for frame in open_source(timed_run).frames]
+    assert any(step.dy for step in steps)
+    named = ["--times", str(tmp_path / "x.times")]
+    assert main(["circles", str(timed_run), *named]) == 0
+    output = timed_run / "detected.circles"
+    assert [frame.step for frame in read_frames(output)] == steps
+    assert read_times(f"{output}.times") == read_times(tmp_path / "x.times")
+
+
+def test_a_renamed_run_folder_keeps_its_steps(small_run: Path, tmp_path: Path) -> None:
+    steps = [frame.step for frame in open_source(small_run).frames]
+    renamed = small_run.rename(tmp_path / "monday")
+    (renamed / "notes.txt").write_text("STEP by step\n")
+    run = open_source(renamed)
+    assert run.odometry == renamed / "s.txt"
+    assert [frame.step for frame in run.frames] == steps
+    (renamed / "t.txt").write_bytes((renamed / "s.txt").read_bytes())  # which of them is it?
+    assert open_source(renamed).odometry is None
+
+
 def test_frames_are_in_the_order_of_the_rows(timed_run: Path, tmp_path: Path) -> None:
     rows = [r for r in (timed_run / "s.txt").read_text().splitlines() if r.startswith("STEP")]
     swapped = tmp_path / "swapped.txt"
