@@ -30,6 +30,12 @@ USUAL_TILT_DEG = 0.3
 #: Least number of frames with a tilt: the errors of fewer cannot be separated from the run's tilt.
 LEAST_FRAMES = 20
 
+#: Settings of `CircleSettings` that have an effect only without `refine`.
+UNREFINED = (
+    "inner_ring", "outer_ring", "samples", "pairs_inside", "apart_px", "stride", "threshold",
+    "least_contrast",
+)  # fmt: skip
+
 #: Tilt for which positions are corrected.
 Levelling = Literal["none", "frame", "run"]
 Polarity = Literal["any", "light", "dark"]

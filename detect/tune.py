@@ -28,7 +28,7 @@ from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.stream import with_first_look
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
 from detect.seen import Sight
-from detect.settings import CircleSettings
+from detect.settings import UNREFINED, CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import demand_recording, open_run
@@ -61,6 +61,11 @@ def perform(options: Tune) -> int:
         raise DetectError(f"--vary {' '.join(words)}: expected each parameter once")
     grid = () if options.serve else combinations(varied)
     settings = [replace(base, **combination) for combination in grid]
+    if idle := sorted({*varied} & {*UNREFINED}) if all(each.refine for each in settings) else []:
+        raise DetectError(
+            f"--vary {' '.join(idle)}: without effect on discs that are found by their rims: "
+            "expected refine=false beside it"
+        )
 
     demand_recording(options.run)
     run = open_run(options.run, options.camera, options.source)
@@ -108,7 +113,7 @@ def perform(options: Tune) -> int:
     print(f"{output}: {title}: {', '.join(names)}")
     for record in records:
         if record["knee"]:
-            values = " ".join(f"--{name.replace('_', '-')} {record[name]}" for name in varied)
+            values = " ".join(f"{name}={record[name]}" for name in varied)
             print(
                 f"knee: {values}: recall {record['recall']:.3f}, "
                 f"precision {record['precision']:.3f}"
@@ -181,13 +186,10 @@ def tune_run(
     """
     tasks = [FrameTask(frame) for frame in frames]
     with closing(WorkerPool(workers)) as pool:
-        unknown = replace(settings[0], tilt_sigma_deg=None)
-        seen = with_first_look(run, FramePlan(run.camera, circles=unknown), pool)
-        assert seen.circles is not None
-        usual, given = seen.circles.tilt_sigma_deg, [each.tilt_sigma_deg for each in settings]
-        sigmas = [usual if sigma_deg is None else sigma_deg for sigma_deg in given]
-        circles = [replace(s, tilt_sigma_deg=sigma) for s, sigma in zip(settings, sigmas)]
-        plans = [replace(seen, circles=each) for each in circles]
+        # Each setting as if it was alone: what some frames show of the tilt depends on it.
+        plans = [
+            with_first_look(run, FramePlan(run.camera, circles=each), pool) for each in settings
+        ]
         work = (task._replace(plan=plan) for plan in plans for task in tasks)
         done = chain.from_iterable(pool.detect_chunks(work, plans[0]))
         for _ in plans:

@@ -51,7 +51,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("detect export ids", ["is a folder", "such as map.circles"]),
         ("detect export empty", ["is a folder: expected a .circles"]),
         ("detect draw calibrated -o drawn", ["run detect all"]),
-        ("detect tune calibrated --vary threshold=0.3,0.4", ["map.circles", "--reference"]),
+        ("detect tune calibrated --vary evidence=0,1", ["map.circles", "--reference"]),
         ("slam map gone", ["no such landmark file or folder", "expected a run folder"]),
         ("slam map empty", ["map.circles or detected.circles", "`detect circles` writes"]),
         ("slam map empty --lines", ["`detect lines` writes detected.lines", "--stem"]),

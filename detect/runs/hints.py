@@ -11,7 +11,7 @@ from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.runs.plan import Job, Known, RunSummary
 from detect.seen import leaning_camera
-from detect.settings import CircleSettings
+from detect.settings import UNREFINED, CircleSettings
 from detect.sources.interface import Run, read_image
 from detect.sources.poses import SomeFrames
 from redetect.array_types import ByteArray
@@ -59,6 +59,14 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
         )
     if camera is None:
         return
+    if plan.circles is not None and plan.circles.refine:
+        default = CircleSettings()
+        idle = [name for name in UNREFINED if getattr(plan.circles, name) != getattr(default, name)]
+        if idle:
+            yield (
+                f"without effect on discs that are found by their rims: {', '.join(idle)} "
+                "(--no-refine selects them by quality)"
+            )
     if plan.lines is not None and not found["lines"]:
         from lut import cached_vertical_table
 

@@ -32,7 +32,7 @@ def looked_at(source: Path, rows: list[str], output: Path) -> dict[str, bytes]:
     output.mkdir()
     assert main(["draw", str(source), *rows, "-o", str(drawn)]) == 0
     assert main(["report", str(source), *rows, "-o", str(page)]) == 0
-    grid = ["--vary", "threshold=0.3,0.6,0.9", "--jobs", "1"]
+    grid = ["--vary", "evidence=-1,0,1", "--jobs", "1"]
     assert main(["tune", str(source), *grid, *rows[2:], "-o", str(tuned)]) == 0
     return {path.name: path.read_bytes() for path in [page, *drawn.iterdir(), tuned / "table.json"]}
 
@@ -45,7 +45,7 @@ def expected(
     files = looked_at(small_run_template, rows, tmp_path_factory.mktemp("of") / "folder")
     assert sorted(files) == ["page.html", "s.0000.png", "s.0001.png", "s.0002.png", "table.json"]
     assert b"data:image/jpeg" in files["page.html"]
-    assert files["table.json"].count(b'"threshold": 0.') == 4
+    assert files["table.json"].count(b'"evidence": ') == 5
     return files
 
 
@@ -75,5 +75,5 @@ def test_a_live_camera_shows_something_else_by_now(
     if command == "view":
         pytest.importorskip("rerun")
     arguments = [command, "camera:0", "-o", str(small_run / "output")]
-    arguments += ["--vary", "threshold=0.5"] if command == "tune" else []
+    arguments += ["--vary", "evidence=0.5"] if command == "tune" else []
     assert_refused(arguments, small_run, "camera:0: its images are not those of the rows", capsys)

@@ -153,6 +153,7 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     write_reference(small_run, {"s.0001": SMALL_RUN_DISCS["s.0001"]}, "unlisted")
     folder, compared = tmp_path / "t", tmp_path / "c.json"
     arguments = ["tune", str(small_run), "--vary", "samples=8,16", "--vary", "threshold=0.4,0.999"]
+    arguments += ["--vary", "refine=false"]
     assert main([*arguments, "-o", str(folder)]) == 0
     document = json.loads((folder / "table.json").read_text())
     rows = document["trials"]
@@ -161,13 +162,16 @@ def test_trials_are_what_detecting_and_comparing_gives(small_run: Path, tmp_path
     ]  # fmt: skip
     assert (rows[2]["recall"], rows[2]["precision"]) == (0.5, 1.0)
     for row in rows:
-        flags = ["--threshold", str(row["threshold"]), "--samples", str(row["samples"])]
+        flags = ["--quality-threshold", str(row["threshold"]), "--samples", str(row["samples"])]
+        flags.append("--no-refine")
         assert main(["circles", str(small_run), *flags, "--force"]) == 0
         assert main(["compare", str(small_run), "--json", str(compared), "--force"]) == 0
         expected = json.loads(compared.read_text())
         for name in ("reference", "detected", "matched", "recall", "precision"):
             assert row[name] == pytest.approx(expected[name], rel=1e-5)
-    assert document["varied"] == {"samples": "8,16", "threshold": "0.4,0.999"}
+    assert document["varied"] == {
+        "samples": "8,16", "threshold": "0.4,0.999", "refine": "false",
+    }  # fmt: skip
     assert document["settings"]["radius_m"] == 0.1
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert main([*arguments, "-o", str(folder), "--force"]) == 0
@@ -191,9 +195,24 @@ def test_covariances_have_the_usual_tilt_of_the_run(project_root: Path, tmp_path
 
 
 @pytest.mark.long
+def test_a_trial_does_not_depend_on_the_others(project_root: Path, tmp_path: Path) -> None:
+    """Each setting has its own look at some images: with other discs, the tilt is another."""
+    run = project_root / "images" / "e"
+    trials: dict[str, list[dict[str, object]]] = {}
+    for radii in ("0.1", "0.05,0.1"):
+        place = tmp_path / radii
+        some = ["--every", "20", "--vary", f"radius_m={radii}", "-o", str(place)]
+        assert main(["tune", str(run), *some]) == 0
+        trials[radii] = json.loads((place / "table.json").read_text())["trials"]
+    (alone,), (_, beside) = trials.values()
+    del alone["knee"], alone["front"], beside["knee"], beside["front"]
+    assert alone == beside
+
+
+@pytest.mark.long
 def test_processes_give_the_same_bytes(small_run: Path, tmp_path: Path) -> None:
     write_reference(small_run, SMALL_RUN_DISCS)
-    arguments = ["tune", str(small_run), "--vary", "threshold=0.4:0.9:0.25"]
+    arguments = ["tune", str(small_run), "--vary", "evidence=-0.5:0.5:0.5"]
     for jobs in ("1", "2"):
         assert main([*arguments, "--jobs", jobs, "-o", str(tmp_path / jobs)]) == 0
     for name in ("table.json", "curve.png"):
@@ -209,15 +228,17 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused([*tune, *twice], small_run, "expected each parameter once", capsys)
     by_hand = [*tune, "--serve", "--vary", "samples=8"]
     assert_refused(by_hand, small_run, "--serve and --vary: expected one of them", capsys)
-    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "map.circles", capsys)
+    idle = [*tune, "--vary", "threshold=0.5", "refine=true", "samples=8"]
+    assert_refused(idle, small_run, "--vary samples threshold: without effect", capsys)
+    assert_refused([*tune, "--vary", "evidence=0.5"], small_run, "map.circles", capsys)
     write_reference(small_run, {"other": [(0.0, -1.0)]})
-    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "none of the 3", capsys)
+    assert_refused([*tune, "--vary", "evidence=0.5"], small_run, "none of the 3", capsys)
     write_reference(small_run, SMALL_RUN_DISCS)
     assert_refused([*tune, "--vary", "threshold=2"], small_run, "threshold is 2", capsys)
     assert not (tmp_path / "t").exists()
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / "curve.png").write_bytes(b"mine")
-    assert_refused([*tune, "--vary", "threshold=0.5"], small_run, "--force", capsys)
+    assert_refused([*tune, "--vary", "evidence=0.5"], small_run, "--force", capsys)
     with pytest.raises(SystemExit) as ended:
         main([*tune, "--treshold", "0.5"])
     assert ended.value.code == 2
