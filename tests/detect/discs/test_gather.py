@@ -109,3 +109,24 @@ def test_of_large_discs_all_of_the_edge_is_taken_and_some_of_the_rest(table: Vot
     inner = np.linalg.norm(off, axis=-1) < 0.5 * RADIUS
     taken = np.isin(np.array(list(every))[inner], index)
     assert np.mean(taken) == pytest.approx(0.5, abs=0.2)
+
+
+@pytest.mark.parametrize("half_px", [60, 150, 420, 900])
+def test_of_still_larger_discs_rows_are_taken_from_all_of_it(
+    table: VoteTable, half_px: int
+) -> None:
+    """Seen from above, so large that its edge alone has more pixels than are fitted."""
+    side = 3 * half_px
+    v, u = np.mgrid[:side, :side]
+    floor_xy = np.stack([u, v], axis=-1).astype(np.float32) * np.float32(RADIUS / half_px)
+    image = np.zeros((side, side), np.uint8)
+    candidate = Candidate(side // 2, side // 2, RADIUS, 0.8)
+    overhead = table._replace(floor_xy=floor_xy)
+    _, ends, real, patch = gathered(overhead, image, candidate)
+    pixels = np.bincount(np.repeat(np.arange(SECTORS), np.diff(ends))[real], minlength=SECTORS)
+    assert pixels.min() > 0.7 * pixels.max()
+    assert pixels.sum() > 1000
+    rows = patch["pixel"][: ends[SECTORS]][real] // side
+    below, above = side // 2 - rows.min(), rows.max() - side // 2
+    assert abs(int(below) - int(above)) <= 0.05 * half_px
+    assert min(below, above) > half_px
