@@ -40,7 +40,7 @@ EXPERT: dict[type, frozenset[str]] = {
         CircleSettings, "radius_m", "polarity", "evidence",
         "calibration_px", "tilt_sigma_deg",
     ),
-    LineSettings: all_but(LineSettings, "threshold", "join_px"),
+    LineSettings: all_but(LineSettings, "threshold", "join_rad"),
     MarkerSettings: all_but(MarkerSettings, "dictionary"),
     options.RowFiles: all_but(options.RowFiles, "rows", "reference"),
     options.CompareOptions: all_but(options.CompareOptions, "only_identified"),

@@ -11,8 +11,10 @@ from tyro.conf import arg
 
 from detect.errors import DetectError
 from redetect.bounds import (
+    NOT_NEGATIVE,
     Bounds,
     LimitOr0,
+    MaybeFloat,
     NotNegative,
     Positive,
     Share,
@@ -108,6 +110,8 @@ class LineSettings:
     #: Of two lines of equal polarity closer than this at the horizon, only the stronger is kept.
     same_edge_px: NotNegative = 2.0
     join_px: NotNegative = 2.7  #: Lines closer than this at the horizon are joined to one row.
+    #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
+    join_rad: Annotated[MaybeFloat, NOT_NEGATIVE, arg(name="join-threshold")] = None
     #: Lines with less than this share of the other's evidence are dropped instead.
     join_share: NotNegative = 0.5
     #: Joined lines are weighted by their evidence, and the row has the ends of the strongest; or
@@ -159,8 +163,8 @@ TiltNumbers = namedtuple(
 )
 JoiningNumbers = namedtuple(
     "JoiningNumbers",
-    "building_deg same_edge_px join_px join_share joined_equally shoulder_px shoulder_share "
-    "sigma_px level",
+    "building_deg same_edge_px join_px join_rad join_share joined_equally shoulder_px "
+    "shoulder_share sigma_px level",
 )
 
 
@@ -177,9 +181,12 @@ class LineNumbers(NamedTuple):
         """Those of some settings, for rows of some height in pixel widths."""
         # Kernels are compiled for 1 and 1.0 separately: each number gets its default's type.
         given = {
-            name: type(usual)(getattr(settings, name)) for name, usual in vars(DEFAULT).items()
+            name: type(usual)(getattr(settings, name))
+            for name, usual in vars(DEFAULT).items()
+            if usual is not None
         }
         given |= {
+            "join_rad": math.nan if settings.join_rad is None else settings.join_rad,
             "least_points": settings.least_points(row_aspect),
             "joined_equally": settings.joined == "equal",
             "level": settings.alpha == "level",

@@ -16,7 +16,6 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from redetect.bounds import (
     ABOVE_0,
-    NOT_NEGATIVE,
     SHARE,
     Bounded,
     MaybeFloat,
@@ -155,8 +154,6 @@ class Lines(DetectorFlags):
     tilt: MaybePath = None
     #: A .lines file whose IDs are transferred where the match is unambiguous.
     ids_from: MaybePath = None
-    #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
-    join_threshold: Annotated[MaybeFloat, NOT_NEGATIVE] = None
     #: Folder for images with lines and their standard deviations drawn in, after detection.
     draw: MaybePath = None
     #: Draw all tracks instead, rejected ones with the reason; repeats the detection.
@@ -203,8 +200,6 @@ class All(DetectorFlags):
     tilt: Levelling = "run"
     #: Estimate the radius of the discs from some images first, the same as --radius-m auto.
     find_radius: bool = False
-    #: Lines whose bearings are closer than this (radians) are joined; overrides `--join-px`.
-    join_threshold: Annotated[MaybeFloat, NOT_NEGATIVE] = None
     circles: OmitArgPrefixes[CircleSettings] = field(default_factory=CircleSettings)
     lines: OmitArgPrefixes[LineSettings] = field(default_factory=LineSettings)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from detect.drawing.picture_files import demand_pictures
 from detect.errors import DetectError, WorkerError
-from detect.line_settings import LineSettings
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.row_files import KINDS, RunRows, read_head
 from detect.runs.hints import hints, some_images
@@ -88,16 +87,9 @@ def _circles(command: Circles, run: Run) -> Job:
 
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
-    plan = FramePlan(run.camera, lines=_joined(command.detector, command.join_threshold, run))
+    plan = FramePlan(run.camera, lines=command.detector)
     places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
     return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
-
-
-def _joined(settings: LineSettings, threshold_rad: float | None, run: Run) -> LineSettings:
-    if threshold_rad is None:
-        return settings
-    # On the horizon straight ahead, a bearing of one radian is scale_x pixels wide.
-    return replace(settings, join_px=threshold_rad * run.camera.scale_x)
 
 
 def _markers(command: Markers) -> Job:
@@ -114,10 +106,9 @@ def _all(command: All, run: Run) -> Job:
         for kind in ("lines", "tilt", "circles")
     }
     circles = _with_radius(command.circles, run) if command.find_radius else command.circles
-    lines = _joined(command.lines, command.join_threshold, run)
     return Job(
         run,
-        FramePlan(run.camera, lines=lines, circles=circles, levelling=command.tilt),
+        FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
         places,
         replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
         base=places["lines"].with_suffix(""),

@@ -63,7 +63,7 @@ def _join(
     _leave_out(chosen, alpha, tracks.polarity, fits, evidence, numbers, fate)
     chosen = chosen[accepted_tracks(fate[chosen])]
     count = len(chosen)
-    group = chain_neighbours(alpha[chosen], numbers.join_px * fits.pixel_rad[chosen])
+    group = chain_neighbours(alpha[chosen], _reach(fits.pixel_rad[chosen], numbers))
     # The strongest track of each line stays its first.
     bounds = np.zeros(count + 1, np.int64)
     members, lines, n = np.empty(count, np.int64), 0, 0
@@ -99,6 +99,15 @@ def _join(
                 ends[n, 2 * end] += share * right
                 ends[n, 2 * end + 1] += share * down
     return Lines(ends, joined, beta, sigma, members, bounds)
+
+
+@kernel()
+def _reach(pixel_rad: FloatArray, numbers: JoiningNumbers) -> FloatArray:
+    """Bearings of lines with these widths of a pixel are joined if closer than this (rad)."""
+    reach = np.full(len(pixel_rad), numbers.join_rad)
+    if math.isnan(numbers.join_rad):
+        reach[:] = numbers.join_px * pixel_rad
+    return reach
 
 
 @kernel()
@@ -138,19 +147,20 @@ def _leave_out(
     evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Suppress tracks, from the strongest on, on the same edge as a stronger one or beside it."""
-    pixel, contrast = fits.pixel_rad, fits.contrast
+    pixel, contrast, reach = fits.pixel_rad, fits.contrast, _reach(fits.pixel_rad, numbers)
     for k in range(len(tracks)):
         t = tracks[k]
         for s in tracks[:k]:
             if fate[s] != Fate.ACCEPTED:
                 continue
-            near_px = abs(_wrapped(alpha[t] - alpha[s])) / pixel[t]
+            off = abs(_wrapped(alpha[t] - alpha[s]))
+            near_px = off / pixel[t]
             if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
                 fate[t] = Fate.SAME_EDGE
                 break
             faint = evidence[t] < numbers.join_share * evidence[s]
             fainter = contrast[t] < numbers.shoulder_share * contrast[s]
-            if (near_px < numbers.join_px and faint) or (near_px < numbers.shoulder_px and fainter):
+            if (off < reach[t] and faint) or (near_px < numbers.shoulder_px and fainter):
                 fate[t] = Fate.BESIDE_A_STRONGER_EDGE
 
 

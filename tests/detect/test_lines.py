@@ -219,6 +219,17 @@ def test_close_edges_are_joined_to_one_row() -> None:
     assert joined.lines.sigma_rad[0] == pytest.approx(np.sqrt(spread), rel=1e-3)
 
 
+@pytest.mark.parametrize("bearing", [0.0, 0.45, -0.45])
+def test_the_threshold_for_joining_is_an_angle(bearing: float) -> None:
+    """Towards the border of an image, an angle is more pixels than in its middle."""
+    camera = pinhole(320, 160, 300.0)
+    table = build_vertical_table(camera)
+    bar = [Edge(bearing + 0.01, 80.0), Edge(bearing - 0.01, -80.0)]
+    image = render(camera, bar, grey=80.0)
+    for threshold, lines in ((0.0196, 2), (0.0204, 1)):
+        assert len(detect_lines(image, table, replace(DEFAULT, join_rad=threshold))) == lines
+
+
 def test_rows_of_the_published_preset_join_lines_as_equals() -> None:
     """Two edges 8 px apart, one of them faint and short: the means of all that they have."""
     camera = pinhole(240, 160, 200.0)

@@ -73,3 +73,14 @@ def test_nothing_is_known_of_nothing() -> None:
 
 def test_a_row_of_several_ids_keeps_them() -> None:
     assert ids_of_rows(np.array([[0.0, -2.0]]), [row(0.0, -2.0, 3, 9)]) == [(3, 9)]
+
+
+def test_rows_with_a_singular_covariance_give_no_id() -> None:
+    nothing = CircleLandmark(0.0, -1.0, 0.9, 0.0, 0.0, 0.0, (1,))
+    flat = CircleLandmark(0.5, -1.0, 0.9, 1e-4, 1e-4, 1e-4, (2,))
+    xy = np.array([[0.0, -1.0], [0.5, -1.0], [-0.5, -1.0]])
+    known = [nothing, flat, row(-0.5, -1.0, 3)]
+    assert ids_of_rows(xy, known) == [(), (), (3,)]
+    # With errors of their own, the discs determine the distance.
+    own = np.tile(1e-4 * np.eye(2), (3, 1, 1))
+    assert ids_of_rows(xy, known, own) == [(1,), (2,), (3,)]
