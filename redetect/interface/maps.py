@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, Unpack, get_type_hints
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from camera import Camera
 from redetect.bounds import demand_fields
 from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks import map_file
@@ -21,6 +23,7 @@ from redetect.slam.commands.map import mapped_run_of
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import FilterRun
 from redetect.slam.mapping.run_map import MappedRun
+from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined
@@ -28,6 +31,37 @@ from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
 Command = TypeVar("Command", Map, Localize)
+
+
+class RowOptions(TypedDict, total=False):
+    """Which rows of a run are read, and how; flags of the same names describe them."""
+
+    stem: str | None
+    camera: Camera | PathLike | None
+    odometry_noise: OdometryNoise
+
+
+class MapOptions(RowOptions, total=False):
+    """Options of `map_landmarks`: flags of `slam map` (`redetect.slam.options.Map`)."""
+
+    more: PathLike | Sequence[PathLike]  #: Further runs of the same building.
+    calibrate: bool
+    place: bool
+    row_errors: Literal["corrected", "recorded"]
+    solver: Literal["separable", "gtsam"]
+    loss: Literal["none", "huber", "cauchy", "geman-mcclure"]
+    loss_scale: float
+    start: ArrayLike  #: (3,) pose at the start in the map (m, m, rad).
+
+
+class LocalizeOptions(RowOptions, total=False):
+    """Options of `localize`: flags of `slam localize` (`redetect.slam.options.Localize`)."""
+
+    association: Literal["known", "nearest", "joint"]
+    gate_probability: float
+    start: ArrayLike  #: (3,) pose at the start in the map (m, m, rad).
+    start_sigma: ArrayLike  #: (3,) its standard deviations.
+    lost: bool
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -148,7 +182,7 @@ class Localization(Poses):
 
 @keywords_named()
 def map_landmarks(
-    run: PathLike, *, circles: bool = True, lines: bool = False, **options: Any
+    run: PathLike, *, circles: bool = True, lines: bool = False, **options: Unpack[MapOptions]
 ) -> RunMap:
     """Map the landmarks of a run by least squares, as `slam map` does.
 
@@ -158,7 +192,7 @@ def map_landmarks(
         Run folder, or a `.circles` or `.lines` file, with identifiers.
     circles, lines : bool
         Which landmarks to use.
-    **options
+    **options : MapOptions
         Further flags of `slam map` (`redetect.slam.options.Map`), such as `stem`, `calibrate`,
         `loss`, `start` or `more`, the paths of further runs of the same building.
 
@@ -173,7 +207,9 @@ def map_landmarks(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     """
-    command = _checked(Map(run=_run(run), circles=circles, lines=lines, **_as_paths(options)))
+    command = _checked(
+        Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
+    )
     mapped = mapped_run_of(command, joined(read_runs(command)))
     return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
@@ -181,7 +217,7 @@ def map_landmarks(
 @keywords_named()
 def localize(
     run: PathLike, landmarks: RunMap | PathLike, *, circles: bool = True, lines: bool = False,
-    **options: Any,
+    **options: Unpack[LocalizeOptions],
 ) -> Localization:  # fmt: skip
     """Localise a run in a map, as `slam localize` does.
 
@@ -193,7 +229,7 @@ def localize(
         The map, or its `map.csv`.
     circles, lines : bool
         Which landmarks to use.
-    **options
+    **options : LocalizeOptions
         Further flags of `slam localize` (`redetect.slam.options.Localize`), such as `association`
         or `start`.
 
@@ -210,9 +246,8 @@ def localize(
     """
     in_memory = isinstance(landmarks, RunMap)
     in_file = path_of("the map" if in_memory else landmarks, "a RunMap, or its map.csv", SlamError)
-    command = _checked(
-        Localize(run=_run(run), map=in_file, circles=circles, lines=lines, **_as_paths(options))
-    )
+    flags = _flags(options, LocalizeOptions)
+    command = _checked(Localize(run=_run(run), map=in_file, circles=circles, lines=lines, **flags))
     if isinstance(landmarks, RunMap):
         places = landmarks.result.landmarks_jointly()
     else:
@@ -221,20 +256,23 @@ def localize(
     return Localization(result.path, result, places)
 
 
-def _as_paths(options: Mapping[str, Any]) -> dict[str, Any]:
-    paths = dict(options)
-    if without_effect := paths.keys() & {"output", "force", "interactive", "reference"}:
+def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
+    """Options as the command has them; a SlamError if there are none of that name."""
+    flags, known = dict(options), get_type_hints(kind)
+    if without_effect := flags.keys() & {"output", "force", "interactive", "reference"}:
         raise SlamError(f"{', '.join(sorted(without_effect))}: of the command only")
-    for name in paths.keys() & {"start", "start_sigma"}:
-        paths[name] = tuple(np.ravel(paths[name]).tolist())
-        if len(paths[name]) != 3:
+    if unknown := sorted(flags.keys() - known):
+        raise SlamError(f"{', '.join(unknown)}: no such option: expected {', '.join(known)}")
+    for name in flags.keys() & {"start", "start_sigma"}:
+        flags[name] = tuple(np.ravel(flags[name]).tolist())
+        if len(flags[name]) != 3:
             raise SlamError(f"{name} is {excerpt(options[name])}: expected three numbers")
-    if isinstance(paths.get("camera"), str | os.PathLike):
-        paths["camera"] = Path(paths["camera"])
-    if "more" in paths:
-        more = paths["more"]
-        paths["more"] = tuple(map(_run, [more] if isinstance(more, str | os.PathLike) else more))
-    return paths
+    if isinstance(flags.get("camera"), str | os.PathLike):
+        flags["camera"] = Path(flags["camera"])
+    if "more" in flags:
+        more = flags["more"]
+        flags["more"] = tuple(map(_run, [more] if isinstance(more, str | os.PathLike) else more))
+    return flags
 
 
 def _run(name: PathLike) -> Path:

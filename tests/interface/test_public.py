@@ -8,9 +8,9 @@ import subprocess
 import sys
 import types
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import cv2
 import numpy as np
@@ -18,7 +18,9 @@ import pytest
 
 import redetect as rd
 from detect.errors import DetectError, FrameError
+from redetect.interface.maps import LocalizeOptions, MapOptions
 from redetect.landmarks import read_frames, write_frames
+from redetect.slam.options import Localize, Map
 from redetect.storage import OutputExistsError
 from redetect.tables import FrameLibrary, ResultError
 
@@ -319,11 +321,13 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     with pytest.raises(rd.Error, match="circles and lines are False"):
         rd.map(demo, circles=False)
     with pytest.raises(rd.Error, match="association is 'all': expected one of known, nearest"):
-        rd.localize(demo, landmarks, association="all")
+        rd.localize(demo, landmarks, association="all")  # type: ignore[arg-type]
     with pytest.raises(rd.Error, match=r"^1 poses: expected 81, as in this run"):
         in_memory.distance(landmarks.path.part(0, 1))
     with pytest.raises(rd.Error, match="force, reference: of the command only"):
-        rd.localize(demo, landmarks, reference="path.csv", force=True)
+        rd.localize(demo, landmarks, reference="path.csv", force=True)  # type: ignore[call-arg]
+    with pytest.raises(rd.Error, match="calibrat: no such option: expected stem, camera,"):
+        rd.map(demo, calibrat=True)  # type: ignore[call-arg]
     with pytest.raises(rd.Error, match=r"start is \(0, 0\): expected three numbers"):
         rd.map(demo, start=(0, 0))
     moved = rd.map(demo, start=np.array([1.0, 2.0, 0.5]))
@@ -337,6 +341,12 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
         assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
     assert len(repr(landmarks)) < 200
     assert len(repr(in_memory)) < 200
+
+
+@pytest.mark.parametrize(("options", "flags"), [(MapOptions, Map), (LocalizeOptions, Localize)])
+def test_options_are_the_flags_of_the_command(options: type, flags: type) -> None:
+    of_command = {"run", "circles", "lines", "map", "output", "force", "interactive", "reference"}
+    assert get_type_hints(options).keys() == {each.name for each in fields(flags)} - of_command
 
 
 # -- explanations ---------------------------------------------------------------------------
