@@ -22,7 +22,7 @@ from detect.discs.candidates import alone_published, apart, local_maxima
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import JUDGED, JudgedCandidates, judge
+from detect.discs.judgement import Fate, JudgedCandidates, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_part_quality
@@ -205,7 +205,7 @@ def judged(
 
 def adjusted_log_odds(judgement: JudgedCandidates, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
-    rims = np.flatnonzero(judgement.fate == JUDGED)
+    rims = np.flatnonzero(judgement.fate == Fate.JUDGED)
     step, log_odds = judgement.step[rims], judgement.log_odds[rims]
     sure = log_odds >= SURE
     penalty = paleness_penalty(step, judgement.floor_grey[rims], sure)

@@ -27,7 +27,7 @@ from detect.circles import (
     vote_shape,
     within_margins,
 )
-from detect.discs.judgement import FATES, JUDGED, LEAST_RIM, RIM_RADIUS, JudgedCandidates
+from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, Fate, JudgedCandidates
 from detect.discs.radius import FACTOR, find_radius
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
@@ -39,6 +39,11 @@ Stage = Literal[
     "disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc", "outside"
 ]
 
+_STAGES: dict[Fate, Stage] = {
+    Fate.FEW_STEPS: "steps",
+    Fate.GLANCE: "glance",
+    Fate.NO_RIM: "rim",
+}
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
 #: Largest distance of a candidate from the given position, radii.
@@ -236,18 +241,18 @@ def _candidates(scene: _Scene) -> Iterator[Candidate]:
     sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[settings.polarity]
     pixels = camera.project_floor(judgement.floor_xy)
     for k in np.flatnonzero(~taken).tolist():
-        fate, value = FATES[judgement.fate[k]], float(judgement.value[k])
-        if fate == "same rim":
+        fate, value = Fate(judgement.fate[k]), float(judgement.value[k])
+        if fate is Fate.SAME_RIM:
             continue
-        contrast = float(judgement.step[k]) if fate == "judged" else math.nan
+        contrast = float(judgement.step[k]) if fate is Fate.JUDGED else math.nan
         stage: Stage = "evidence"
         limit = settings.evidence
         if judgement.sign[k] * sign < 0.0:
-            if fate != "judged" or value < 0.0:
+            if fate is not Fate.JUDGED or value < 0.0:
                 continue
             stage = "polarity"
-        elif fate != "judged":
-            stage, limit = fate, LEAST_RIM if fate == "rim" else math.nan
+        elif fate is not Fate.JUDGED:
+            stage, limit = _STAGES[fate], LEAST_RIM if fate is Fate.NO_RIM else math.nan
         elif evidence[k] < limit:
             value = float(evidence[k])
         else:
@@ -307,7 +312,7 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
         yield f"--radius-m {radius_m:.3f} finds {gain}."
     rims = scene.judgement[1]
-    discs = (rims.fate == JUDGED) & (rims.log_odds > settings.evidence)
+    discs = (rims.fate == Fate.JUDGED) & (rims.log_odds > settings.evidence)
     sizes = rims.radius[discs] / (RIM_RADIUS * settings.radius_m)
     if len(sizes) >= _FEWEST_RIMS:
         off = float(np.median(sizes)) - 1.0

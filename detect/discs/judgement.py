@@ -10,7 +10,8 @@ grey values around the candidate and from the rim.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,10 +65,20 @@ _SAME = 0.1
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
+class Fate(IntEnum):
+    """The stage that rejected a candidate, in order; or it was judged by its rim."""
+
+    FEW_STEPS = 0
+    GLANCE = 1
+    NO_RIM = 2
+    SAME_RIM = 3
+    JUDGED = 4
+
+
 class JudgedCandidates(NamedTuple):
     """N candidates and their fates; `step` and later fields are valid for judged rims only."""
 
-    fate: NDArray[np.int8]  #: (N,) indices of `FATES`
+    fate: NDArray[np.int8]  #: (N,) of `Fate`
     value: FloatArray  #: (N,) the number that decided: log-odds, or a share of the rim
     sign: FloatArray  #: (N,) 1 for light discs, -1 for dark ones
     features: FloatArray  #: (N, len(FEATURES))
@@ -92,12 +103,6 @@ NO_CANDIDATES = JudgedCandidates._make(
     [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), *np.empty((2, 0)),
      *np.empty((3, 0, 2)), *np.empty((4, 0))]
 )  # fmt: skip
-
-#: Fates of candidates: the stage that rejected it, in order; the last was judged by its rim.
-FATES: tuple[Literal["steps", "glance", "rim", "same rim", "judged"], ...] = (
-    "steps", "glance", "rim", "same rim", "judged",
-)  # fmt: skip
-_FEW_STEPS, _GLANCED, _NO_RIM, _SAME_RIM, JUDGED = range(len(FATES))
 
 
 @kernel()
@@ -127,7 +132,7 @@ def judge(
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
     seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
     step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    fate, value = np.full(n, _FEW_STEPS, np.int8), np.zeros(n)
+    fate, value = np.full(n, Fate.FEW_STEPS, np.int8), np.zeros(n)
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
@@ -139,15 +144,15 @@ def judge(
             continue
         inputs, scales = network_inputs(grey, scale, sign)
         score = candidates.score[i : i + 1]
-        fate[i], value[i] = _GLANCED, network_log_odds(inputs, scales, score, networks.glance)
+        fate[i], value[i] = Fate.GLANCE, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
         seen = profiles(image, camera_numbers, x, y, nominal)
         rim = follow_rim(image, camera_numbers, seen, sign * contrast)
-        fate[i], value[i] = _NO_RIM, rim.agreeing
+        fate[i], value[i] = Fate.NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
-        fate[i] = _SAME_RIM
+        fate[i] = Fate.SAME_RIM
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
@@ -162,7 +167,7 @@ def judge(
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
                     rim, odds, noted, seen = again, more, noted_again, seen_again
-        fate[i], value[i], log_odds[i], step[i] = JUDGED, odds, odds, rim.step
+        fate[i], value[i], log_odds[i], step[i] = Fate.JUDGED, odds, odds, rim.step
         agreeing[i], radius[i] = rim.agreeing, rim.radius
         for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
             features[i, k] = noted[k]

@@ -23,7 +23,7 @@ from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
 from detect.circles import candidates_of, judged, scene_of, vote_shape
-from detect.discs.judgement import FEATURES, GLANCED_AT, JUDGED, glance, pairs_of_steps
+from detect.discs.judgement import FEATURES, GLANCED_AT, Fate, glance, pairs_of_steps
 from detect.discs.rim import DIRECTIONS, STEPS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.settings import CircleSettings
@@ -130,7 +130,7 @@ class _Gathering:
             seen = candidates.score[k : k + 1], candidates.sign[k] * grey[None], scale[None]
             self.glances.append((*seen, *row))
         rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
-        rims = rims.where((rims.fate == JUDGED) & np.isfinite(rims.features).all(axis=1))
+        rims = rims.where((rims.fate == Fate.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
             views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])
             self.looks.append((rims.features[k], *views, *row))
