@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -18,6 +18,7 @@ from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
 from redetect.bounds import expectation
+from redetect.json_text import json_text
 from redetect.messages import excerpt
 from redetect.storage.bounded import read_text
 
@@ -116,5 +117,4 @@ def word_value(kind: type, name: str, word: str) -> Any:
 
 def settings_text(**settings: CircleSettings | LineSettings | MarkerSettings) -> str:
     """Content of a settings file, by kind: circles, lines, markers."""
-    content = {"settings": {kind: asdict(each) for kind, each in settings.items()}}
-    return f"{json.dumps(content, indent=1)}\n"
+    return f"{json_text({'settings': settings}, limits=True)}\n"

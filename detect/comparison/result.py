@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from html import escape
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -15,6 +14,7 @@ from scipy.special import chdtri
 from detect.options import CompareOptions
 from detect.seen import Sight
 from redetect.array_types import FloatArray
+from redetect.json_text import json_text, plain
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.messages import counted
 from redetect.tables import Table
@@ -233,12 +233,12 @@ class Comparison(RunMatch, Table, ABC):
             "pairs": self.matched,
             "worst_frames": [self._row(match) for match in self.worst_frames(WORST_FRAMES)],
         }
-        plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
-        return plain
+        converted: dict[str, Any] = plain(figures)
+        return converted
 
     def to_json(self) -> str:
         """`figures` as JSON; numbers are finite or null."""
-        return f"{json.dumps(self.figures(), indent=2)}\n"
+        return f"{json_text(self.figures(), indent=2)}\n"
 
     def _repr_html_(self) -> str:
         words = "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())
