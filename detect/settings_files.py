@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
-from redetect.bounds import expectation
+from redetect.bounds import expectation, number_in, whole_number_in
 from redetect.json_text import json_text
 from redetect.messages import excerpt
 from redetect.storage.bounded import read_text
@@ -109,9 +109,9 @@ def word_value(kind: type, name: str, word: str) -> Any:
     Raises DetectError if that fails, or there is no such setting.
     """
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
-    for number in (float, int):  # a float setting accepts whole numbers
+    for read in (number_in, whole_number_in):  # a float setting accepts whole numbers
         with suppress(ValueError):
-            value = number(word)
+            value = read(word)
     return setting_value(kind, name, value)
 
 
