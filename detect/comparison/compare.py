@@ -311,25 +311,24 @@ def match_runs(
         frames = reference[name], detected[name]
         view = None if sight is None else sight.of(*frames)
         matches.append(match_frame(kind, name, (*frames, known.get(name)), options, view))
-    matched, joined, missed, extra, set_aside = (
-        sum(len(getattr(match, name)) for match in matches)
+    counts: dict[str, int] = {
+        name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
-    )
-    found, wanted, detected_rows = matched + joined, matched + joined + missed, matched + extra
+    }
+    matched, extra = counts["matched"], counts["extra"]
+    found = matched + counts["joined"]
+    wanted = found + counts["missed"]
     return RunMatch(
-        *names,
-        options,
+        reference_name=names[0],
+        detected_name=names[1],
+        options=options,
         reference=wanted,
-        detected=detected_rows,
-        matched=matched,
-        joined=joined,
+        detected=matched + extra,
         found=found,
-        missed=missed,
-        extra=extra,
-        set_aside=set_aside,
+        **counts,
         on_lookalikes=None,
         recall=found / wanted if wanted else None,
-        precision=matched / detected_rows if detected_rows else None,
+        precision=matched / (matched + extra) if matched + extra else None,
         frames=tuple(matches),
         frames_only_in_reference=tuple(name for name in reference if name not in detected),
         frames_only_in_detected=tuple(name for name in detected if name not in reference),
