@@ -17,7 +17,7 @@ PROGRAM = Program(
         Calibrate: "camera.calibration.command",
         Floor: "camera.calibration.floor",
         # Needs detection, so the command is implemented in `detect`.
-        Level: "detect.mounting",
+        Level: "detect.commands.level",
         Convert: "camera.formats.command",
     },
 )

@@ -13,6 +13,15 @@ from camera.model import Camera
 from redetect.array_types import FloatArray
 from redetect.compiled import kernel
 
+# Places of the parameters in `camera_numbers`. A named tuple in place of that vector would take
+# longer to compile, in every kernel to which it is passed.
+_SCALE_X, _SCALE_Y, _OFFSET_X, _OFFSET_Y = range(4)
+_A2, _A3, _B1, _B2, _B3, _R_MAX = range(4, 10)
+# Of the rotation: axes of the camera, then of the robot.
+_XX, _XY, _XZ, _YX, _YY, _YZ, _ZX, _ZY, _ZZ = range(10, 19)
+_CENTRE_X, _CENTRE_Y, _CENTRE_Z = range(19, 22)
+_K1, _K2, _P1, _P2, _K3 = range(22, 27)
+
 _NEWTON_STEPS = 100
 _LAST_STEP = 1e-9
 _CONVERGED = 1e-12
@@ -20,10 +29,10 @@ _SMALLEST_SHARE = 1e-6
 
 
 def camera_numbers(camera: Camera) -> FloatArray:
-    """All parameters of a projection as one vector, the form of a camera for kernels.
+    """(27,) all parameters of a projection as one vector, the form of a camera for kernels.
 
-    Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
-    robot -> camera row by row; the camera's centre in the robot frame; k1, k2, p1, p2, k3.
+    Their order is that of the places above; the rotation is robot -> camera, row by row, the
+    camera's centre is in the robot frame.
     """
     return np.array(
         [
@@ -43,7 +52,7 @@ def published_camera_numbers(camera: Camera) -> FloatArray:
     It uses the transpose of the rotation, which the file gives in few digits, not the inverse.
     """
     numbers = camera_numbers(camera)
-    numbers[10:19] = camera.rotation.T.ravel()
+    numbers[_XX : _ZZ + 1] = camera.rotation.T.ravel()
     return numbers
 
 
@@ -143,31 +152,33 @@ def straighten_points(
 @kernel()
 def project_direction(numbers: FloatArray, dx: float, dy: float, dz: float) -> tuple[float, float]:
     """Pixel (u, v) of a direction in the robot frame; both NaN where it is undefined."""
-    z = numbers[16] * dx + numbers[17] * dy + numbers[18] * dz
+    z = numbers[_ZX] * dx + numbers[_ZY] * dy + numbers[_ZZ] * dz
     if not z > 0.0:
         return math.nan, math.nan
-    x = (numbers[10] * dx + numbers[11] * dy + numbers[12] * dz) / z
-    y = (numbers[13] * dx + numbers[14] * dy + numbers[15] * dz) / z
+    x = (numbers[_XX] * dx + numbers[_XY] * dy + numbers[_XZ] * dz) / z
+    y = (numbers[_YX] * dx + numbers[_YY] * dy + numbers[_YZ] * dz) / z
     r = math.sqrt(x * x + y * y)
-    if not r <= numbers[9]:
+    if not r <= numbers[_R_MAX]:
         return math.nan, math.nan
-    factor = 1.0 + r * (numbers[4] + r * numbers[5]) / (
-        1.0 + r * (numbers[6] + r * (numbers[7] + r * numbers[8]))
+    factor = 1.0 + r * (numbers[_A2] + r * numbers[_A3]) / (
+        1.0 + r * (numbers[_B1] + r * (numbers[_B2] + r * numbers[_B3]))
     )
-    u, v = numbers[0] * x * factor, numbers[1] * y * factor
-    k1, k2, p1, p2, k3 = numbers[22], numbers[23], numbers[24], numbers[25], numbers[26]
+    u, v = numbers[_SCALE_X] * x * factor, numbers[_SCALE_Y] * y * factor
+    k1, k2, p1, p2, k3 = numbers[_K1], numbers[_K2], numbers[_P1], numbers[_P2], numbers[_K3]
     if k1 != 0.0 or k2 != 0.0 or p1 != 0.0 or p2 != 0.0 or k3 != 0.0:
         squared = x * x + y * y
         along = 2.0 * (p2 * x + p1 * y) + squared * (k1 + squared * (k2 + squared * k3))
-        u += numbers[0] * (along * x + squared * p2)
-        v += numbers[1] * (along * y + squared * p1)
-    return u + numbers[2], v + numbers[3]
+        u += numbers[_SCALE_X] * (along * x + squared * p2)
+        v += numbers[_SCALE_Y] * (along * y + squared * p1)
+    return u + numbers[_OFFSET_X], v + numbers[_OFFSET_Y]
 
 
 @kernel()
 def project_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> tuple[float, float]:
     """Pixel (u, v) of a floor point; both NaN where the projection is undefined."""
-    return project_direction(numbers, x_robot - numbers[19], y_robot - numbers[20], -numbers[21])
+    return project_direction(
+        numbers, x_robot - numbers[_CENTRE_X], y_robot - numbers[_CENTRE_Y], -numbers[_CENTRE_Z]
+    )
 
 
 @kernel()

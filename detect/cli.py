@@ -108,16 +108,16 @@ PROGRAM = DetectProgram(
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
         **dict.fromkeys(
-            (options.Circles, options.Lines, options.Markers, options.All), "detect.runs.command"
+            (options.Circles, options.Lines, options.Markers, options.All), "detect.commands.run"
         ),
-        options.Compare: "detect.comparison.report",
-        options.Export: "detect.export",
-        options.Draw: "detect.drawing.command",
-        options.View: "detect.view_command",
-        options.Report: "detect.report.page",
-        options.Tune: "detect.tune",
-        options.Explain: "detect.explain_command",
-        options.Demo: "detect.demo_command",
+        options.Compare: "detect.commands.compare",
+        options.Export: "detect.commands.export",
+        options.Draw: "detect.commands.draw",
+        options.View: "detect.commands.view",
+        options.Report: "detect.commands.report",
+        options.Tune: "detect.commands.tune",
+        options.Explain: "detect.commands.explain",
+        options.Demo: "detect.commands.demo",
     },
     EXPERT,
 )

@@ -10,14 +10,15 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, MarkerSettings
-from redetect.bounds import expectation
+from redetect.bounds import expectation, number_in, whole_number_in
+from redetect.json_text import json_text
 from redetect.messages import excerpt
 from redetect.storage.bounded import read_text
 
@@ -108,13 +109,12 @@ def word_value(kind: type, name: str, word: str) -> Any:
     Raises DetectError if that fails, or there is no such setting.
     """
     value: Any = {"true": True, "false": False, "none": None}.get(word.lower(), word)
-    for number in (float, int):  # a float setting accepts whole numbers
+    for read in (number_in, whole_number_in):  # a float setting accepts whole numbers
         with suppress(ValueError):
-            value = number(word)
+            value = read(word)
     return setting_value(kind, name, value)
 
 
 def settings_text(**settings: CircleSettings | LineSettings | MarkerSettings) -> str:
     """Content of a settings file, by kind: circles, lines, markers."""
-    content = {"settings": {kind: asdict(each) for kind, each in settings.items()}}
-    return f"{json.dumps(content, indent=1)}\n"
+    return f"{json_text({'settings': settings}, limits=True)}\n"

@@ -34,6 +34,7 @@ from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image
 from redetect.array_types import GreyImage
+from redetect.json_text import json_text
 from redetect.landmarks import CircleLandmark, Frame
 from redetect.landmarks.files import format_frame, format_head
 from redetect.messages import OneLineError
@@ -97,7 +98,7 @@ class TuningSession:
                 "y": float(xy[1]),
                 "covariance": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
                 "quality": float(quality),
-                "evidence": float(evidence) if math.isfinite(evidence) else None,
+                "evidence": float(evidence),
                 "outline": self._outline(xy, settings.radius_m),
                 "ellipse": ellipses(xy, c, _SIGMAS, _OUTLINE).tolist(),
             }
@@ -186,7 +187,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path == "/":
             page = files("detect").joinpath("tuning_page.html").read_text("utf-8")
             described = {**session.described(), "token": self.server.token}
-            content = json.dumps(described).replace("<", "\\u003c")
+            content = json_text(described, indent=None).replace("<", "\\u003c")
             self._answer("text/html; charset=utf-8", page.replace("@RUN@", content).encode())
         elif path.startswith("/frame/"):
             self._try(lambda: ("image/png", png_of(session.image(self._number(path[7:])))))
@@ -202,7 +203,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request is too long")
             return
         body = self.rfile.read(int(length))
-        self._try(lambda: ("application/json", json.dumps(self._carried_out(body)).encode()))
+        self._try(lambda: ("application/json", json_text(self._carried_out(body)).encode()))
 
     def _carried_out(self, body: bytes) -> dict[str, Any]:
         request, session = json.loads(body), self.server.session
@@ -242,7 +243,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse(self, status: HTTPStatus, words: str) -> None:
         self.close_connection = True
-        self._answer("application/json", json.dumps({"error": words}).encode(), status)
+        self._answer("application/json", json_text({"error": words}).encode(), status)
 
     def _answer(self, kind: str, content: bytes, status: HTTPStatus = HTTPStatus.OK) -> None:
         self.send_response(status)

@@ -55,6 +55,16 @@ class Bounds:
             return False
 
 
+def number_in(word: str) -> float:
+    """The number that a word of a file is; a ValueError if it is none."""
+    return float(word.replace("_", "?"))  # in Python, 1_000 is a number
+
+
+def whole_number_in(word: str) -> int:
+    """The whole number that a word of a file is; a ValueError if it is none."""
+    return int(word.replace("_", "?"))
+
+
 def from_to(least: float, most: float) -> Bounds:
     """Numbers of a closed interval."""
     return Bounds(f"{least:g} to {most:g}", lambda x: least <= x <= most)

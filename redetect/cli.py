@@ -14,7 +14,7 @@ from operator import or_
 from typing import Annotated, Any
 
 from redetect import __version__
-from redetect.command_line import FOR_ALL, end_with
+from redetect.command_line import EXIT_WRONG_COMMAND_LINE, FOR_ALL, end_with, exit_code_of
 from redetect.messages import no_such
 
 PROGRAMS = {
@@ -41,11 +41,12 @@ def main(arguments: list[str] | None = None) -> int:
     leading = [word for word in given[:1] if word in _QUIET]
     words = [*given[len(leading) :], *leading]
     if words[:1] == ["--version"]:
-        print(f"redetect {__version__}")
-        return 0
-    if not words or words[0] in ("-h", "--help", "--help-all"):
-        print(_help(), end="", file=sys.stdout if words else sys.stderr)
-        return 0 if words else 2
+        return exit_code_of(lambda: _shown(f"redetect {__version__}\n"))
+    if not words:
+        print(_help(), end="", file=sys.stderr)
+        return EXIT_WRONG_COMMAND_LINE
+    if words[0] in ("-h", "--help", "--help-all"):
+        return exit_code_of(lambda: _shown(_help()))
     if words[0].startswith("--tyro-"):
         _write_completion(words)
     name, rest = words[0], words[1:]
@@ -62,6 +63,11 @@ def main(arguments: list[str] | None = None) -> int:
     # As if it were called by its short name, including the way it ends the process.
     sys.argv = [name, *rest]
     return int(program.main())
+
+
+def _shown(text: str) -> int:
+    print(text, end="")
+    return 0
 
 
 def _help() -> str:

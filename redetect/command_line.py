@@ -73,7 +73,9 @@ def exit_code_of(work: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return say_interrupted()
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and _is_unread():
+        unread = isinstance(error, BrokenPipeError) and _is_unread()
+        _discard_what_cannot_be_written()
+        if unread:
             return EXIT_UNREAD
         if not isinstance(error, OneLineError | ValueError | OSError) and not _is_of_cache(error):
             raise
@@ -82,20 +84,25 @@ def exit_code_of(work: Callable[[], int]) -> int:
 
 
 def _is_unread() -> bool:
-    """Whether standard output is a pipe without a reader; if so, redirect it to the null device."""
+    """Whether standard output is a pipe without a reader."""
     try:
         descriptor = sys.stdout.fileno()
     except (AttributeError, OSError):
         return False
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)
-    if not any(event & select.POLLERR for _, event in poll.poll(0)):
-        return False
-    # Python itself flushes again when it ends.
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, descriptor)
-    os.close(nowhere)
-    return True
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+def _discard_what_cannot_be_written() -> None:
+    """Redirect standard output to the null device if it fails: Python flushes again at its end."""
+    try:
+        if sys.stdout is not None and not sys.stdout.closed:
+            sys.stdout.flush()
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _message(error: Exception) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from redetect.json_text import json_text, plain
 from redetect.messages import OneLineError, excerpt
 
 FrameLibrary = Literal["pandas", "polars"]
@@ -71,7 +71,7 @@ class Table(ByContent):
 
     def to_json(self) -> str:
         """The columns as a JSON object of lists; numbers that are not finite are null."""
-        return json.dumps(plain(self.columns()), indent=1, allow_nan=False)
+        return json_text(self.columns())
 
     def __repr__(self) -> str:
         columns = self.columns()
@@ -94,17 +94,6 @@ def alike(one: Any, other: Any) -> bool:
     if isinstance(one, tuple | list):
         return len(one) == len(other) and all(map(alike, one, other))
     return bool(one == other or (one != one and other != other))
-
-
-def plain(value: Any) -> Any:
-    """Convert arrays, tuples and mappings to lists and dicts with JSON's types."""
-    if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def covariance_columns(covariance: Any) -> dict[str, Sequence[Any]]:

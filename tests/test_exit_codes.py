@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -96,3 +97,18 @@ def test_a_pipe_of_ones_own_that_broke_is_an_error(capfd: pytest.CaptureFixture[
 
     assert exit_code_of(work) == EXIT_ERROR
     assert capfd.readouterr().err == "error: [Errno 32] Broken pipe: 'elsewhere'\n"
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", ["redetect --version", "redetect --help", "detect --version"])
+def test_an_output_without_space_is_one_line(words: str, unbuffered: str) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", *words.split()],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            check=False,
+        )
+    assert done.returncode == EXIT_ERROR
+    assert done.stderr == b"error: [Errno 28] No space left on device\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -33,6 +32,7 @@ from camera.options import Calibrate
 from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
 from redetect import __version__
 from redetect.array_types import GreyImage
+from redetect.json_text import json_text
 from redetect.storage import demand_place, write_bytes
 
 #: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.
@@ -105,18 +105,12 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
         "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
         "lens": str(calibration.lens),
         "rms_px": adjusted.rms_px,
-        "holdout_rms_px": {
-            str(lens): error if np.isfinite(error) else None
-            for lens, error in calibration.holdout_px.items()
-        },
+        "holdout_rms_px": {str(lens): error for lens, error in calibration.holdout_px.items()},
         "views": [dict(zip(("name", "points", "rms_px"), view)) for view in views],
-        "left_out": [
-            {"name": name, "rms_px": error if np.isfinite(error) else None}
-            for name, error in calibration.outliers
-        ],
+        "left_out": [{"name": name, "rms_px": error} for name, error in calibration.outliers],
         "warnings": calibration.warnings,
     }
-    return json.dumps(content, indent=1, allow_nan=False, default=str) + "\n"
+    return f"{json_text(content)}\n"
 
 
 def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from camera.errors import ConversionError
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import foreign, name_of_one
+from redetect.bounds import number_in, whole_number_in
 from redetect.messages import excerpt, one_line
 
 if TYPE_CHECKING:
@@ -59,8 +60,8 @@ def parse_colmap(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     number, fields = rows[name_of_one(list(rows), camera_name, name)]
     where = f"{name}:{number}"
     try:
-        width, height = int(fields[2]), int(fields[3])
-        parameters = [float(field) for field in fields[4:]]
+        width, height = map(whole_number_in, fields[2:4])
+        parameters = [number_in(field) for field in fields[4:]]
     except ValueError:
         raise ConversionError(f"{where}: a size or parameter is not a number") from None
     return _from_parameters(where, fields[1], width, height, parameters)

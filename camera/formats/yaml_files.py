@@ -15,6 +15,7 @@ import yaml  # type: ignore[import-untyped, unused-ignore]
 
 from camera.errors import ConversionError
 from camera.formats.models import COEFFICIENTS, ForeignCamera, Model
+from redetect.bounds import number_in
 from redetect.messages import excerpt, one_line
 
 _MOST_CAMERAS = 1000
@@ -90,8 +91,8 @@ def numbers(value: Any, key: str, name: str) -> list[float]:
     for item in np.array(value, dtype=object).ravel():
         # YAML 1.1 parses 1e-3 as text, because it lacks the dot.
         try:
-            number = float(item) if not isinstance(item, bool) else float("nan")
-        except (OverflowError, TypeError, ValueError):
+            number = number_in(str(item))
+        except ValueError:
             number = float("nan")
         if not np.isfinite(number):
             raise ConversionError(f"{name}: {key} has {excerpt(item)}: expected numbers")

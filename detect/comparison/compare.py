@@ -26,6 +26,7 @@ from detect.comparison.result import (
     Kind,
     LineComparison,
     LinePairs,
+    RunMatch,
     floor_difference,
     normalised_error,
     quantile,
@@ -144,14 +145,15 @@ def compare_frames(
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     match = partial(match_runs, "circles", wanted, found, options, names, unlisted=unlisted)
-    common = match(sight)
+    run = match(sight)
     if sight is not None and not sight.reference_level:
         # A file need not state that its rows are level: then the matches in the images decide.
         level_sight = replace(sight, reference_level=True)
         as_level = match(level_sight)
-        if _image_cost(as_level["frames"]) < _image_cost(common["frames"]):
-            common, sight = as_level, level_sight
-    matches: Sequence[FrameMatch] = common["frames"]
+        if _image_cost(as_level.frames) < _image_cost(run.frames):
+            run, sight = as_level, level_sight
+    run = replace(run, on_lookalikes=_on_lookalikes(run.frames, lookalikes, options))
+    matches = run.frames
     first, second, _, extra = sides = tuple(
         circle_arrays([row for match in matches for row in getattr(match, side)])
         for side in ("wanted", "matched", "missed", "extra")
@@ -166,7 +168,7 @@ def compare_frames(
     error_m = np.linalg.norm(pairs.offset, axis=1)
     farthest_m = np.linalg.norm(second.xy, axis=1).max(initial=0.0)
     return DiscComparison(
-        **common | {"on_lookalikes": _on_lookalikes(matches, lookalikes, options)},
+        **vars(run),
         normalised_error=normalised_error(pairs.offset, second.covariance),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
@@ -215,9 +217,9 @@ def compare_line_frames(
     """Compare the lines of two sets of frames, as `compare_frames`."""
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    common = match_runs("lines", *sides, options, names, unlisted=unlisted)
-    first = [row for match in common["frames"] for row in match.wanted]
-    second = [row for match in common["frames"] for row in match.matched]
+    run = match_runs("lines", *sides, options, names, unlisted=unlisted)
+    first = [row for match in run.frames for row in match.wanted]
+    second = [row for match in run.frames for row in match.matched]
 
     def difference(name: str) -> FloatArray:
         return numbers(second, name) - numbers(first, name)
@@ -231,7 +233,7 @@ def compare_line_frames(
         for x, y in (("xtop", "ytop"), ("xbottom", "ybottom"))
     ]
     return LineComparison(
-        **common,
+        **vars(run),
         normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
         bearing_median_deg=quantile(error_deg),
         bearing_95_deg=quantile(error_deg, 0.95),
@@ -297,8 +299,8 @@ def match_runs(
     names: tuple[str, str],
     sight: Sight | None = None,
     unlisted: Iterable[Frame] | None = None,
-) -> dict[str, Any]:
-    """Match the rows of two runs, image by image: the fields of a `Comparison`.
+) -> RunMatch:
+    """Match the rows of two runs, image by image; look-alikes are not known.
 
     Images are in the order of the reference; those in only one run are ignored.
     """
@@ -309,27 +311,28 @@ def match_runs(
         frames = reference[name], detected[name]
         view = None if sight is None else sight.of(*frames)
         matches.append(match_frame(kind, name, (*frames, known.get(name)), options, view))
-    counts: dict[str, Any] = {
+    counts: dict[str, int] = {
         name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
     }
-    found, detected_rows = counts["matched"] + counts["joined"], counts["matched"] + counts["extra"]
+    matched, extra = counts["matched"], counts["extra"]
+    found = matched + counts["joined"]
     wanted = found + counts["missed"]
-    return {
-        "reference_name": names[0],
-        "detected_name": names[1],
-        "options": options,
-        "reference": wanted,
-        "detected": detected_rows,
-        "found": found,
+    return RunMatch(
+        reference_name=names[0],
+        detected_name=names[1],
+        options=options,
+        reference=wanted,
+        detected=matched + extra,
+        found=found,
         **counts,
-        "on_lookalikes": None,
-        "recall": found / wanted if wanted else None,
-        "precision": counts["matched"] / detected_rows if detected_rows else None,
-        "frames": tuple(matches),
-        "frames_only_in_reference": tuple(name for name in reference if name not in detected),
-        "frames_only_in_detected": tuple(name for name in detected if name not in reference),
-    }
+        on_lookalikes=None,
+        recall=found / wanted if wanted else None,
+        precision=matched / (matched + extra) if matched + extra else None,
+        frames=tuple(matches),
+        frames_only_in_reference=tuple(name for name in reference if name not in detected),
+        frames_only_in_detected=tuple(name for name in detected if name not in reference),
+    )
 
 
 def match_frame(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from html import escape
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -15,6 +14,7 @@ from scipy.special import chdtri
 from detect.options import CompareOptions
 from detect.seen import Sight
 from redetect.array_types import FloatArray
+from redetect.json_text import json_text, plain
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.messages import counted
 from redetect.tables import Table
@@ -120,17 +120,12 @@ class LinePairs:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison(Table, ABC):
-    """How a run's detected rows compare with reference rows.
+class RunMatch:
+    """Matching rows of two runs, image by image, all discs or all lines.
 
-    Figures are None if there are no rows to compute them from. Rows are counted as in `FrameMatch`;
-    `found` rows were matched or joined. Recall is the share of reference rows that were found,
-    precision the share of detected rows that were matched.
+    Rows are counted as in `FrameMatch`; `found` rows were matched or joined. Recall is the share of
+    reference rows that were found, precision the share of detected rows that were matched.
     """
-
-    what: ClassVar[str]  # the landmarks that are compared
-    unit: ClassVar[str]  # of `FrameMatch.largest_error`
-    counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
 
     reference_name: str
     detected_name: str
@@ -146,10 +141,23 @@ class Comparison(Table, ABC):
     on_lookalikes: int | None  # extra rows on known look-alikes; None if unknown
     recall: float | None
     precision: float | None
-    normalised_error: NormalisedError
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison(RunMatch, Table, ABC):
+    """How a run's detected rows compare with reference rows.
+
+    Figures are None if there are no rows to compute them from.
+    """
+
+    what: ClassVar[str]  # the landmarks that are compared
+    unit: ClassVar[str]  # of `FrameMatch.largest_error`
+    counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
+
+    normalised_error: NormalisedError
 
     def columns(self) -> dict[str, Any]:
         """One row per frame that is in both files."""
@@ -216,18 +224,21 @@ class Comparison(Table, ABC):
         Lengths are in metres, angles in degrees. The worst frames are listed, and frames that are
         in only one file.
         """
-        figures = {f.name: getattr(self, f.name) for f in fields(self)}
+        names = [each.name for each in fields(self)]
+        # In files, the normalised error is before the frames.
+        names.insert(names.index("frames"), names.pop(names.index("normalised_error")))
+        figures = {name: getattr(self, name) for name in names}
         figures |= {
             "frames": len(self.frames),
             "pairs": self.matched,
             "worst_frames": [self._row(match) for match in self.worst_frames(WORST_FRAMES)],
         }
-        plain: dict[str, Any] = json.loads(json.dumps(figures, allow_nan=False, default=asdict))
-        return plain
+        converted: dict[str, Any] = plain(figures)
+        return converted
 
     def to_json(self) -> str:
         """`figures` as JSON; numbers are finite or null."""
-        return f"{json.dumps(self.figures(), indent=2)}\n"
+        return f"{json_text(self.figures(), indent=2)}\n"
 
     def _repr_html_(self) -> str:
         words = "".join(f"<p>{escape(sentence)}</p>" for sentence in self.sentences())

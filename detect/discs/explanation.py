@@ -6,7 +6,6 @@ polarities. Suggestions are tried out: each states what would be found with it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -32,6 +31,7 @@ from detect.discs.radius import FACTOR, find_radius
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
+from redetect.json_text import json_text
 from redetect.messages import counted
 from redetect.tables import Table
 
@@ -130,7 +130,7 @@ class DiscExplanation(Table):
             "suggestions": list(self.suggestions),
             "candidates": self.records(),
         }
-        return json.dumps(content, indent=1, allow_nan=False)
+        return json_text(content)
 
     def __str__(self) -> str:
         lines = [self.place] if self.place else []

@@ -1,4 +1,4 @@
-"""The command ``detect report``: files of rows in, one HTML page out."""
+"""The page of a run: its rows, their comparison with the reference, and some frames."""
 
 from __future__ import annotations
 
@@ -16,18 +16,16 @@ from detect.drawing.frame import draw_rows, processed
 from detect.drawing.picture_files import picture_name
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
-from detect.options import Report, RowFiles
+from detect.options import RowFiles
 from detect.report import figures
 from detect.row_files import RunRows, SeenRows, open_rows
 from detect.seen import Sight, summed_steps
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
-from detect.sources.opening import demand_recording, open_source
 from redetect import __version__
 from redetect.landmarks import circle_arrays
 from redetect.messages import counted
 from redetect.reporting.page import Part, Section, image_part, page_of
-from redetect.storage import demand_place, write_bytes
 
 _NAMES = {
     "circles": "discs", "lines": "verticals", "markers": "markers", "tilt": "frames with a tilt"
@@ -104,20 +102,6 @@ def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
     picture = draw_rows(image, inputs.sight, rows, settings)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
-
-
-def perform(options: Report) -> int:
-    """Execute the command; returns the exit code."""
-    demand_recording(options.run)
-    run = open_source(options.run, options.camera, options.source)
-    output = run.output("html") if options.output is None else options.output
-    demand_place(output, overwrite=options.force)
-    inputs = gather(run, options.files)
-    write_bytes(output, report_page(inputs, options.worst), overwrite=options.force)
-    names = [path.name for path in inputs.files.reference.values()]
-    against = f" against {' and '.join(names)}" if names else ", no reference rows"
-    print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
-    return 0
 
 
 def report_page(inputs: ReportInputs, worst: int) -> bytes:

@@ -255,7 +255,7 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
                     "x_m": row.px,
                     "y_m": row.py,
                     "quality": row.quality,
-                    "evidence": evidence if math.isfinite(evidence) else None,
+                    "evidence": evidence,
                     "covariance_m2": [row.cxx, row.cxy, row.cyy],
                 }
                 for row, pixel, evidence in seen

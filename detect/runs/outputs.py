@@ -8,7 +8,6 @@ same run writes the same bytes.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from detect.runs.plan import FramePlan, Job, Lean, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
 from redetect import __version__
+from redetect.json_text import json_text
 from redetect.landmarks import format_head
 from redetect.landmarks.times import TIMES_HEAD
 
@@ -165,16 +165,16 @@ def _markers_text(run: ImageRun, plan: FramePlan) -> list[str]:
 
 
 def _json_file(path: Path, plan: FramePlan) -> Output:
-    """A JSON file as `json.dumps` with an indent of 1 would write it."""
+    """A JSON file as `json_text` would write it."""
     assert plan.circles is not None
     assert plan.camera is not None
     document = {
         "version": __version__,
-        "settings": dataclasses.asdict(plan.circles),
+        "settings": plan.circles,
         "camera": plan.camera.content_hash,
         "frames": [],
     }
-    head, tail = json.dumps(document, indent=1).rsplit("]", 1)
+    head, tail = json_text(document).rsplit("]", 1)
     return Output(path, "json", head, f"\n ]{tail}\n", ",")
 
 
@@ -204,9 +204,7 @@ def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, obje
         "version": __version__,
         "command": job.command,
         "camera": None if plan.camera is None else plan.camera.content_hash,
-        "settings": {
-            kind: dataclasses.asdict(values) for kind, values in settings.items() if values
-        },
+        "settings": {kind: values for kind, values in settings.items() if values},
         **({"lean_rad": plan.lean} if plan.lean else {}),
         "failures": failures,
         "frames": summary.frames,
@@ -216,4 +214,4 @@ def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, obje
         "rejected": dict(sorted(summary.rejected.items())),
         "exit_code": EXIT_FRAMES_FAILED if summary.failed else 0,
     }
-    return f"{json.dumps(document, indent=1)}\n"
+    return f"{json_text(document, limits=True)}\n"

@@ -5,7 +5,6 @@ Imports nothing heavy.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from detect.line_settings import LineSettings
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, RunFrame
+from redetect.json_text import json_text
 from redetect.landmarks import (
     CircleLandmark,
     Frame,
@@ -263,4 +263,4 @@ def time_row(task: FrameTask) -> str:
 
 def json_record(record: dict[str, object]) -> str:
     """A record in the list of frames of an indented document."""
-    return "\n" + indent(json.dumps(record, indent=1), "  ")
+    return "\n" + indent(json_text(record), "  ")

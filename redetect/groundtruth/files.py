@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import math
 import os
 import re
 import zlib
@@ -18,6 +17,7 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.bounds import FINITE, LARGEST_NUMBER, Bounds
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.json_text import json_rows
 from redetect.messages import excerpt, one_line
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_content
@@ -173,25 +173,8 @@ def _has_shape(value: Any, shape: tuple[int | None, ...]) -> bool:
 
 
 def write_json(path: PathLike, content: Mapping[str, Any], *, overwrite: bool = False) -> None:
-    """Write a JSON object with a line per entry of its objects, whole or not at all.
-
-    Numbers that are not finite, which JSON does not have, are null.
-    """
-    write_bytes(path, (_laid_out(content) + "\n").encode(), overwrite=overwrite)
-
-
-def _laid_out(value: Any, indent: str = "") -> str:
-    """JSON with objects over several lines and arrays on one, except matrices: a line per row."""
-    deeper = indent + " "
-    if isinstance(value, Mapping) and value:
-        items = (f"{deeper}{json.dumps(k)}: {_laid_out(v, deeper)}" for k, v in value.items())
-        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
-    if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple | Mapping):
-        return "[\n" + ",\n".join(deeper + _laid_out(v, deeper) for v in value) + f"\n{indent}]"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_laid_out, value))}]"
-    finite = not isinstance(value, float) or math.isfinite(value)
-    return json.dumps(value if finite else None, allow_nan=False)
+    """Write a JSON object with a line per entry of its objects, whole or not at all."""
+    write_bytes(path, f"{json_rows(content)}\n".encode(), overwrite=overwrite)
 
 
 def read_text(path: PathLike, largest_bytes: int, expected: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,10 +27,11 @@ from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
 from redetect.interface.inputs import keywords_named, path_of
+from redetect.json_text import json_text
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.messages import counted, excerpt
-from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table, plain
+from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]
 CameraLike = Camera | str | os.PathLike[str]
@@ -192,11 +192,11 @@ class Detection(Table):
         content = {
             "image": self.name,
             "axes": self.axes,
-            "tilt": None if self.tilt is None else plain(vars(self.tilt)),
+            "tilt": None if self.tilt is None else vars(self.tilt),
             "discs": self.discs.records(),
             "verticals": self.verticals.records(),
         }
-        return json.dumps(content, indent=1, allow_nan=False)
+        return json_text(content)
 
     def picture(self) -> NDArray[np.uint8]:
         """(S H + h, S W, 3) the image with the detections: blue, green, red; see `draw_rows`."""

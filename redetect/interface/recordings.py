@@ -8,8 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from detect.commands.compare import comparison_of
 from detect.comparison.compare import compare_with_file
-from detect.comparison.report import comparison_of
 from detect.comparison.result import Comparison, Kind
 from detect.errors import DetectError
 from detect.options import Compare, CompareOptions, SourceOptions

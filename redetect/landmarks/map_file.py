@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.bounds import FINITE, LARGEST_NUMBER
+from redetect.bounds import FINITE, LARGEST_NUMBER, number_in, whole_number_in
 from redetect.landmarks.records import LandmarkFileError
 from redetect.storage import write_bytes
 from redetect.storage.bounded import FilePath, read_bounded, read_plain_array
@@ -127,9 +127,9 @@ def read_map(path: FilePath) -> LandmarkMap:
         kind = words[0]
         if kind not in found:
             raise LandmarkFileError(path, line, f"kind is {kind[:20]!r}: expected disc or line")
-        number = _number(path, line, "id", words[1], int)
+        number = _number(path, line, "id", words[1], whole_number_in)
         values = _finite(path, line, MAP_COLUMNS[2:7], words[2:7])
-        rows = _number(path, line, "rows", words[7], int)
+        rows = _number(path, line, "rows", words[7], whole_number_in)
         if number in found[kind]:
             raise LandmarkFileError(path, line, f"{kind} {number} is already in the map")
         _, _, cxx, cxy, cyy = values
@@ -265,15 +265,15 @@ def _read(
 
 
 def _finite(path: FilePath, line: int, names: Sequence[str], words: Sequence[str]) -> list[float]:
-    return [_number(path, line, name, word, float) for name, word in zip(names, words)]
+    return [_number(path, line, name, word, number_in) for name, word in zip(names, words)]
 
 
-def _number(path: FilePath, line: int, name: str, word: str, kind: type[N]) -> N:
+def _number(path: FilePath, line: int, name: str, word: str, read: Callable[[str], N]) -> N:
     """A finite float, or an integer of 64 bits."""
     whole = (2**63, "a whole number")
-    limit, expected = whole if kind is int else (LARGEST_NUMBER, FINITE.expected)
+    limit, expected = whole if read is whole_number_in else (LARGEST_NUMBER, FINITE.expected)
     try:
-        value = kind(word)
+        value = read(word)
     except ValueError:
         value = None
     if value is None or not abs(value) < limit:

@@ -19,6 +19,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from redetect.bounds import number_in, whole_number_in
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
 from redetect.messages import excerpt
@@ -101,8 +102,8 @@ def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
         found = f"{excerpt(' '.join(words))}: expected TILT, an image, 5 numbers and a count"
         raise LandmarkFileError(name, line, found)
     try:
-        pitch, roll, cpp, cpr, crr = numbers = [float(word) for word in words[2:7]]
-        lines = int(words[7])
+        pitch, roll, cpp, cpr, crr = numbers = [number_in(word) for word in words[2:7]]
+        lines = whole_number_in(words[7])
     except ValueError:
         numbers, lines = [math.nan], 0
     if not all(map(math.isfinite, numbers)) or not 0 <= lines < 1 << 31:

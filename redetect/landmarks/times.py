@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from math import isfinite
 
+from redetect.bounds import number_in
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
 from redetect.messages import excerpt
@@ -25,7 +26,7 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
             if not words:
                 continue
             try:
-                prefix, seconds = words[0], float(words[1])
+                prefix, seconds = words[0], number_in(words[1])
             except (IndexError, ValueError):
                 prefix, seconds = "", float("nan")
             if len(words) != 2 or not isfinite(seconds):

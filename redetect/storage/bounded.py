@@ -25,6 +25,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from redetect.bounds import number_in
 from redetect.messages import excerpt, one_line
 
 FilePath = str | os.PathLike[str]
@@ -124,7 +125,7 @@ def rows_of_numbers(
             head = False
             continue
         try:
-            values = [float(word) for word in words]
+            values = [number_in(word) for word in words]
         except ValueError:
             values = []
         if len(values) != count or not all(map(math.isfinite, values)):

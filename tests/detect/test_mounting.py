@@ -16,8 +16,8 @@ from camera.calibration.model import COUNT
 from camera.cli import main
 from camera.model import PARAMETERS
 from camera.uncertainty import covariance_of, with_covariance
+from detect.commands.level import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.levelling import common_covariance
-from detect.mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import LEAST_FRAMES, FrameTilts
 from detect.seen import image_positions, level_seen
 from redetect.storage import OutputExistsError
@@ -185,7 +185,7 @@ def test_images_of_another_size_are_told_once(
 
 def test_an_existing_file_is_found_first(tmp_path: Path) -> None:
     from camera.options import Level
-    from detect.mounting import perform
+    from detect.commands.level import perform
 
     output = tmp_path / "level.cam"
     output.touch()

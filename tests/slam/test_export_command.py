@@ -82,6 +82,17 @@ def test_tables(tmp_path: Path, capsys: Capture) -> None:
     assert [path.name for path in out.iterdir()] == ["bearings.csv"]
 
 
+def test_tables_are_written_into_a_folder_not_one_of_the_name_of_a_table(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "tt.csv"
+    arguments = ["export", str(DEMO), "--to", "csv", "-o", str(out)]
+    refused(arguments, "several tables are written: expected a folder, such as tt", capsys)
+    assert not out.exists()
+    out.mkdir()
+    assert main(arguments) == 0
+
+
 def test_verticals_have_no_edge(tmp_path: Path, capsys: Capture) -> None:
     output = ["-o", str(tmp_path / "e.g2o")]
     refused(["export", str(DEMO), "--lines", *output], "have no edge in g2o", capsys)

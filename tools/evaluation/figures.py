@@ -23,8 +23,8 @@ from redetect import __version__
 from redetect.cli import PROGRAMS
 from redetect.command_line import exit_code_of
 from redetect.groundtruth.files import write_json
+from redetect.json_text import json_text
 from redetect.storage import write_bytes
-from redetect.tables import plain
 from tools.benchmark.timing import number
 
 #: Figures by name, or further figures by theirs.
@@ -53,7 +53,7 @@ class Study:
         found = self.measured()
         if self.figures is not None:
             head = {"command": shlex.join(command), "version": __version__}
-            text = json.dumps(plain(found))
+            text = json_text(found)
             # Further digits differ from machine to machine.
             kept = json.loads(text, parse_float=lambda digits: float(f"{float(digits):.9g}"))
             write_json(self.figures, {**head, "figures": kept}, overwrite=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,16 +59,16 @@ def perform(options: Fuse) -> int:
     document = {
         **provenance(settings, inputs),
         "used": fusion.used,
-        "odometry": asdict(fusion.odometry),
-        "localisation": asdict(fusion.localisation) if fusion.localisation else None,
-        "left_out": [asdict(segment) for segment in left_out],
+        "odometry": fusion.odometry,
+        "localisation": fusion.localisation,
+        "left_out": left_out,
         stream_errors.COMMON: common.tolist(),
         "covariances_repaired": fusion.repaired,
         "deviations_raised": fusion.raised,
         "slips_s": fusion.slips_s,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
-        "rejected": [asdict(rejected) for rejected in fusion.rejected],
+        "rejected": fusion.rejected,
     }
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
     if options.filtered is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.trajectories.streams import write_planar_poses
+from redetect.json_text import json_text
 from redetect.storage import write_bytes
 
 #: Number of readings that hide the robot, or of objects beside it, that make a set disturbed.
@@ -141,7 +141,7 @@ def set_lines(track: tracking.LaserTrack) -> list[str]:
             line["direction"] = [round(float(v), 4) for v in track.weak[i]]
         if i in track.reasons and status == tracking.COASTING:
             line["reason"] = track.reasons[i]
-        lines.append(json.dumps(line))
+        lines.append(json_text(line, indent=None))
     return lines
 
 

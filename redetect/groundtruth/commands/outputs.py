@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,7 +41,7 @@ def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     """Metadata of a result: version, settings, and the files on which it depends."""
     return {
         "version": __version__,
-        "settings": settings if isinstance(settings, dict) else asdict(settings),
+        "settings": settings,
         "files": {
             path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
         },

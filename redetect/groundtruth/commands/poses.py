@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from pathlib import Path
@@ -16,6 +15,7 @@ from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
+from redetect.json_text import json_text
 from redetect.storage import write_bytes
 
 #: Share of markers that disagree, or times that have no pose, above which a warning is printed; a
@@ -51,7 +51,7 @@ def perform(command: Poses) -> int:
             warn(f"{found}, those in {rig_path} are of {rig.dictionary}")
     print_left_out(track, rig_path, network_path)
     if command.report is not None:
-        lines = [json.dumps(report_entry(t, network), allow_nan=False) + "\n" for t in track.times]
+        lines = [f"{json_text(report_entry(t, network), indent=None)}\n" for t in track.times]
         write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
     if not len(poses):
         print("error: no pose", file=sys.stderr)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ def perform(options: Sync) -> int:
     model = ClockModel(segments)
     document: dict[str, Any] = {
         **provenance(options.settings, [options.odometry, options.groundtruth]),
-        "segments": [asdict(segment) for segment in segments],
+        "segments": segments,
     }
     if log is not None:
         document["ptpd"] = compare_with_ptpd(model, determined, log)

@@ -73,8 +73,8 @@ def perform(options: Validate) -> int:
         "poses": options.poses.name,
         "clock": None if clock_path is None else clock_path.name,
         "figures": figures,
-        "published": [asdict(published) for published in scoring.PUBLISHED],
-        "refused": [asdict(r) for r in (*refused, *without)],
+        "published": scoring.PUBLISHED,
+        "refused": [*refused, *without],
         "distances": _distance_figures(solved, survey.sigma_m),
         "rows": [
             {**row, "note": r.note, "points": r.points, "rms_m": r.rms_m}

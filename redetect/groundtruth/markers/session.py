@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera, read_camera
 from redetect.array_types import FloatArray
-from redetect.bounds import Bounds
+from redetect.bounds import Bounds, whole_number_in
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike, write_json
 from redetect.groundtruth.trajectories import se3
@@ -72,7 +72,7 @@ def read_rig(path: PathLike) -> Rig:
     dictionary = content.text("dictionary", "its name")
     markers = content.objects("markers")
     try:
-        by_id = {int(key): entry for key, entry in markers.items()}
+        by_id = {whole_number_in(key): entry for key, entry in markers.items()}
     except ValueError:
         raise GroundTruthError(f"{path}: markers: expected whole numbers as keys") from None
     ids = tuple(sorted(by_id))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ def perform(options: Associate) -> int:
                 "noise": factor,
                 "seconds": round(seconds, 2),
                 "loop_matches": len(found.matches),
-                "scores": {k: {s: asdict(x) for s, x in by.items()} for k, by in scores.items()},
+                "scores": scores,
             }
         )
         print("\n".join(score_lines(factor, seconds, scores)))
@@ -76,7 +76,7 @@ def perform(options: Associate) -> int:
         "version": __version__,
         "run": str(options.run),
         "more": [str(run) for run in options.more],
-        "settings": asdict(settings),
+        "settings": settings,
         "seed": options.seed,
         "runs": tries,
     }

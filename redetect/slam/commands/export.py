@@ -77,7 +77,12 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
 
 
 def _export_tables(command: Export) -> None:
-    recording, folder = recording_of(command), command.output
+    folder = command.output
+    if folder.suffix == ".csv" and not folder.is_dir():
+        raise SlamError(
+            f"{folder}: several tables are written: expected a folder, such as {folder.stem}"
+        )
+    recording = recording_of(command)
     tables = {"odometry.csv": odometry_table(recording), "discs.csv": disc_table(recording)}
     if len(recording.lines):
         camera_xy = camera_xy_of(recording, command.run, command.camera)

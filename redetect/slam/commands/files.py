@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +11,7 @@ import numpy as np
 
 from camera import Camera, camera_in, read_camera
 from redetect.array_types import FloatArray
+from redetect.json_text import json_text
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.options import RunFlags
@@ -106,6 +105,5 @@ def flags_of(command: object, but: tuple[str, ...] = ()) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: dict[str, Any], *, overwrite: bool) -> None:
-    """Write a summary; paths become text."""
-    text = json.dumps(content, indent=1, default=os.fspath) + "\n"
-    write_bytes(path, text.encode(), overwrite=overwrite)
+    """Write a summary."""
+    write_bytes(path, f"{json_text(content)}\n".encode(), overwrite=overwrite)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ from redetect.slam.pictures import draw_map
 from redetect.slam.recording import Recording, first_poses, joined
 from redetect.slam.settings import PLACE
 from redetect.storage import demand_free, write_bytes
-from redetect.tables import plain
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 
@@ -64,7 +62,7 @@ def perform(command: Map) -> int:
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
-    results = plain(_results(mapped, check, command))
+    results = _results(mapped, check, command)
     files.write_json(output / TABLE_NAME, results, overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
@@ -179,11 +177,11 @@ def _results(mapped: MappedRun, check: OdometryCheck, command: Map) -> dict[str,
     results: dict[str, Any] = {
         "version": __version__,
         "configuration": files.flags_of(command, ("output", "force", "interactive")),
-        "table": asdict(mapped.table),
-        "odometry": asdict(check),
+        "table": mapped.table,
+        "odometry": check,
         "minimised": mapped.cost,
         "steps": mapped.steps,
-        "left_out": asdict(mapped.left_out),
+        "left_out": mapped.left_out,
     }
     if (found := mapped.mounting) is not None:
         results["mounting"] = {

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.bounds import FINITE
+from redetect.bounds import FINITE, number_in, whole_number_in
 from redetect.landmarks import is_positive_definite
 from redetect.landmarks.axes import covariance_from_dataset, from_dataset, to_dataset
 from redetect.plane import rotation
@@ -208,8 +208,8 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
             )
         count, names = _KINDS[kind]
         try:
-            vertices = tuple(map(int, words[:count]))
-            numbers = tuple(map(float, words[count:]))
+            vertices = tuple(map(whole_number_in, words[:count]))
+            numbers = tuple(map(number_in, words[count:]))
         except ValueError:
             vertices, numbers = (), ()
         usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(map(FINITE.hold, numbers))

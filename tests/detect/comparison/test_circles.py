@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from detect.commands.compare import comparison_of
 from detect.comparison.compare import compare_frames as compare
-from detect.comparison.report import comparison_of
 from detect.errors import CompareError, DetectError
 from detect.options import Compare, CompareOptions
 from detect.sources.image_files import image_name

@@ -14,10 +14,17 @@ from hypothesis import strategies as st
 
 from camera import read_camera, write_camera
 from detect.cli import main
+from detect.commands.tune import (
+    combinations,
+    curve_picture,
+    knee,
+    marked,
+    parameter_values,
+    pareto_front,
+)
 from detect.errors import DetectError
 from detect.seen import leaning_camera
 from detect.settings import CircleSettings
-from detect.tune import combinations, curve_picture, knee, marked, parameter_values, pareto_front
 from tests.detect.commands import Captured, assert_refused
 from tests.detect.conftest import SMALL_RUN_DISCS
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, replace
+from dataclasses import replace
 from decimal import Decimal
 from functools import partial
 from itertools import chain, islice
@@ -36,6 +35,7 @@ from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect import __version__
 from redetect.array_types import FloatArray
+from redetect.json_text import json_text
 from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
@@ -100,12 +100,12 @@ def perform(options: Tune) -> int:
         "run": run.name,
         "reference": path.name,
         "frames": [frame.step.prefix for frame, _ in pairs],
-        "gate": asdict(options.matching),
+        "gate": options.matching,
         "camera": run.camera.content_hash,
-        "settings": asdict(base),
+        "settings": base,
         "varied": varied,
     }
-    table = f"{json.dumps({**head, 'trials': records}, indent=1)}\n".encode()
+    table = f"{json_text({**head, 'trials': records})}\n".encode()
     title = f"{len(grid)} settings on {len(pairs)} frames of {run.name}"
     output.mkdir(parents=True, exist_ok=True)
     for name, content in zip(names, (table, curve_picture(records, varied, title))):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from detect.comparison.report import comparison_of
+from detect.commands.compare import comparison_of
+from detect.commands.report import perform as write_report
+from detect.commands.run import perform as detect_run
 from detect.options import All, Compare, Demo, Report, RowFiles
-from detect.report.page import perform as write_report
-from detect.runs.command import perform as detect_run
 from redetect.storage import demand_free
 
 #: Images included in the program: the first ones of the demo run (`images/README.md`).
-DEMO_RUN = Path(__file__).resolve().parent.parent / "redetect" / "demo"
+DEMO_RUN = Path(__file__).resolve().parents[2] / "redetect" / "demo"
 
 
 def perform(command: Demo) -> int:

@@ -49,7 +49,7 @@ def perform(command: DetectorFlags) -> int:
     with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:
-        from detect.drawing.command import draw_run  # loads the detectors
+        from detect.commands.draw import draw_run  # loads the detectors
 
         files = {kind: path for kind, path in job.places.items() if kind in KINDS}
         plan = job.plan if getattr(command, "rejected", False) else None
