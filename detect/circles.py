@@ -18,7 +18,7 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
-from detect.discs.candidates import alone_published, apart, local_maxima
+from detect.discs.candidates import local_maxima, suppress_close, suppress_published
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
@@ -180,7 +180,9 @@ def judged_discs(
     taken = np.flatnonzero(log_odds >= settings.evidence)
     best_first = np.argsort(-log_odds[taken], kind="stable")
     # Without those too close to a better one.
-    best = taken[np.sort(apart(judgement.floor_xy[taken], best_first, settings.separation_m))]
+    best = taken[
+        np.sort(suppress_close(judgement.floor_xy[taken], best_first, settings.separation_m))
+    ]
     return judgement.where(best), log_odds[best]
 
 
@@ -233,7 +235,7 @@ def _by_quality(
         qualities[pixels[:, 1], pixels[:, 0]] = quality
         keep = local_maxima(qualities, settings.threshold)[pixels[:, 1], pixels[:, 0]]
         pixels, quality = pixels[keep], quality[keep]
-    keep = alone_published(pixels, quality, table.floor_xy, settings.separation_m)
+    keep = suppress_published(pixels, quality, table.floor_xy, settings.separation_m)
     pixels, quality = pixels[keep], quality[keep]
     floor_xy, covariance = published_positions(camera, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))

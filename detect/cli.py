@@ -117,7 +117,7 @@ PROGRAM = DetectProgram(
         options.Report: "detect.commands.report",
         options.Tune: "detect.commands.tune",
         options.Explain: "detect.commands.explain",
-        options.Demo: "detect.commands.demo",
+        options.Demo: "detect.commands.report",
     },
     EXPERT,
 )

@@ -1,15 +1,26 @@
-"""The command ``detect report``: files of rows in, one HTML page out."""
+"""The commands ``detect report``, rows in and one HTML page out, and ``detect demo``."""
 
 from __future__ import annotations
 
-from detect.options import Report
+from pathlib import Path
+
+from detect.commands.compare import comparison_of
+from detect.commands.run import perform as detect_run
+from detect.options import All, Compare, Demo, Report, RowFiles
 from detect.report.page import gather, report_page
 from detect.sources.opening import demand_recording, open_source
-from redetect.storage import demand_place, write_bytes
+from redetect.storage import demand_free, demand_place, write_bytes
+
+#: Images included in the program: the first ones of the demo run (`images/README.md`).
+DEMO_RUN = Path(__file__).resolve().parents[2] / "redetect" / "demo"
 
 
-def perform(options: Report) -> int:
+def perform(command: Report | Demo) -> int:
     """Execute the command; returns the exit code."""
+    return _demo(command) if isinstance(command, Demo) else _report(command)
+
+
+def _report(options: Report) -> int:
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
@@ -19,4 +30,19 @@ def perform(options: Report) -> int:
     names = [path.name for path in inputs.files.reference.values()]
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
     print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
+    return 0
+
+
+def _demo(command: Demo) -> int:
+    """Detect a small run, compare it with the truth, and write a page."""
+    run = command.run or DEMO_RUN
+    page = command.output / "demo.html"
+    demand_free([page], overwrite=command.force)
+    print(f"{run}: rendered images of a robot's drive")
+    code = detect_run(All(run=run, output=command.output, force=command.force))
+    if code != 0:
+        return code
+    result = comparison_of(Compare(run=run, detected=command.output / "detected.circles"))
+    _report(Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force))
+    print("", *result.sentences(), sep="\n")
     return 0

@@ -40,7 +40,7 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
 
 
 @kernel()
-def apart(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
+def suppress_close(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
     """Indices, in this order, of positions at least `separation` away from all kept before."""
     kept, count = np.empty(len(order), np.int64), 0
     x, y = np.empty(len(order)), np.empty(len(order))
@@ -56,7 +56,7 @@ def apart(floor_xy: FloatArray, order: IntArray, separation: float) -> IntArray:
 
 
 @kernel()
-def alone_published(
+def suppress_published(
     pixels: IntArray, quality: FloatArray, floor_xy: Float32Array,
     separation: float,
 ) -> BoolArray:  # fmt: skip

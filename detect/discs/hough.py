@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from detect.discs.candidates import apart
+from detect.discs.candidates import suppress_close
 from lut import VoteTable
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
@@ -71,7 +71,7 @@ def hough_candidates(
         place, score = _peaks(votes, table)
         best = np.argsort(-score, kind="stable")
         best = best[: max(_MOST_COMPARED, np.count_nonzero(score >= _CLEAR_SCORE))]
-        best = apart(place, best, _APART * radius)
+        best = suppress_close(place, best, _APART * radius)
         best = best[: max(_MOST_DOUBTFUL, np.count_nonzero(score[best] >= _CLEAR_SCORE))]
         places.append(place[best] @ table.turn + table.foot)
         scores.append(score[best])

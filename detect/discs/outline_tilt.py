@@ -24,7 +24,7 @@ import numpy as np
 from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
-from detect.verticals.tilt import level_matrix
+from detect.verticals.tilt import levelling_rotation
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
@@ -144,7 +144,7 @@ def fit_outline(
         for i in range(5):
             by_pitch = _STEP_RAD * ((i == 1) - (i == 2))
             by_roll = _STEP_RAD * ((i == 3) - (i == 4))
-            rotation = level_matrix(pitch + by_pitch, roll + by_roll)
+            rotation = levelling_rotation(pitch + by_pitch, roll + by_roll)
             a, b, c, d = _derivative_of_levelling(rotation, centre, x, y)
             shapes[i, 0], shapes[i, 1], shapes[i, 2], shapes[i, 3] = a, b, c, d
         for k in range(count):

@@ -112,28 +112,28 @@ def fit_marker(
             break
     if samples is None or solution is None:
         return None
-    p, left, inverse = solution
-    energy = left.weight * left.residual**2
-    variance = max(energy.sum() / max(left.weight.sum() - PARAMETERS, 1.0), noise**2)
+    p, linear, inverse = solution
+    energy = linear.weight * linear.residual**2
+    variance = max(energy.sum() / max(linear.weight.sum() - PARAMETERS, 1.0), noise**2)
     homography = _homography_of(p)
     by_homography = geometry.corners_by_homography(homography)
     whole = by_homography @ inverse[HOMOGRAPHY, HOMOGRAPHY] @ by_homography.T
-    whole *= variance * _inflation(samples.pixel, left)
+    whole *= variance * _inflation(samples.pixel, linear)
     if not (np.all(np.isfinite(whole)) and np.all(np.diag(whole) > 0.0)):
         return None
-    products, squares = cell_sums(pattern, left)
+    products, squares = cell_sums(pattern, linear)
     with np.errstate(divide="ignore", invalid="ignore"):
         cells = np.where(squares > 0.0, 1.0 - pattern.black + products / squares, 0.5)
         sigma = np.sqrt(variance / squares)
     outside = np.ones(cells.shape, dtype=bool)
     outside[templates.grid, templates.grid] = False
     # Concave tone curves move centroids of edges towards black; a convex one is ink that spread.
-    blur = np.median([left.at.sigma_x, left.at.sigma_y], axis=1)
+    blur = np.median([linear.at.sigma_x, linear.at.sigma_y], axis=1)
     inset = max(p[TONE], 0.0) / (1.0 + 0.5 * max(p[TONE], 0.0)) / math.sqrt(math.pi) * blur
     inner = np.diag([*(1.0 - 2.0 * inset), 1.0])
     inner[:2, 2] = inset
     contrast = max(float(p[WHITE.start] - p[BLACK.start]), 1e-3)
-    unexplained = float(np.mean(left.residual**2)) - picture.noise**2
+    unexplained = float(np.mean(linear.residual**2)) - picture.noise**2
     return PatternFit(
         corners=geometry.corners_of(homography) + centre,
         covariance=np.einsum("kikj->kij", whole.reshape(4, 2, 4, 2)),
@@ -176,16 +176,16 @@ def _solved(
     outlier, moved = math.inf, math.inf
     for step in range(steps + 1):
         homography = _homography_of(p)
-        left = linearise(samples, pattern, p, _inverse(homography), outlier)
-        scale = robust_sigma(left.residual, noise)
+        linear = linearise(samples, pattern, p, _inverse(homography), outlier)
+        scale = robust_sigma(linear.residual, noise)
         outlier = _OUTLIER * scale
         sigma[WHITE] = sigma[BLACK] = light * max(abs(p[WHITE.start] - p[BLACK.start]), scale)
         prior = (scale / sigma) ** 2
-        weighted = left.jacobian * left.weight
-        inverse = _inverse(weighted @ left.jacobian.T + np.diag(prior))
+        weighted = linear.jacobian * linear.weight
+        inverse = _inverse(weighted @ linear.jacobian.T + np.diag(prior))
         if step == steps or moved < _CLOSE_ENOUGH_PX:
             break
-        change = inverse @ (weighted @ left.residual + prior * (expected - p))
+        change = inverse @ (weighted @ linear.residual + prior * (expected - p))
         moved = float(np.abs(geometry.corners_by_homography(homography) @ change[HOMOGRAPHY]).max())
         change[HOMOGRAPHY] *= min(1.0, _STEP_REACHES * reach_px / max(moved, 1e-9))
         p = p + change
@@ -198,14 +198,14 @@ def _solved(
         largest = min(1.0 + 3.0 * blur_guess, _LARGEST_VARIANCE)
         confined = (vectors * np.clip(values, _LEAST_VARIANCE, largest)) @ vectors.T
         p[BLUR] = confined.flat[[0, 1, 3]]
-    return p, left, inverse
+    return p, linear, inverse
 
 
-def _seam_differs(left: Linearised) -> bool:
+def _seam_differs(linear: Linearised) -> bool:
     """Whether the surroundings are not as white as the model although the marker is as modelled."""
-    x, y = np.abs(left.at.x - 0.5) - 0.5, np.abs(left.at.y - 0.5) - 0.5
-    seam = (x > left.at.sigma_x) | (y > left.at.sigma_y)
-    squares, inside = left.residual**2, (x < 0.0) & (y < 0.0)
+    x, y = np.abs(linear.at.x - 0.5) - 0.5, np.abs(linear.at.y - 0.5) - 0.5
+    seam = (x > linear.at.sigma_x) | (y > linear.at.sigma_y)
+    squares, inside = linear.residual**2, (x < 0.0) & (y < 0.0)
     return bool(
         squares[seam].sum() * inside.sum() > _SEAM_RATIO * squares[inside].sum() * seam.sum()
     )
@@ -228,13 +228,13 @@ def _homography_of(p: FloatArray) -> FloatArray:
     return np.append(p[HOMOGRAPHY], 1.0).reshape(3, 3)
 
 
-def _inflation(pixel: IntArray, left: Linearised) -> float:
+def _inflation(pixel: IntArray, linear: Linearised) -> float:
     """Factor of the covariance for residuals that are correlated between neighbouring pixels.
 
     With a significant correlation rho to its neighbours in a row (decaying geometrically), each
     counts as (1 - rho) / (1 + rho) of an independent one; rows and columns alike.
     """
-    weighted = left.residual * np.sqrt(left.weight)
+    weighted = linear.residual * np.sqrt(linear.weight)
     energy = max(float(np.mean(weighted**2)), 1e-12)
     column, row = (pixel - pixel.min(axis=0)).T
     image = np.full((row.max() + 1, column.max() + 1), np.nan)

@@ -227,7 +227,7 @@ def linearise(
     return Linearised(residual, weight, jacobian, at, contrast)
 
 
-def cell_sums(pattern: Pattern, left: Linearised) -> tuple[FloatArray, FloatArray]:
+def cell_sums(pattern: Pattern, linear: Linearised) -> tuple[FloatArray, FloatArray]:
     """Sums over all pixels, for each cell (L - 1, L - 1), of the grey levels that a change from
     black to white would add, times residuals, and squared.
 
@@ -235,7 +235,7 @@ def cell_sums(pattern: Pattern, left: Linearised) -> tuple[FloatArray, FloatArra
     """
     across, down = (
         np.diff(ndtr(np.clip((pattern.lines - place[:, None]) / sigma[:, None], -_REACH, _REACH)))
-        for place, sigma in ((left.at.x, left.at.sigma_x), (left.at.y, left.at.sigma_y))
+        for place, sigma in ((linear.at.x, linear.at.sigma_x), (linear.at.y, linear.at.sigma_y))
     )
-    down = down * left.contrast[:, None]
-    return (down * left.residual[:, None]).T @ across, (down**2).T @ across**2
+    down = down * linear.contrast[:, None]
+    return (down * linear.residual[:, None]).T @ across, (down**2).T @ across**2

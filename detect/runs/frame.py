@@ -15,12 +15,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_table
+from detect.circles import CircleDetections, detect_circles, disc_table, scene_of, vote_shape
+from detect.discs.fit import working_space
 from detect.discs.identity import ids_of_rows
+from detect.discs.judgement import NO_CANDIDATES
 from detect.discs.outline_tilt import tilt_of_outlines
+from detect.discs.placing import place_discs
 from detect.errors import FrameError
 from detect.levelling import as_calibrated, common_covariance, levelled
 from detect.lines import LineDetections, carry_ids, detect_lines
+from detect.run_tilt import smooth_axis
 from detect.runs.plan import (
     FramePlan,
     FrameRows,
@@ -28,14 +32,14 @@ from detect.runs.plan import (
     KnownOfFrame,
     Lean,
     json_record,
-    pays,
+    lean_finds_more,
     rows_of_failure,
     time_row,
 )
 from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
-from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table
+from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table, cached_vote_table
 from redetect.array_types import GreyImage
 from redetect.interrupts import interrupts_deferred
 from redetect.landmarks import (
@@ -57,7 +61,7 @@ if TYPE_CHECKING:
 
 
 #: Errors of one frame, not of the run.
-COSTS_THE_FRAME = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
+FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
@@ -145,7 +149,11 @@ def _path(
                 lean = lean_of_frame(by_frame)
                 if lean is not None:
                     leaning = _discs(image, camera, settings, search_of(camera, plan.circles, lean))
-                    seen = leaning if pays(leaning.evidence.sum(), seen.evidence.sum()) else seen
+                    seen = (
+                        leaning
+                        if lean_finds_more(leaning.evidence.sum(), seen.evidence.sum())
+                        else seen
+                    )
             found.seen = seen
             found.discs = seen if by_frame is None else levelled(seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run does so later
@@ -163,7 +171,7 @@ def _path(
             from detect.markers.detect import detect_markers  # rarely needed
 
             found.markers = detect_markers(image, plan.markers, camera)
-    except COSTS_THE_FRAME as error:
+    except FRAME_ERRORS as error:
         found.error = reason_of(error, task)
 
 
@@ -224,7 +232,7 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
             {} if found.markers is None else dict(sorted(found.markers.rejected.items())),
             evidence=0.0 if found.discs is None else float(np.nansum(found.discs.evidence)),
         )
-    except COSTS_THE_FRAME as error:
+    except FRAME_ERRORS as error:
         return rows_of_failure(task, reason_of(error, task))
 
 
@@ -304,3 +312,21 @@ def lean_of_frame(tilt: FrameTilt) -> Lean | None:
         for angle in (tilt.pitch, tilt.roll)
     )
     return (pitch, roll) if pitch or roll else None
+
+
+def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
+    """Run the stages after the judgement of discs on empty input, so that they are compiled.
+
+    A process compiles kernels in the order of a frame's path. Another process calls this function
+    at the same time, and stores in the disk cache what the first one would have to compile later.
+    """
+    camera, settings = plan.camera, plan.circles
+    if not (camera and settings and settings.refine):
+        return
+    image = read_image(tasks[0].frame, camera, plan.working_folder)
+    table = cached_vote_table(camera, vote_shape(settings))
+    scene = scene_of(image, camera, table, settings)
+    place_discs(scene, NO_CANDIDATES, working_space()[0])
+    if plan.levelling == "run":
+        tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
+        smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)

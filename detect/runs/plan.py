@@ -240,7 +240,7 @@ def tilts_by_image(path: Path) -> dict[str, FrameTilt]:
     return {image_name(prefix): tilt for prefix, tilt in read_tilts(path).items()}
 
 
-def pays(leaning: float, evidence: float) -> bool:
+def lean_finds_more(leaning: float, evidence: float) -> bool:
     """Whether a search with the camera's lean finds clearly more evidence of discs."""
     return leaning > _MORE_EVIDENCE * evidence
 

@@ -41,7 +41,7 @@ import numpy as np
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary, pays
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary, lean_finds_more
 from detect.runs.workers import WorkerPool, Workers, local_workers
 from detect.settings import LEAST_FRAMES
 from detect.sources.interface import ImageRun, RunFrame
@@ -257,7 +257,11 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     if lean is None:
         return plan
     leaning = sum(each.evidence for each in rows_by(replace(level, lean=lean)))
-    return replace(plan, lean=lean) if pays(leaning, sum(each.evidence for each in rows)) else plan
+    return (
+        replace(plan, lean=lean)
+        if lean_finds_more(leaning, sum(each.evidence for each in rows))
+        else plan
+    )
 
 
 class RunFiles:

@@ -262,7 +262,7 @@ class _InProcess(Executor):
         if not self._shared or not self._chunk:  # or between tasks
             return
         self._shared = False  # only before the first kernel
-        from detect.runs.first_run import place_and_level_none
+        from detect.runs.frame import compile_later_stages
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # If no process can be started, this one compiles all kernels.
@@ -274,7 +274,7 @@ class _InProcess(Executor):
             done: list[Future[Any]] = [
                 path.submit(work_on_chunk, lines, self._chunk),
                 path.submit(work_on_chunk, discs, self._chunk),
-                later.submit(place_and_level_none, discs, self._chunk),
+                later.submit(compile_later_stages, discs, self._chunk),
             ]
             # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:

@@ -24,7 +24,7 @@ from detect.line_settings import JoiningNumbers
 from detect.verticals.judgement import Fate, JudgedTracks, accepted_tracks
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
-from detect.verticals.tilt import level_matrix, strongest_first
+from detect.verticals.tilt import levelling_rotation, strongest_first
 from detect.verticals.tracking import LineTracks
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
@@ -126,7 +126,7 @@ def _bearings(
     """
     alpha, noise = np.empty(len(fits.line)), np.empty(len(fits.line))
     turn = 1.0 if numbers.level else -1.0
-    rotation = level_matrix(turn * tilt[0], turn * tilt[1])
+    rotation = levelling_rotation(turn * tilt[0], turn * tilt[1])
     for t in tracks:
         sine, cosine = math.sin(fits.reference_rad[t]), math.cos(fits.reference_rad[t])
         a, b, covariance = fits.line[t, 0], fits.line[t, 1], fits.covariance[t]

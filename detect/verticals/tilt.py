@@ -194,7 +194,7 @@ def _refine_tilt(
     """Refine a tilt by repeated least squares over the lines that agree with it."""
     normal, variance, tolerance = lines.normal, lines.variance, lines.tolerance
     for repetition in range(REFINEMENTS + 1):
-        rotation = level_matrix(pitch, roll)
+        rotation = levelling_rotation(pitch, roll)
         pp = rr = 1.0 / (prior * prior)
         pr = 0.0
         gradient_p, gradient_r = pitch * pp, roll * rr
@@ -224,7 +224,7 @@ def _refine_tilt(
 
 
 @kernel()
-def level_matrix(pitch: float, roll: float) -> FloatArray:
+def levelling_rotation(pitch: float, roll: float) -> FloatArray:
     """(3, 3) rotation exp([pitch, roll, 0]x)."""
     squared = pitch * pitch + roll * roll
     angle = math.sqrt(squared)

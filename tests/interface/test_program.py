@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from detect.commands.demo import DEMO_RUN
+from detect.commands.report import DEMO_RUN
 from redetect.cli import DIRECT, PROGRAMS, main
 from tools.demo_package import FRAMES, first_frames
 

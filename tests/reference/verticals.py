@@ -13,7 +13,7 @@ from scipy.ndimage import correlate1d, map_coordinates
 from scipy.special import logsumexp, softmax
 
 from detect.line_settings import LineSettings
-from detect.verticals.tilt import TiltEstimate, level_matrix
+from detect.verticals.tilt import TiltEstimate, levelling_rotation
 from lut.verticals import VerticalTable
 from redetect.array_types import FloatArray, IntArray
 
@@ -282,7 +282,7 @@ def level_bearings(normal: ArrayLike, pitch_rad: float, roll_rad: float) -> Floa
     (...) float64
         alpha (rad), 0 forward, positive to the left.
     """
-    turned = np.asarray(normal, dtype=np.float64) @ level_matrix(pitch_rad, roll_rad).T
+    turned = np.asarray(normal, dtype=np.float64) @ levelling_rotation(pitch_rad, roll_rad).T
     # Of the plane's two level directions (n_y, -n_x) is the one ahead of the camera.
     return np.asarray(np.arctan2(turned[..., 1], turned[..., 0]))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_shape
-from detect.discs.candidates import alone_published
+from detect.discs.candidates import suppress_published
 from detect.settings import PUBLISHED
 from lut import DiscTable, build_disc_table
 from tests.detect.painted_floor import PaintedFloor
@@ -176,7 +176,7 @@ def test_what_is_alone_is_so_by_definition(data: st.DataObject) -> None:
     ).reshape(-1)
     v, u = np.mgrid[0:10, 0:10].astype(np.float32)
     floor_xy = np.stack([u, v], axis=-1)
-    kept = np.flatnonzero(alone_published(pixels, quality, floor_xy, 2.5)).tolist()
+    kept = np.flatnonzero(suppress_published(pixels, quality, floor_xy, 2.5)).tolist()
     expected: list[int] = []
     for k in range(count):
         near = [j for j in range(count) if j != k and np.hypot(*(pixels[j] - pixels[k])) < 2.5]

@@ -87,5 +87,5 @@ def test_the_best_stay_and_no_two_are_too_close(
     floor_xy, separation = lattice / 8.0, eighths / 8.0
     score = np.random.default_rng(seed).integers(-3, 4, len(lattice)) / 2.0
     kept = np.zeros(len(score), np.bool_)
-    kept[candidates.apart(floor_xy, np.argsort(-score, kind="stable"), separation)] = True
+    kept[candidates.suppress_close(floor_xy, np.argsort(-score, kind="stable"), separation)] = True
     np.testing.assert_array_equal(kept, plain_suppression(floor_xy, score, separation))

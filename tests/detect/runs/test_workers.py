@@ -144,7 +144,7 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
     assert began == [
         "0 work_on_chunk True False images",
         "0 work_on_chunk False True images",
-        "1 place_and_level_none False True images",
+        "1 compile_later_stages False True images",
         "compiled images",
         "compiled images",
     ]

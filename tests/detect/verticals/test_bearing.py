@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from camera import Camera
 from detect.verticals.joining import chain_neighbours, join_mixtures
-from detect.verticals.tilt import TiltEstimate, level_matrix
+from detect.verticals.tilt import TiltEstimate, levelling_rotation
 from redetect.landmarks import LineLandmark
 from tests.landmarks.rows import parse_record
 from tests.reference.verticals import (
@@ -83,7 +83,7 @@ def test_compensation_gives_the_bearing_of_a_vertical_back(
     """A camera that is tilted by R sees directions R' times the level ones."""
     level = np.array([np.sin(bearing), -np.cos(bearing), 0.0])
     ends = [level + np.array([0.0, 0.0, z]) for z in (high, low)]
-    seen = [end @ level_matrix(pitch, roll) for end in ends]
+    seen = [end @ levelling_rotation(pitch, roll) for end in ends]
     normal = np.cross(seen[0], seen[1])
     normal /= np.linalg.norm(normal)
     assert level_bearings(normal, pitch, roll) == pytest.approx(bearing, abs=1e-9)

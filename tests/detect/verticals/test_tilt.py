@@ -13,7 +13,12 @@ from scipy.ndimage import gaussian_filter
 from detect.line_settings import DEFAULT, LineNumbers
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
-from detect.verticals.tilt import TiltEstimate, agree_on_tilt, group_around_strongest, level_matrix
+from detect.verticals.tilt import (
+    TiltEstimate,
+    agree_on_tilt,
+    group_around_strongest,
+    levelling_rotation,
+)
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
 from tests.detect.verticals.stages import consensus, verticals
@@ -30,7 +35,7 @@ def seen_normals(
     bearing = rng.uniform(-0.7, 0.7, count)
     level = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(count)], axis=-1)
     real = level + rng.normal(0.0, 1.0, (count, 1)) * deviation_rad[:, None] * [0.0, 0.0, 1.0]
-    measured = real @ level_matrix(*tilt_rad)
+    measured = real @ levelling_rotation(*tilt_rad)
     return np.asarray(measured / np.linalg.norm(measured, axis=1, keepdims=True))
 
 
