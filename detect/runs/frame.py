@@ -149,11 +149,8 @@ def _path(
                 lean = lean_of_frame(by_frame)
                 if lean is not None:
                     leaning = _discs(image, camera, settings, search_of(camera, plan.circles, lean))
-                    seen = (
-                        leaning
-                        if lean_finds_more(leaning.evidence.sum(), seen.evidence.sum())
-                        else seen
-                    )
+                    if lean_finds_more(leaning.evidence.sum(), seen.evidence.sum()):
+                        seen = leaning
             found.seen = seen
             found.discs = seen if by_frame is None else levelled(seen, camera, by_frame)
             if plan.levelling != "run" and settings.refine:  # levelling by the run does so later

@@ -256,12 +256,9 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     lean = searched_lean(tilt)
     if lean is None:
         return plan
-    leaning = sum(each.evidence for each in rows_by(replace(level, lean=lean)))
-    return (
-        replace(plan, lean=lean)
-        if lean_finds_more(leaning, sum(each.evidence for each in rows))
-        else plan
-    )
+    leaning = replace(level, lean=lean)
+    evidence, with_lean = (sum(each.evidence for each in of) for of in (rows, rows_by(leaning)))
+    return replace(plan, lean=lean) if lean_finds_more(with_lean, evidence) else plan
 
 
 class RunFiles:
