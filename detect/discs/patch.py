@@ -2,9 +2,10 @@
 
 Pixels are used if they are within some radii of the initial disc, or within some pixels or standard
 deviations of the blur of its edge. All of them are taken for small discs; for large ones, all at
-the edge, which locate the disc, and a subset of the others, which give the grey levels. A pixel's
-distance from the edge is approximated to first order, with the floor's steps J at the candidate:
-``|r - R| r / |J^T p|`` pixels for a floor position p, r = ``|p|``.
+the edge, which locate the disc, and a subset of the others, which give the grey levels; for huge
+ones, pairs all along the edge. A pixel's distance from the edge is approximated to first order,
+with the floor's steps J at the candidate: ``|r - R| r / |J^T p|`` pixels for a floor position p,
+r = ``|p|``.
 """
 
 from __future__ import annotations
@@ -64,6 +65,9 @@ _LEAST_HALF_AXIS = 4.0
 _EDGE_BLURS = 2.0
 #: In windows of more pixels than this, those off the edge are subsampled.
 _DENSE_WINDOW = 2048
+#: Of this many neighbouring pixels at the edge, two are taken, so that their correlation is known:
+#: all for most discs, less for one whose edge has too many.
+_EDGE_SPACINGS = (1, 4, 8, 16, 32, 64)
 _NEVER, _SOMETIMES, _ALWAYS = range(3)
 #: Shift of the subsampled pixels from row to row, as a share of their spacing; it repeats rarely.
 _SHIFT = 0.381966
@@ -239,31 +243,37 @@ def _choose(
     first_u, last_u = max(1, u0 - half_u), min(width - 2, u0 + half_u)
     first_v, last_v = max(1, v0 - half_v), min(height - 2, v0 + half_v)
     window = (2 * half_u + 1) * (2 * half_v + 1)
-    every = 1 + window // _DENSE_WINDOW
-    shift = max(1, int(_SHIFT * every + 0.5))
     floor = floor_xy.reshape(-1, 2)
     pixel, taken, row_x, row_y = patch.pixel, patch.taken, patch.row_x, patch.row_y
     # Positions relative to the start, in its radii.
     x0 = F32(floor_xy[v0, u0, 0] + candidate.radius * start.x)
     y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
     per_radius = F32(1.0 / (candidate.radius * start.radius))
-    count = 0
-    for v in range(first_v, last_v + 1):
-        turn = (u0 - first_u + shift * (v - v0)) % every
-        begin = v * width + first_u
-        length = last_u - first_u + 1
-        if count + length > CAPACITY - SECTORS * _SECTOR_WHOLE:
+    length = last_u - first_u + 1
+    limit, count = CAPACITY - SECTORS * _SECTOR_WHOLE, 0
+    for spacing in _EDGE_SPACINGS:
+        every = spacing * (1 + window // (spacing * _DENSE_WINDOW))
+        shift = max(1, int(_SHIFT * every + 0.5))
+        count = 0
+        for v in range(first_v, last_v + 1):
+            turn = (u0 - first_u + shift * (v - v0)) % every
+            begin = v * width + first_u
+            if count == limit or length > CAPACITY:
+                break
+            places = floor[begin:]
+            for k in range(np.uint64(length)):
+                row_x[k] = (places[k, 0] - x0) * per_radius
+                row_y[k] = (places[k, 1] - y0) * per_radius
+            _take(length, candidate.blur, blur_ratio, reach, view, patch)
+            for k in range(length):
+                wanted = taken[k] == _ALWAYS and turn % spacing < 2
+                wanted |= taken[k] == _SOMETIMES and turn == 0
+                if wanted and count < limit:
+                    pixel[count] = begin + k
+                    count += 1
+                turn = turn - 1 if turn > 0 else every - 1
+        if count < limit:
             break
-        places = floor[begin:]
-        for k in range(np.uint64(length)):
-            row_x[k] = (places[k, 0] - x0) * per_radius
-            row_y[k] = (places[k, 1] - y0) * per_radius
-        _take(length, candidate.blur, blur_ratio, reach, view, patch)
-        for k in range(length):
-            if taken[k] == _ALWAYS or (taken[k] == _SOMETIMES and turn == 0):
-                pixel[count] = begin + k
-                count += 1
-            turn = turn - 1 if turn > 0 else every - 1
     return count
 
 
