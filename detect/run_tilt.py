@@ -151,6 +151,22 @@ def tilt_of_run(
     )
 
 
+def usual_tilt(verticals: FrameTilts, outlines: FrameTilts) -> float:
+    """Standard deviation of unknown tilts (rad) in a run of which few frames have a tilt.
+
+    By the median square of those from verticals, or else from outlines, without the variance of
+    their errors; the prior counts like as many frames as would determine it as well.
+    """
+    tilt, variance = (
+        np.where(verticals.known[:, None], *both) for both in zip(verticals, outlines)
+    )
+    # Half of two normal errors have a sum of squares below ln 4 times their variance.
+    squares = np.sum(tilt**2, axis=1) / math.log(4.0) - np.mean(variance, axis=1)
+    prior = np.full(round(0.25 / _LOG_SPREAD_SIGMA**2), _SPREAD_RAD**2)
+    usual = np.median(np.concatenate([prior, squares[np.isfinite(squares)]]))
+    return max(_SPREAD_RAD, math.sqrt(max(usual, 0.0)))
+
+
 def _tilt_by_outlines(verticals: FrameTilts, outlines: FrameTilts, unsure: float) -> RunTilt | None:
     """The tilt of a run of which few frames show verticals, mainly from the outlines of discs.
 

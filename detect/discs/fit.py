@@ -62,7 +62,7 @@ from detect.discs.patch import (
     floor_steps,
     gather,
 )
-from detect.discs.rim import median
+from detect.discs.rim import median, within
 from redetect.array_types import Float32Array, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
@@ -222,9 +222,8 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     usual = Edge(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
     edge = Edge(begin.x, begin.y, begin.radius, _blur_of(shape, start.blur_px, scene.blur_ratio))
     groups = SECTORS if by_parts else 1
-    levels = Levels(
-        np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups)
-    )
+    zeros = np.zeros((5, groups))
+    levels = Levels(zeros[0], zeros[1], zeros[2], zeros[3], zeros[4])
     products, normal = np.zeros((_TERMS, _TERMS, SECTORS)), np.zeros((_TERMS, _TERMS, 1))
     movement = np.zeros(_TERMS)
     patch.trust[: ends[SECTORS]] = 1.0
@@ -260,7 +259,9 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     if by_parts:
         xx, xy, yy = _covariance_by_parts(products, levels, normal, noise)
     else:
-        area = _correlated_area_of(patch, rows, ends[SECTORS], products)
+        unknowns = np.zeros(_TERMS)
+        _solve(_sum_of(products), 0, unknowns)
+        area = _correlated_area(patch, rows, ends[SECTORS], unknowns)
         xx, xy, yy = area * noise[0], area * noise[1], area * noise[2]
     information *= (noise[0] + noise[2]) / (xx + yy)
     near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
@@ -496,26 +497,16 @@ def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
 @kernel(inline="always")
 def _moved(edge: Edge, step: FloatArray, most_blur: float) -> Edge:
     """The edge after a step, within limits."""
-    radius = edge.radius + _within(step[_RADIUS], _LONGEST)
-    return Edge(
-        edge.x + _within(step[_X], _LONGEST),
-        edge.y + _within(step[_Y], _LONGEST),
-        min(max(radius, _LEAST_RADIUS), _MOST_RADIUS),
-        Blur(
-            _scaled(edge.blur.first, step[_BLUR_1], most_blur),
-            _scaled(edge.blur.second, step[_BLUR_2], most_blur),
-        ),
-    )
-
-
-@kernel(inline="always")
-def _within(step: float, longest: float) -> float:
-    return min(max(step, -longest), longest)
+    radius = edge.radius + within(step[_RADIUS], _LONGEST)
+    x, y = edge.x + within(step[_X], _LONGEST), edge.y + within(step[_Y], _LONGEST)
+    first = _scaled(edge.blur.first, step[_BLUR_1], most_blur)
+    second = _scaled(edge.blur.second, step[_BLUR_2], most_blur)
+    return Edge(x, y, min(max(radius, _LEAST_RADIUS), _MOST_RADIUS), Blur(first, second))
 
 
 @kernel(inline="always")
 def _scaled(blur: float, step: float, most: float) -> float:
-    return min(max(blur * math.exp(_within(step, _LONGEST_BLUR)), _LEAST_BLUR), most)
+    return min(max(blur * math.exp(within(step, _LONGEST_BLUR)), _LEAST_BLUR), most)
 
 
 @kernel(inline="always")
@@ -534,13 +525,6 @@ def _radius_information(normal: FloatArray) -> float:
     by_centre = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     information: float = normal[_RADIUS, _RADIUS, 0] - by_centre
     return information
-
-
-@kernel(inline="always")
-def _correlated_area_of(patch: Any, rows: Float32Array, n: int, products: FloatArray) -> float:
-    unknowns = np.zeros(_TERMS)
-    _solve(_sum_of(products), 0, unknowns)
-    return _correlated_area(patch, rows, n, unknowns)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

@@ -209,24 +209,32 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 def glance(
     image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Nearest-pixel grey values along some directions, ignoring perspective within the disc.
+    """Nearest-pixel grey values along some directions.
 
-    Parameters and results as for `detect.discs.rim.profiles`, with fewer directions and steps.
+    Perspective within the disc is ignored if it shifts the rim by less than a step. Parameters and
+    results as for `detect.discs.rim.profiles`, with fewer directions and steps.
     """
     grey, scale = np.empty((GLANCED, len(GLANCED_AT))), np.empty(GLANCED)
     u0, v0 = project_floor_point(camera_numbers, x, y)
     ux, vx = project_floor_point(camera_numbers, x + radius, y)
     uy, vy = project_floor_point(camera_numbers, x, y + radius)
+    cx, cy, cz = camera_numbers[19:22]
+    # The scale changes from the centre to the rim by up to radius over distance, on either side.
+    step = GLANCED_AT[1] - GLANCED_AT[0]
+    flat = 2.0 * radius < step * math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + cz**2)
     height, width = image.shape
     for k in range(GLANCED):
         cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
         du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
         scale[k] = math.sqrt(du * du + dv * dv)
         for m in range(len(GLANCED_AT)):
-            u = math.floor(u0 + GLANCED_AT[m] * du + 0.5)
-            v = math.floor(v0 + GLANCED_AT[m] * dv + 0.5)
-            inside = 0 <= u < width and 0 <= v < height
-            grey[k, m] = image[v, u] if inside else math.nan
+            u, v = u0 + GLANCED_AT[m] * du, v0 + GLANCED_AT[m] * dv
+            if not flat:
+                off = radius * GLANCED_AT[m]
+                u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
+            u, v = u + 0.5, v + 0.5
+            inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
+            grey[k, m] = image[int(v), int(u)] if inside else math.nan
     return grey, scale
 
 

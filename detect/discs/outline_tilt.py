@@ -195,14 +195,8 @@ def fit_outline(
         weights += weight[k]
     variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
     found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
-    return (
-        found,
-        unknowns[2],
-        unknowns[3],
-        variance * inverse[2, 2],
-        variance * inverse[2, 3],
-        variance * inverse[3, 3],
-    )
+    cpp, cpr, crr = variance * inverse[2, 2], variance * inverse[2, 3], variance * inverse[3, 3]
+    return found, unknowns[2], unknowns[3], cpp, cpr, crr
 
 
 @kernel()

@@ -2,9 +2,10 @@
 
 Pixels are used if they are within some radii of the initial disc, or within some pixels or standard
 deviations of the blur of its edge. All of them are taken for small discs; for large ones, all at
-the edge, which locate the disc, and a subset of the others, which give the grey levels. A pixel's
-distance from the edge is approximated to first order, with the floor's steps J at the candidate:
-``|r - R| r / |J^T p|`` pixels for a floor position p, r = ``|p|``.
+the edge, which locate the disc, and a subset of the others, which give the grey levels; for huge
+ones, pairs all along the edge. A pixel's distance from the edge is approximated to first order,
+with the floor's steps J at the candidate: ``|r - R| r / |J^T p|`` pixels for a floor position p,
+r = ``|p|``.
 """
 
 from __future__ import annotations
@@ -64,7 +65,10 @@ _LEAST_HALF_AXIS = 4.0
 _EDGE_BLURS = 2.0
 #: In windows of more pixels than this, those off the edge are subsampled.
 _DENSE_WINDOW = 2048
-_NEVER, _SOMETIMES, _AT_EDGE = range(3)
+#: Of this many neighbouring pixels at the edge, two are taken, so that their correlation is known:
+#: all for most discs, less for one whose edge has too many.
+_EDGE_SPACINGS = (1, 4, 8, 16, 32, 64)
+_NEVER, _SOMETIMES, _ALWAYS = range(3)
 #: Shift of the subsampled pixels from row to row, as a share of their spacing; it repeats rarely.
 _SHIFT = 0.381966
 
@@ -239,40 +243,37 @@ def _choose(
     first_u, last_u = max(1, u0 - half_u), min(width - 2, u0 + half_u)
     first_v, last_v = max(1, v0 - half_v), min(height - 2, v0 + half_v)
     window = (2 * half_u + 1) * (2 * half_v + 1)
-    every = 1 + window // _DENSE_WINDOW
-    shift = max(1, int(_SHIFT * every + 0.5))
-    # Of a disc with more pixels at its edge than there is room for, those are subsampled, too.
-    room = CAPACITY - SECTORS * _SECTOR_WHOLE
-    band = 2.0 * _EDGE_BLURS * math.sqrt(candidate.blur * candidate.blur + PIXEL_VARIANCE)
-    perimeter = 2.0 * math.pi * math.hypot(view.u_per_radius, view.v_per_radius) / math.sqrt(2.0)
-    edge_every = 1 + int(band * perimeter / (room - window // every))
-    edge_shift = max(1, int(_SHIFT * edge_every + 0.5))
     floor = floor_xy.reshape(-1, 2)
     pixel, taken, row_x, row_y = patch.pixel, patch.taken, patch.row_x, patch.row_y
     # Positions relative to the start, in its radii.
     x0 = F32(floor_xy[v0, u0, 0] + candidate.radius * start.x)
     y0 = F32(floor_xy[v0, u0, 1] + candidate.radius * start.y)
     per_radius = F32(1.0 / (candidate.radius * start.radius))
-    count = 0
-    for v in range(first_v, last_v + 1):
-        turn = (u0 - first_u + shift * (v - v0)) % every
-        edge_turn = (u0 - first_u + edge_shift * (v - v0)) % edge_every
-        begin = v * width + first_u
-        length = min(last_u - first_u + 1, CAPACITY)
-        places = floor[begin:]
-        for k in range(np.uint64(length)):
-            row_x[k] = (places[k, 0] - x0) * per_radius
-            row_y[k] = (places[k, 1] - y0) * per_radius
-        _take(length, candidate.blur, blur_ratio, reach, view, patch)
-        for k in range(length):
-            chosen = (taken[k] == _SOMETIMES and turn == 0) or (
-                taken[k] == _AT_EDGE and edge_turn == 0
-            )
-            if chosen and count < room:
-                pixel[count] = begin + k
-                count += 1
-            turn = turn - 1 if turn > 0 else every - 1
-            edge_turn = edge_turn - 1 if edge_turn > 0 else edge_every - 1
+    length = last_u - first_u + 1
+    limit, count = CAPACITY - SECTORS * _SECTOR_WHOLE, 0
+    for spacing in _EDGE_SPACINGS:
+        every = spacing * (1 + window // (spacing * _DENSE_WINDOW))
+        shift = max(1, int(_SHIFT * every + 0.5))
+        count = 0
+        for v in range(first_v, last_v + 1):
+            turn = (u0 - first_u + shift * (v - v0)) % every
+            begin = v * width + first_u
+            if count == limit or length > CAPACITY:
+                break
+            places = floor[begin:]
+            for k in range(np.uint64(length)):
+                row_x[k] = (places[k, 0] - x0) * per_radius
+                row_y[k] = (places[k, 1] - y0) * per_radius
+            _take(length, candidate.blur, blur_ratio, reach, view, patch)
+            for k in range(length):
+                wanted = taken[k] == _ALWAYS and turn % spacing < 2
+                wanted |= taken[k] == _SOMETIMES and turn == 0
+                if wanted and count < limit:
+                    pixel[count] = begin + k
+                    count += 1
+                turn = turn - 1 if turn > 0 else every - 1
+        if count < limit:
+            break
     return count
 
 
@@ -280,7 +281,7 @@ def _choose(
 def _take(
     length: int, blur: float, blur_ratio: float, reach: Reach, view: View, patch: Any
 ) -> None:
-    """Decide which pixels of a row are taken: at the edge, or elsewhere within reach."""
+    """Decide which pixels of a row are taken: all at the edge, a subset of others within reach."""
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
@@ -307,7 +308,7 @@ def _take(
         # At the candidate itself, where all terms are zero, there is no edge.
         edge = off_2 < edge_u * gu + edge_v * gv
         taken = _SOMETIMES if within else _NEVER
-        patch.taken[k] = _AT_EDGE if within & edge else taken
+        patch.taken[k] = _ALWAYS if within & edge else taken
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

@@ -191,13 +191,8 @@ def _more_certain(one: Place, other: Place) -> Place:
 @kernel(inline="always")
 def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
     """Add a share of the square of (x, y), metres, to the covariance of a place."""
-    return Place(
-        place.x,
-        place.y,
-        place.cov_xx + share * x * x,
-        place.cov_xy + share * x * y,
-        place.cov_yy + share * y * y,
-    )
+    xx, xy = place.cov_xx + share * x * x, place.cov_xy + share * x * y
+    return Place(place.x, place.y, xx, xy, place.cov_yy + share * y * y)
 
 
 @kernel(inline="always")

@@ -230,9 +230,9 @@ def fit_circle(
     ww = s_xx * s_yy - s_xy * s_xy
     scale = 1.0 / (s_xx * xx + s_xy * xy + s_x * xw)
     return Circle(
-        circle.x + _bounded(scale * (xx * r_x + xy * r_y + xw * r_w)),
-        circle.y + _bounded(scale * (xy * r_x + yy * r_y + yw * r_w)),
-        circle.radius + _bounded(scale * (xw * r_x + yw * r_y + ww * r_w)),
+        circle.x + within(scale * (xx * r_x + xy * r_y + xw * r_w), _LONGEST_STEP),
+        circle.y + within(scale * (xy * r_x + yy * r_y + yw * r_w), _LONGEST_STEP),
+        circle.radius + within(scale * (xw * r_x + yw * r_y + ww * r_w), _LONGEST_STEP),
         scale * xx,
         scale * xy,
         scale * yy,
@@ -240,8 +240,9 @@ def fit_circle(
 
 
 @kernel()
-def _bounded(step: float) -> float:
-    return min(max(step, -_LONGEST_STEP), _LONGEST_STEP)
+def within(step: float, longest: float) -> float:
+    """The step, or one of the longest length."""
+    return min(max(step, -longest), longest)
 
 
 @kernel()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from camera import Camera
 from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
-from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run
+from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run, usual_tilt
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import FrameRows, Lean, RunSummary
 from detect.settings import CircleSettings
@@ -34,10 +35,13 @@ _LEAST_SIGMA_RAD = 1e-6
 _LEVELLED_AT_ONCE = 64
 
 
-def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> RunTilt | None:
-    """The tilt of a run, from the rows of some frames; None if few of them have a tilt."""
+def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt | None, float]:
+    """The tilt of a run, from the rows of some frames, and the standard deviation of an unknown one
+    (rad). None if few of them have a tilt.
+    """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
-    return tilt_of_run(verticals, outlines, common_tilt_variance(camera))
+    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera))
+    return found, found.usual_rad if found else usual_tilt(verticals, outlines)
 
 
 def searched_lean(tilt: RunTilt) -> Lean | None:
@@ -69,8 +73,9 @@ def level_run(
     """The rows of each frame with levelled discs, and `RUN_TILT`.
 
     If too few frames have a tilt (`detect.run_tilt.LEAST_FRAMES`), each frame is levelled by its
-    own; unknown tilts have the standard deviation of the settings. The tilt of the run is stored in
-    the summary. `read` returns the rows of all frames before levelling, and is called twice.
+    own; unknown tilts have the standard deviation of the settings, or of the known ones. It or the
+    tilt of the run is stored in the summary. `read` returns the rows of all frames before
+    levelling, and is called twice.
     """
     frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)
@@ -82,7 +87,11 @@ def level_run(
             for (prefix, lines, _), (pitch, roll, cpp, crr) in zip(frames, numbers, strict=True)
         ]
     elif settings.tilt_sigma_rad or settings.calibration_px or common is not None:
-        unknown = max(settings.tilt_sigma_rad, _LEAST_SIGMA_RAD) ** 2
+        sigma_rad = settings.tilt_sigma_rad
+        if settings.tilt_sigma_deg is None:
+            sigma_rad = usual_tilt(verticals, outlines)
+            summary.unlevelled_deg = round(math.degrees(sigma_rad), 2)
+        unknown = max(sigma_rad, _LEAST_SIGMA_RAD) ** 2
         tilts = [t or FrameTilt(name, 0.0, 0.0, unknown, 0.0, unknown, 0) for name, _, t in frames]
     else:
         tilts = [tilt for _, _, tilt in frames]

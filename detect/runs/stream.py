@@ -247,13 +247,12 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
     rows = rows_by(level)
-    tilt = tilt_of_some(camera, rows)
-    if tilt is None:
-        return plan
-    if circles.tilt_sigma_deg is None and plan.levelling != "run":
-        circles = replace(circles, tilt_sigma_deg=round(math.degrees(tilt.usual_rad), 2))
+    tilt, usual_rad = tilt_of_some(camera, rows)
+    known = tilt is not None or usual_rad > circles.tilt_sigma_rad
+    if known and circles.tilt_sigma_deg is None and plan.levelling != "run":
+        circles = replace(circles, tilt_sigma_deg=round(math.degrees(usual_rad), 2))
         plan = replace(plan, circles=circles)
-    lean = searched_lean(tilt)
+    lean = searched_lean(tilt) if tilt else None
     if lean is None:
         return plan
     leaning = replace(level, lean=lean)

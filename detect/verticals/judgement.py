@@ -108,9 +108,7 @@ def fit_and_judge(
 @kernel()
 def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
-) -> tuple[
-    FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray
-]:  # fmt: skip
+) -> tuple[FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray]:
     """Evidence and individual fates of tracks, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
     evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)

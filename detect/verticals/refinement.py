@@ -136,22 +136,6 @@ class Eigenline(NamedTuple):
 
 
 @kernel(inline="always")
-def _no_fits(count: int) -> LineFits:
-    """Empty arrays for the lines of tracks."""
-    return LineFits(
-        np.empty(count),
-        np.empty(count),
-        np.full((count, 2), np.nan),
-        np.full((count, 2, 2), np.nan),
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.ones(count),
-    )
-
-
-@kernel(inline="always")
 def _fit_points(
     strip: Strip, tracks: LineTracks, t: int, least: tuple[int, float], chart: FloatArray,
     fits: LineFits, k: int,
@@ -196,11 +180,13 @@ def fit_lines(
 
     Tracks with fewer points or a lower sum of scores than `least` have no line.
     """
-    fits = _no_fits(len(tracks.polarity) - first)
-    height = image.shape[0]
+    count, height = len(tracks.polarity) - first, image.shape[0]
+    own, nan = np.empty((2, count)), np.full((4, count), np.nan)
+    ab, of_ab = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
+    fits = LineFits(own[0], own[1], ab, of_ab, nan[0], nan[1], nan[2], nan[3], np.ones(count))
     chart, column = np.empty((2, height)), np.empty(height)
     by_a, by_b = np.empty(height), np.empty(height)
-    for k in range(len(fits.sharpness)):
+    for k in range(count):
         t = first + k
         line = _fit_points(strip, tracks, t, least, chart, fits, k)
         if len(filters.half) == 0 or np.isnan(fits.line[k, 0]):

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, RunTilt, tilt_of_run
+from detect.run_tilt import (
+    COMMON_RAD,
+    LEAST_FRAMES,
+    FrameTilts,
+    RunTilt,
+    tilt_of_run,
+    usual_tilt,
+)
 
 FloatArray = NDArray[np.float64]
 FRAMES = 600
@@ -109,6 +116,34 @@ def test_too_few_frames_have_no_run() -> None:
     measured[: LEAST_FRAMES - 1] = 0.01
 
     assert tilt_of_run(FrameTilts(measured, np.full((50, 2), 1e-6))) is None
+
+
+@pytest.mark.parametrize("count", [5, 10, 19])
+@pytest.mark.parametrize("of_outlines", [False, True])
+@pytest.mark.parametrize("tilt_deg", [0.2, 1.5])
+def test_few_tilts_determine_an_unknown_one(count: int, of_outlines: bool, tilt_deg: float) -> None:
+    rng = np.random.default_rng(count)
+    nothing = np.full((40, 2), np.nan)
+    found = []
+    for _ in range(200):
+        sigma = np.radians(rng.uniform(0.1, 0.6, (40, 2)))
+        tilt = np.radians(tilt_deg) * rng.standard_normal((40, 2))
+        tilt += sigma * rng.standard_normal((40, 2))
+        tilt[count:] = np.nan
+        both = FrameTilts(tilt, sigma**2), FrameTilts(nothing, nothing)
+        found.append(math.degrees(usual_tilt(*(both[::-1] if of_outlines else both))))
+    assert min(found) == pytest.approx(0.3) or tilt_deg > 1.0
+    assert 0.5 < np.mean(found) / max(tilt_deg, 0.3) < 1.3
+
+
+def test_two_strays_do_not_determine_an_unknown_tilt() -> None:
+    tilt = np.full((40, 2), np.nan)
+    tilt[[3, 17]] = np.radians([[4.0, -1.0], [1.0, 5.0]])
+    both = (
+        FrameTilts(tilt, np.full((40, 2), np.radians(0.3) ** 2)),
+        FrameTilts(*2 * [tilt * np.nan]),
+    )
+    assert math.degrees(usual_tilt(*both)) < 0.5
 
 
 @pytest.mark.parametrize("wrong", ["verticals", "outlines", "both"])

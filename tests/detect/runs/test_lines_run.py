@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -10,12 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from camera import write_camera
+from camera import read_camera, write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
 from detect.lines import carry_ids
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
+from detect.seen import leaning_camera
 from detect.sources.opening import open_run
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.commands import Captured
@@ -114,6 +116,22 @@ def test_frames_that_count_as_level_are_told(short_run: Path, capsys: Captured) 
     )
     assert main(["all", str(short_run), "--tilt", "frame", "--force", "--tilt-sigma-deg", "0"]) == 3
     assert "the other 1 are assumed exactly level" in capsys.readouterr().out
+
+
+def test_frames_without_a_tilt_count_as_level_as_the_others(
+    short_run: Path, capsys: Captured
+) -> None:
+    camera = leaning_camera(read_camera(short_run / "e.cam"), (0.04, 0.0))
+    write_camera(camera, short_run / "e.cam", overwrite=True)
+    cv2.imwrite(str(short_run / "images" / "e.0002.jpg"), np.full((288, 768), 90, np.uint8))
+    assert main(["all", str(short_run)]) == 0
+    said = re.search("the tilt of 3 frames; .* level within ([0-9.]+) deg", capsys.readouterr().out)
+    assert said is not None
+    assert 1.0 < float(said[1]) < 2.3
+    unknown = [tilt for tilt in read_tilts(short_run / "detected.tilt").values() if not tilt.lines]
+    assert [math.degrees(math.sqrt(tilt.cpp)) for tilt in unknown] == [
+        pytest.approx(float(said[1]), abs=0.01)
+    ]
 
 
 def test_tilts_that_are_known_exactly_can_be_read(short_run: Path) -> None:
