@@ -25,16 +25,8 @@ def camera_numbers(camera: Camera) -> FloatArray:
     Order: scale x, y; offset x, y; a2, a3, b1, b2, b3; r_max; the 9 entries of the rotation
     robot -> camera row by row; the camera's centre in the robot frame; k1, k2, p1, p2, k3.
     """
-    return np.array(
-        [
-            *camera.pinhole,
-            *camera.coef,
-            camera.r_max,
-            *camera.camera_from_robot.ravel(),
-            *camera.centre,
-            *camera.brown,
-        ]
-    )
+    pose = camera.camera_from_robot.ravel(), camera.centre
+    return np.concatenate([camera.pinhole, camera.coef, [camera.r_max], *pose, camera.brown])
 
 
 def published_camera_numbers(camera: Camera) -> FloatArray:
