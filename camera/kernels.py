@@ -34,16 +34,8 @@ def camera_numbers(camera: Camera) -> FloatArray:
     Their order is that of the places above; the rotation is robot -> camera, row by row, the
     camera's centre is in the robot frame.
     """
-    return np.array(
-        [
-            *camera.pinhole,
-            *camera.coef,
-            camera.r_max,
-            *camera.camera_from_robot.ravel(),
-            *camera.centre,
-            *camera.brown,
-        ]
-    )
+    pose = camera.camera_from_robot.ravel(), camera.centre
+    return np.concatenate([camera.pinhole, camera.coef, [camera.r_max], *pose, camera.brown])
 
 
 def published_camera_numbers(camera: Camera) -> FloatArray:

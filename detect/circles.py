@@ -32,6 +32,7 @@ from detect.grey_values import blank_margins, estimate_noise, plain_image, steep
 from detect.settings import CircleSettings, Polarity
 from lut import DiscShape, DiscTable, VoteShape, VoteTable, cached_disc_table, cached_vote_table
 from lut.outlines import fingerprint, floor_positions
+from lut.votes import build_vote_table
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.tables import ByContent
 
@@ -159,7 +160,7 @@ def _between_margins(
     """The camera of an image without its margins, and its table."""
     width, offset_x = camera.width - left - right, camera.offset_x - left
     camera = replace(camera, width=width, offset_x=offset_x)
-    return camera, cached_vote_table(camera, shape)
+    return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
 def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:

@@ -23,11 +23,11 @@ from camera.uncertainty import covariance_of, with_covariance
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.run_tilt import COMMON_RAD, LEAST_FRAMES, FrameTilts, frame_tilts, tilt_of_run
+from detect.run_tilt import COMMON_RAD, FrameTilts, frame_tilts, own_pitch, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import leaning_camera, level_matrix
-from detect.settings import CircleSettings
+from detect.settings import LEAST_FRAMES, CircleSettings
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
 from detect.terminal import progress_bar, report_failures
@@ -69,7 +69,7 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
     """The mounting of a run's camera, compared with the given one."""
     height_m = float(camera.centre[2])
     plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
-    tilts, pitches, failures = [], [], []
+    tilts, apart, failures, own = [], [], [], own_pitch(camera)
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
             advance()
@@ -84,13 +84,12 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
                 for share in HEIGHT_STEPS
             ]
             tilts.append(found.tilt)
-            pitches.append([math.nan if one is None else one.pitch for one in outlines])
+            level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
+            apart.append(np.dot(np.subtract(level[1:], level[0]), own))
     report_failures(len(failures), failures)
     if not tilts:
         raise DetectError(f"{run.folder}: none of its images could be processed")
-    mounting = mounting_of_run(
-        height_m, frame_tilts(tilts), np.reshape(pitches, (-1, len(HEIGHT_STEPS)))
-    )
+    mounting = mounting_of_run(height_m, frame_tilts(tilts), np.array(apart))
     if mounting is None:
         raise DetectError(
             f"{run.folder}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
@@ -128,22 +127,23 @@ class Mounting:
 
 
 def mounting_of_run(
-    height_m: float, verticals: FrameTilts, outline_pitch_rad: FloatArray
+    height_m: float, verticals: FrameTilts, apart_rad: FloatArray
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    From the calibrated height of the camera, the tilts of N frames, and the pitch (N, 3) from the
-    outlines of discs with the height changed by each of `HEIGHT_STEPS`; NaN without outlines.
+    From the calibrated height of the camera, the tilts of N frames, and the camera's pitch (N, 3)
+    from the outlines of discs with the height changed by each of `HEIGHT_STEPS`, relative to that
+    from verticals; NaN without either.
     """
     run = tilt_of_run(verticals)
     if run is None:
         return None
-    known = np.isfinite(outline_pitch_rad).all(axis=1) & verticals.known
+    known = np.isfinite(apart_rad).all(axis=1)
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
     if count >= LEAST_FRAMES:
         # Pitch from outlines is nearly linear in the height; frames share the slope.
-        lower, same, higher = (outline_pitch_rad[known] - verticals.tilt[known, :1]).T
+        lower, same, higher = apart_rad[known].T
         slope = float(np.median(higher - lower)) / (HEIGHT_STEPS[2] - HEIGHT_STEPS[0])
         bend = float(np.median(higher + lower - 2.0 * same)) / HEIGHT_STEPS[2] ** 2
         off = float(np.median(same))

@@ -10,7 +10,7 @@ import numpy as np
 
 from camera import Camera
 from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
-from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, tilt_of_run, usual_tilt
+from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, own_pitch, tilt_of_run, usual_tilt
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import FrameRows, Lean, RunSummary
 from detect.settings import CircleSettings
@@ -40,7 +40,7 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt |
     (rad). None if few of them have a tilt.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
-    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera))
+    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera), own_pitch(camera))
     return found, found.usual_rad if found else usual_tilt(verticals, outlines)
 
 
@@ -79,7 +79,7 @@ def level_run(
     """
     frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)
-    found = summary.tilt = tilt_of_run(verticals, outlines, common)
+    found = summary.tilt = tilt_of_run(verticals, outlines, common, own_pitch(camera))
     if found is not None:
         numbers = np.column_stack([found.tilt, found.variance]).tolist()
         tilts: list[FrameTilt | None] = [

@@ -171,13 +171,8 @@ def follow_edges(
         polarity[count] = sign
         count += 1
         bounds[count] = n
-    return LineTracks(
-        polarity[:count],
-        bounds[: count + 1],
-        found_row[:n].copy(),
-        found_column[:n].copy(),
-        found_score[:n].copy(),
-    )
+    rows, columns, scores = found_row[:n].copy(), found_column[:n].copy(), found_score[:n].copy()
+    return LineTracks(polarity[:count], bounds[: count + 1], rows, columns, scores)
 
 
 @kernel(inline="always")

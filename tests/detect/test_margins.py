@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import detect_circles, disc_table
+from detect.circles import detect_circles, disc_table, vote_shape
 from detect.grey_values import blank_margins
 from detect.settings import CircleSettings
+from lut import build_vote_table
 from tests.detect.painted_floor import PaintedFloor
 
 LIGHT = 200.0
@@ -56,6 +59,18 @@ def test_a_disc_that_a_margin_cuts_is_found_in_its_place(
     assert len(found) == 1
     assert np.linalg.norm(found.floor_xy[0] - place) < 0.01
     assert np.abs(found.pixels[0] - [u, 190.0]).max() <= 3.0
+
+
+def test_no_table_is_kept_on_disk_for_a_margin(
+    published_camera: Camera, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Walls at the side may look like one, and a search for the radius tries many."""
+    monkeypatch.setenv("REDETECT_CACHE", str(tmp_path))
+    settings = CircleSettings(radius_m=0.105)
+    table = build_vote_table(published_camera, vote_shape(settings))
+    image, _ = floor_with_disc(published_camera, 400.0, 190.0)
+    assert len(detect_circles(with_margin(image, 7), published_camera, table, settings)) == 1
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_least_images_have_no_margins() -> None:

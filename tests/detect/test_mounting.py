@@ -10,11 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from camera import Camera, read_camera, write_camera
 from camera.calibration.model import COUNT
 from camera.cli import main
 from camera.model import PARAMETERS
+from camera.model_checks import checked_pose
 from camera.uncertainty import covariance_of, with_covariance
 from detect.commands.level import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.levelling import common_covariance
@@ -31,14 +33,15 @@ SLOPE, BEND = -3.0, 4.0
 def drive(
     lean: tuple[float, float], raised_m: float, frames: int = 200
 ) -> tuple[FrameTilts, np.ndarray]:
-    """Tilts by verticals, and pitches by outlines at the tried heights."""
+    """Tilts by verticals, and pitches by outlines at the tried heights, relative to those."""
     rng = np.random.default_rng(4)
     true = lean + np.radians(0.3) * rng.standard_normal((frames, 2))
     sigma = np.full(true.shape, np.radians(0.1))
     verticals = FrameTilts(true + sigma * rng.standard_normal(true.shape), sigma**2)
     off = np.array(HEIGHT_STEPS) - raised_m / HEIGHT_M
     pitches = true[:, :1] + SLOPE * off + BEND * off**2
-    return verticals, pitches + np.radians(0.4) * rng.standard_normal((frames, 1))
+    pitches += np.radians(0.4) * rng.standard_normal((frames, 1))
+    return verticals, pitches - verticals.tilt[:, :1]
 
 
 @pytest.mark.parametrize("raised_m", [0.0, -0.045, 0.06])
@@ -148,6 +151,23 @@ def test_the_demos_camera_comes_back(project_root: Path, tmp_path: Path, capsys:
     unmoved = replace(found, robot_from_camera=true.robot_from_camera, covariance=true.covariance)
     assert unmoved == true
     assert main(command) == 1  # nothing is overwritten unasked
+
+
+@pytest.mark.long
+def test_the_height_of_a_camera_that_looks_aside_comes_back(
+    project_root: Path, tmp_path: Path
+) -> None:
+    """The robot of the demo might as well drive sideways."""
+    run = project_root / "images" / "e"
+    true = read_camera(run / "e.cam")
+    aside = Rotation.from_euler("z", 90.0, degrees=True).as_matrix() @ true.robot_from_camera
+    aside[2, 3] = 1.43
+    wrong = replace(true, robot_from_camera=checked_pose("sensor2World", aside))
+    write_camera(wrong, tmp_path / "wrong.cam")
+    output = tmp_path / "level.cam"
+    words = ["level", str(run), "--camera", str(tmp_path / "wrong.cam"), "-o", str(output)]
+    assert main(words) == 0
+    assert read_camera(output).centre[2] == pytest.approx(1.50354, abs=0.02)
 
 
 @pytest.mark.long

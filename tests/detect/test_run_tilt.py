@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from camera import Camera
+from camera.model_checks import checked_pose
 from detect.run_tilt import (
     COMMON_RAD,
     LEAST_FRAMES,
     FrameTilts,
     RunTilt,
+    own_pitch,
     tilt_of_run,
     usual_tilt,
 )
@@ -116,6 +121,24 @@ def test_too_few_frames_have_no_run() -> None:
     measured[: LEAST_FRAMES - 1] = 0.01
 
     assert tilt_of_run(FrameTilts(measured, np.full((50, 2), 1e-6))) is None
+
+
+def test_to_a_camera_that_looks_aside_roll_is_its_pitch(published_camera: Camera) -> None:
+    """A wrong height changes the roll of a robot by the outlines of discs at its side."""
+    for bearing_deg, own in ((0.0, (1.0, 0.0)), (-90.0, (0.0, -1.0)), (180.0, (-1.0, 0.0))):
+        turn = Rotation.from_euler("z", bearing_deg, degrees=True).as_matrix()
+        pose = checked_pose("sensor2World", turn @ published_camera.robot_from_camera)
+        assert own_pitch(replace(published_camera, robot_from_camera=pose)) == pytest.approx(own)
+    true, measured, variance = sequence(2)
+    nothing = FrameTilts(np.full_like(true, np.nan), variance)
+    outlines = FrameTilts(measured, variance)
+    aside = FrameTilts(measured[:, ::-1], variance[:, ::-1])
+    ahead = found_tilt(nothing, outlines)
+    turned = tilt_of_run(nothing, aside, own=(0.0, 1.0))
+    assert turned is not None
+    np.testing.assert_allclose(turned.lean, ahead.lean[::-1], atol=1e-4)
+    np.testing.assert_allclose(turned.lean_sigma, ahead.lean_sigma[::-1], rtol=0.01)
+    assert ahead.lean_sigma[0] > 2.0 * ahead.lean_sigma[1]
 
 
 @pytest.mark.parametrize("count", [5, 10, 19])
