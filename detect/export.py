@@ -63,6 +63,8 @@ def perform(command: Export) -> int:
         )
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
+    if rate_hz is not None and command.times is not None:
+        raise DetectError("both --times and --rate-hz say when frames are: expected one of them")
     if to == "parquet":
         required_pyarrow()
     tables = read_tables(file, _times(command), rate_hz)
