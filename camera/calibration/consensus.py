@@ -21,8 +21,8 @@ from redetect.array_types import BoolArray, FloatArray
 # A view contradicts the others above this multiple of their median residual: with one coefficient
 # of the lens, which leaves systematic residuals in the image's corners, and with all of them.
 _FAR_AT_FIRST, _FAR = 10.0, 3.0
-# Never below this: good photographs have up to 0.3 px each (medians of their sets: 0.02 to 0.23 px),
-# and the noise-free ones of a nearly perfect set differ by large factors.
+# Never below this: good photographs have up to some 0.3 px (the medians of four cameras are 0.02 to
+# 0.23 px), and the noise-free ones of a nearly perfect set differ by large factors.
 _LEAST_FAR_PX = 0.3
 # A view's farthest points are ignored for that, since single outliers are excluded separately.
 _COUNTED_SHARE = 0.95
