@@ -27,6 +27,8 @@ from redetect.bounds import (
 BearingConvention = Literal["level", "published"]
 Joining = Literal["evidence", "equal"]
 
+#: Widths of filters: wider ones see no line, and take memory without bound.
+FilterWidth = Annotated[float, Bounds("above 0, at most 100", lambda x: 0.0 < x <= 100.0)]
 _WIDTH = Bounds("a number above 1, at most 10", lambda x: 1.0 < x <= 10.0)
 
 
@@ -39,8 +41,8 @@ class LineSettings:
     `largest_...` may be infinite: no limit.
     """
 
-    sigma_across_px: Positive = 0.8  #: Gaussian window of the filter across the line.
-    sigma_along_rows: Positive = 2.0  #: Gaussian window of the filter along the line.
+    sigma_across_px: FilterWidth = 0.8  #: Gaussian window of the filter across the line.
+    sigma_along_rows: FilterWidth = 2.0  #: Gaussian window of the filter along the line.
     #: Added to the variance in the window, grey values squared: suppresses steps much smaller than
     #: its square root.
     regulariser: Positive = 40.0
@@ -67,9 +69,9 @@ class LineSettings:
         (0.8, 1.5),
         (1.8, 0.1),
     )
-    fine_scale_px: Positive = 0.8  #: Fine width at which an edge's contrast is measured.
+    fine_scale_px: FilterWidth = 0.8  #: Fine width at which an edge's contrast is measured.
     #: Coarse width; the ratio of the contrasts at both is the edge's sharpness.
-    coarse_scale_px: Positive = 1.6
+    coarse_scale_px: FilterWidth = 1.6
     least_rows: Annotated[int, whole(5)] = 14  #: Least number of points of a line.
     least_length_px: NotNegative = 24.0  #: The same as a length.
     #: Least evidence: responses summed over the length in pixel widths, times squared sharpness.

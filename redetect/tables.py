@@ -32,6 +32,8 @@ class ByContent:
     def __eq__(self, other: object) -> bool:
         return alike(self, other)
 
+    __hash__ = None  # type: ignore[assignment]  # arrays may be changed
+
 
 class Table(ByContent):
     """A result with columns; base class of all results."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import glob
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from camera.calibration.calibrate import (
 )
 from camera.calibration.consensus import view_rms
 from camera.calibration.floor import write_picture
-from camera.calibration.images import calibration_images
+from camera.calibration.images import calibration_files, calibration_images, is_video
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
 from camera.camfile import format_camera
@@ -33,7 +35,7 @@ from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_
 from redetect import __version__
 from redetect.array_types import GreyImage
 from redetect.json_text import json_text
-from redetect.storage import demand_place, write_bytes
+from redetect.storage import demand_place, demand_writable, write_bytes
 
 #: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.
 _COUNTED_PICTURES, _VOTES = 8, 2
@@ -56,6 +58,7 @@ def perform(options: Calibrate) -> int:
         raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
     for path in (output, report, *names.values()):
         demand_place(path, overwrite=options.force)
+    demand_places_of_pictures(options)
     board = board_of(options)
     settings = CalibrationSettings(
         aspect=0.5 if options.half else 1.0,
@@ -79,18 +82,36 @@ def perform(options: Calibrate) -> int:
         "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
         "board on the floor"
     )
+    write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
+    write_bytes(report, report_text(options, calibration).encode(), overwrite=options.force)
+    for name, drawn in pictures(calibration, camera).items():
+        write_bytes(names[name], drawn, overwrite=options.force)
+    print(f"written: {output}, {', '.join(p.name for p in (report, *names.values()))}")
     if options.pictures is not None:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
-                place = options.pictures / f"{name.replace(':', '-')}.corners.png"
+                place = place_of_picture(options.pictures, name)
                 write_picture(picture, place, force=options.force)
-    for name, drawn in pictures(calibration, camera).items():
-        write_bytes(names[name], drawn, overwrite=options.force)
-    write_bytes(output, format_camera(camera).encode(), overwrite=options.force)
-    write_bytes(report, report_text(options, calibration).encode(), overwrite=options.force)
-    print(f"written: {output}, {', '.join(p.name for p in (report, *names.values()))}")
     return 0
+
+
+def place_of_picture(folder: Path, name: str) -> Path:
+    """Where a picture with its corners is drawn; the colon before a frame's number is replaced."""
+    return folder / f"{name.replace(':', '-')}.corners.png"
+
+
+def demand_places_of_pictures(options: Calibrate) -> None:
+    """Reject a folder for pictures that is none, or has some that must not be replaced."""
+    if options.pictures is None:
+        return
+    for name, path in calibration_files(options.images, options.max_images).items():
+        place = place_of_picture(options.pictures, name)
+        demand_writable(place)
+        # Which frames of a video are drawn is known once it has been read.
+        drawn = place_of_picture(Path(), glob.escape(name) + (":*" if is_video(path) else ""))
+        for before in options.pictures.glob(str(drawn)):
+            demand_place(before, overwrite=options.force)
 
 
 def report_text(options: Calibrate, calibration: Calibration) -> str:

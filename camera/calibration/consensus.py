@@ -21,6 +21,9 @@ from redetect.array_types import BoolArray, FloatArray
 # A view contradicts the others above this multiple of their median residual: with one coefficient
 # of the lens, which leaves systematic residuals in the image's corners, and with all of them.
 _FAR_AT_FIRST, _FAR = 10.0, 3.0
+# Never below this: good photographs have up to some 0.3 px (the medians of four cameras are 0.02 to
+# 0.23 px), and the noise-free ones of a nearly perfect set differ by large factors.
+_LEAST_FAR_PX = 0.3
 # A view's farthest points are ignored for that, since single outliers are excluded separately.
 _COUNTED_SHARE = 0.95
 _ROUNDS = 3
@@ -67,7 +70,7 @@ def find_consensus(
     errors = view_errors(estimate, points)
     used = np.isfinite(errors)
     if used.any():
-        used &= errors <= _FAR_AT_FIRST * np.median(errors[used])
+        used &= errors <= max(_FAR_AT_FIRST * np.median(errors[used]), _LEAST_FAR_PX)
     _demand_most(used, names)
     few = min(2, settings.most)
     for count in (1, few):
@@ -124,11 +127,12 @@ def _fitted(
         found = found.with_poses(others, posed)
         residuals[~used[points.views]] = residuals_of(posed, rest)
     typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))
+    far = max(_FAR * np.median(typical[used]), _LEAST_FAR_PX)
     return Consensus(
         fit=fit,
         estimate=found,
         rms_px=rms,
-        agree=(typical <= _FAR * np.median(typical[used])) & np.isfinite(rms),
+        agree=(typical <= far) & np.isfinite(rms),
     )
 
 

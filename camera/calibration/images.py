@@ -23,11 +23,11 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tif
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
 
-def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
-    """Names and grey images of photographs, folders of them, and videos, one after the other.
+def calibration_files(inputs: Sequence[Path], most: int) -> dict[str, Path]:
+    """The photographs, those in folders, and then the videos, by names that differ.
 
-    At most `most` images are used, and at most `most` frames of each video, evenly spaced. A file
-    that is named twice is used once.
+    At most `most` photographs are used, evenly spaced. A file that is named twice is used once.
+    Files of the same name in several folders are called by their paths below a common folder.
     """
     if most < 1:
         raise CalibrationError(f"--max-images {most}: expected 1 or more")
@@ -40,7 +40,7 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
             images += sorted(p for p in visible if p.suffix.lower() in IMAGE_SUFFIXES)
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
-        elif path.suffix.lower() in VIDEO_SUFFIXES:
+        elif is_video(path):
             videos.append(path)
         else:
             images.append(path)
@@ -52,10 +52,28 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
     images = _each_once(images)
     if len(images) > most:
         images = [images[i] for i in np.linspace(0, len(images) - 1, most).round().astype(int)]
-    for path in images:
-        yield path.name, read_grey(path)
-    for path in _each_once(videos):
-        yield from _frames(path, most)
+    files = images + _each_once(videos)
+    named = {path.name: path for path in files}
+    if len(named) < len(files):
+        above = os.path.commonpath([path.resolve().parent for path in files])
+        named = {str(path.resolve().relative_to(above)): path for path in files}
+    return named
+
+
+def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
+    """Names and grey images of the `calibration_files`, one after the other; at most `most` frames
+    of each video, evenly spaced.
+    """
+    for name, path in calibration_files(inputs, most).items():
+        if is_video(path):
+            yield from _frames(path, name, most)
+        else:
+            yield name, read_grey(path)
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is a video, by its suffix."""
+    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def read_grey(path: Path) -> GreyImage:
@@ -124,7 +142,7 @@ def _each_once(paths: list[Path]) -> list[Path]:
     return list({path.resolve(): path for path in reversed(paths)}.values())[::-1]
 
 
-def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
+def _frames(path: Path, name: str, most: int) -> Iterator[tuple[str, GreyImage]]:
     refused = CalibrationError(f"{path}: not a video that OpenCV can read")
     with opened_video(path, refused) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -137,7 +155,7 @@ def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
                 if not good:
                     raise CalibrationError(f"{path}: frame {number} cannot be read")
                 grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-                yield f"{path.name}:{number}", np.asarray(grey, dtype=np.uint8)
+                yield f"{name}:{number}", np.asarray(grey, dtype=np.uint8)
                 taken += 1
             number += 1
     if taken == 0:

@@ -26,7 +26,7 @@ from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
 from redetect.landmarks.tilts import numbered_tilts
 from redetect.landmarks.times import read_times
-from redetect.messages import imported_for
+from redetect.messages import counted, imported_for
 from redetect.storage import demand_place, write_whole
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ def perform(command: Export) -> int:
         )
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
+    if rate_hz is not None and command.times is not None:
+        raise DetectError("both --times and --rate-hz say when frames are: expected one of them")
     if to == "parquet":
         required_pyarrow()
     tables = read_tables(file, _times(command), rate_hz)
@@ -80,9 +82,9 @@ def perform(command: Export) -> int:
         demand_place(path, overwrite=command.force)
     for table, path in places.items():
         with write_whole(path, overwrite=command.force) as stream:
-            written = f"{len(tables[table])} rows"
+            written = counted(len(tables[table]), "row")
             if to == "mcap":
-                written = f"{write_mcap(stream, tables, str(file))} messages"
+                written = counted(write_mcap(stream, tables, str(file)), "message")
             elif to == "csv":
                 write_csv(stream, table, tables[table])
             else:

@@ -9,6 +9,7 @@ from detect.commands.run import perform as detect_run
 from detect.options import All, Compare, Demo, Report, RowFiles
 from detect.report.page import gather, report_page
 from detect.sources.opening import demand_recording, open_source
+from redetect.messages import counted
 from redetect.storage import demand_free, demand_place, write_bytes
 
 #: Images included in the program: the first ones of the demo run (`images/README.md`).
@@ -29,7 +30,8 @@ def _report(options: Report) -> int:
     write_bytes(output, report_page(inputs, options.worst), overwrite=options.force)
     names = [path.name for path in inputs.files.reference.values()]
     against = f" against {' and '.join(names)}" if names else ", no reference rows"
-    print(f"{output}: {len(inputs.rows)} frames, {', '.join(inputs.files.detected)}{against}")
+    frames = counted(len(inputs.rows), "frame")
+    print(f"{output}: {frames}, {', '.join(inputs.files.detected)}{against}")
     return 0
 
 

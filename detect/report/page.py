@@ -295,7 +295,9 @@ def _tilt(inputs: ReportInputs) -> list[Part]:
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
     lines = np.median([t.lines for t in tilts])
-    words = f"{len(tilts)} of {len(inputs.rows)} frames; {lines:g} verticals agree (median)."
+    words = (
+        f"{len(tilts)} of {counted(len(inputs.rows), 'frame')}; {lines:g} verticals agree (median)."
+    )
     if without := [picture_name(name) for name in _without_tilt(inputs)]:
         others = f" and {len(without) - _LISTED} more" if len(without) > _LISTED else ""
         words += f" Too few agree in {', '.join(without[:_LISTED])}{others}."

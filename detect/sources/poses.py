@@ -167,12 +167,10 @@ def tick_poses(
     """The poses of a differential-drive robot from wheel ticks; arcs from row to row."""
 
     def arcs() -> Iterator[_Arc]:
-        last: list[float] = []
-        rows = rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError)
-        for place, (time_s, *counts) in rows:
-            left, right = (metres_per_tick * _ticks(*ends) for ends in zip(last or counts, counts))
-            yield _Arc(place, time_s, 0.5 * (left + right), (right - left) / wheel_base_m)
-            last = counts
+        rows = list(rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError))
+        ways = metres_per_tick * _ticks(np.reshape([row[1:] for _, row in rows], (-1, 2)))
+        for (place, row), (left, right) in zip(rows, ways.tolist()):
+            yield _Arc(place, row[0], 0.5 * (left + right), (right - left) / wheel_base_m)
 
     return _poses_along(arcs())
 
@@ -225,12 +223,20 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
         yield pose
 
 
-def _ticks(before: float, after: float) -> float:
-    """Ticks between two readings; a counter of 16 or 32 bits may overflow once in between."""
+def _ticks(counts: FloatArray) -> FloatArray:
+    """(N, 2) ticks since the row before; counters of 16 or 32 bits may overflow in between.
+
+    They are of the fewest bits, signed or not, that all counts of the file fit in. Only counters
+    that usually change by little overflow: a fast one may jump as far without.
+    """
+    ticks = np.diff(counts, axis=0, prepend=counts[:1])
     for turn in (2.0**16, 2.0**32):
-        if max(abs(before), abs(after)) < turn and abs(after - before) > 0.75 * turn:
-            return after - before - math.copysign(turn, after - before)
-    return after - before
+        for least in (0.0, -0.5 * turn):
+            if np.all((counts >= least) & (counts < least + turn)):
+                shorter = ticks - np.where(np.abs(ticks) > 0.75 * turn, np.copysign(turn, ticks), 0)
+                moves = np.abs(shorter[shorter != 0.0])
+                return shorter if np.median(np.append(moves, 0.0)) < 0.25 * turn else ticks
+    return ticks
 
 
 def heading_rad(qx: float, qy: float, qz: float, qw: float) -> float:

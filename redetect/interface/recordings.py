@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from detect.commands.compare import comparison_of
 from detect.comparison.compare import compare_with_file
@@ -15,17 +17,23 @@ from detect.errors import DetectError
 from detect.options import Compare, CompareOptions, SourceOptions
 from detect.row_files import read_head
 from detect.seen import Sight
-from detect.sources.interface import Run
+from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
 from redetect.interface.inputs import keywords_named, path_of
-from redetect.messages import excerpt
+from redetect.messages import OneLineError, excerpt
 
 PathLike = str | os.PathLike[str]
 
 
+class LengthError(OneLineError, TypeError):
+    """The number of frames is not known (a `TypeError`, so that `list` does without)."""
+
+
 class Recording:
     """The frames of a run, in order; each iteration starts again.
+
+    With `len`, negative indices and any slices if the images are files.
 
     Attributes
     ----------
@@ -43,11 +51,60 @@ class Recording:
             for frame in self._run.frames:
                 yield RecordedFrame(frame, self.camera)
 
-    def __getitem__(self, number: int) -> RecordedFrame:
-        """A frame by its number, from 0; those before it are passed over."""
-        for frame in islice(self, number, None) if number >= 0 else ():
-            return frame
+    @overload
+    def __getitem__(self, number: int) -> RecordedFrame: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[RecordedFrame]: ...
+
+    def __getitem__(self, number: int | slice) -> RecordedFrame | list[RecordedFrame]:
+        """A frame by its number, from 0, or the frames of a slice.
+
+        Those of a video or bag are read from its beginning, since it has no list of its frames.
+
+        Raises
+        ------
+        IndexError
+            If there is no such frame.
+        LengthError
+            If a number from the end is given for a video, bag or live camera.
+        """
+        frames = self._listed
+        if isinstance(number, slice):
+            if frames is not None:
+                return [RecordedFrame(frame, self.camera) for frame in frames[number]]
+            ends = number.start, number.stop, number.step
+            if any(end is not None and end < 0 for end in ends):
+                raise self._length_error()
+            return list(islice(self, *ends))
+        if frames is None and number < 0:
+            raise self._length_error()
+        with suppress(IndexError):
+            if frames is not None:
+                return RecordedFrame(frames[number], self.camera)
+            for frame in islice(self, number, None):
+                return frame
         raise IndexError(f"{self.name} has no frame {number}")
+
+    def __len__(self) -> int:
+        """Number of frames; `LengthError` for a video, bag or live camera."""
+        if self._listed is None:
+            raise self._length_error()
+        return len(self._listed)
+
+    def __bool__(self) -> bool:
+        return True  # also without a known length
+
+    @cached_property
+    def _listed(self) -> list[RunFrame] | None:
+        """All frames, if their images are files of their own, whose list is small."""
+        if self._run.frames.ships_images:
+            return None
+        with keywords_named():
+            return list(self._run.frames)
+
+    def _length_error(self) -> LengthError:
+        return LengthError(f"{self.name}: the number of frames is known only once all are read")
 
     @property
     def expected(self) -> int | None:

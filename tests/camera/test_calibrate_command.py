@@ -327,3 +327,32 @@ def test_help_shows_an_example(command: str, capsys: pytest.CaptureFixture[str])
         main([command, "--help"])
     assert end.value.code == 0
     assert f"Example: camera {command}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_pictures_of_the_same_name_are_told_apart(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cameras number the pictures of each folder from the beginning."""
+    for i, picture in enumerate(sorted(photographs.glob("*.png"))[:8]):
+        place = tmp_path / "ab"[i % 2] / f"{i // 2}.png"
+        place.parent.mkdir(exist_ok=True)
+        place.write_bytes(picture.read_bytes())
+    output, drawn = tmp_path / "my.cam", tmp_path / "drawn"
+    command = [
+        "calibrate", str(tmp_path / "a"), str(tmp_path / "b"), *FLAGS, "-o", str(output),
+        "--coefficients", "1", "--tangential", "off", "--keep-outliers", "--pictures", str(drawn),
+    ]  # fmt: skip
+    assert main(command) == 0
+    views = [view["name"] for view in json.loads(output.with_suffix(".json").read_text())["views"]]
+    assert {"a/1.png", "b/1.png"} < set(views)
+    assert len(set(views)) == len(views)
+    pictures = [(drawn / f"{name}.corners.png").read_bytes() for name in views]
+    assert len(set(pictures)) == len(views)
+    # What exists is noticed at once, not after the calibration.
+    capsys.readouterr()
+    command[command.index(str(output))] = str(tmp_path / "other.cam")
+    assert main(command) == 1
+    written = capsys.readouterr()
+    assert written.out == ""
+    assert "1.png.corners.png: exists already" in written.err
+    assert not (tmp_path / "other.cam").exists()

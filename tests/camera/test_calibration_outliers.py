@@ -34,14 +34,16 @@ SETTINGS = CalibrationSettings(coefficients=2, tangential=False, polynomial=Fals
 COUNT, SEED = 15, 12
 
 
-def seen_views(count: int = COUNT, stretched: Sequence[int] = ()) -> list[BoardView]:
+def seen_views(
+    count: int = COUNT, stretched: Sequence[int] = (), noise_px: float = 0.1
+) -> list[BoardView]:
     """Points of boards; some of these are 1.3 times as wide as they should be."""
     rng = np.random.default_rng(SEED)
     views = []
     for view, (R, t) in enumerate(board_poses(TRUTH, BOARD, count, SEED, distances_m=(0.3, 0.6))):
         wide, back = ((1.3, 1.0, 1.0), 1.3) if view in stretched else ((1.0, 1.0, 1.0), 1.0)
         pixels = TRUTH.project(BOARD.points * wide @ R.T + back * t)
-        noise = rng.normal(scale=0.1, size=pixels.shape)
+        noise = rng.normal(scale=noise_px, size=pixels.shape)
         views.append(BoardView(f"{view:02d}.png", np.arange(len(pixels)), pixels + noise))
     return views
 
@@ -49,6 +51,15 @@ def seen_views(count: int = COUNT, stretched: Sequence[int] = ()) -> list[BoardV
 def a_square_off(view: BoardView) -> None:
     """Where a row ends, its last corner is found in the next."""
     view.pixels[:-1] = view.pixels[1:].copy()
+
+
+@pytest.mark.parametrize("noise_px", [0.0, 0.01, 0.1])
+def test_perfect_pictures_are_never_outliers(noise_px: float) -> None:
+    """Nor are good ones among them, whose points have the noise of usual photographs."""
+    views, rng = seen_views(noise_px=0.0), np.random.default_rng(4)
+    for view in views[:4]:
+        view.pixels[:] += rng.normal(scale=noise_px, size=view.pixels.shape)
+    assert calibrate(views, BOARD, (640, 480), SETTINGS).outliers == ()
 
 
 def nowhere(view: BoardView) -> None:

@@ -25,6 +25,9 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
         (CircleSettings, {"outer_ring": 1.0}, "outer_ring is 1: expected more than 1, the disc"),
         (LineSettings, {"threshold": 0.0}, "threshold is 0: expected"),
         (LineSettings, {"regulariser": 0.0}, "regulariser is 0: expected"),
+        (LineSettings, {"sigma_along_rows": 1e6}, "sigma_along_rows is 1e\\+06: expected"),
+        (LineSettings, {"sigma_across_px": 101.0}, "sigma_across_px is 101: expected"),
+        (LineSettings, {"coarse_scale_px": 1e6}, "coarse_scale_px is 1e\\+06: expected"),
         (LineSettings, {"least_rows": 2}, "least_rows is 2: expected"),
         (LineSettings, {"refine_steps_px": ((0.0, 1.0),)}, "refine_steps_px is .*: expected"),
         (LineSettings, {"blurred_widths": (1.0,)}, "blurred_widths is 1: expected a number"),
@@ -38,7 +41,7 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
 def test_nonsense_is_refused_by_name(
     settings: type[Any], changes: dict[str, Any], told: str
 ) -> None:
-    """Besides what no number of any settings may be: `tests/storage/test_bounds.py`."""
+    """Besides what no number of any settings may be: `tests/test_bounds.py`."""
     with pytest.raises(DetectError, match=told):
         settings(**changes)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from redetect.groundtruth.trajectories.streams import (
+    Interpolated,
     PlanarPoses,
     matched_streams,
     moved_poses,
@@ -16,7 +17,7 @@ def compare_streams(
     truth: PlanarPoses,
     *,
     largest_gap_s: float = 0.5,
-    interpolate: str = "truth",
+    interpolate: Interpolated = "truth",
     align: bool = False,
 ) -> PoseScore:
     """The score of a stream against another of other times, as of `groundtruth score`."""

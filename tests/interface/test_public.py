@@ -278,12 +278,44 @@ def test_frames_of_a_run_and_their_comparison(demo: Path, tmp_path: Path) -> Non
     assert str(discs).splitlines() == list(discs.sentences())
     assert rd.compare(demo, found[1]) == rd.compare(demo, iter(found[1:2]))
     assert run[2].detect(polarity="light") == found[2]
-    with pytest.raises(IndexError, match="e has no frame -1"):
-        _ = run[-1]
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(found[2])
     without_unlisted = rd.compare(demo, found, alone, lines=True)
     assert verticals.extra < without_unlisted.extra
     with pytest.raises(DetectError, match="nothing to compare"):
         rd.compare(demo, [])
+
+
+def test_a_recording_is_a_sequence(demo: Path) -> None:
+    run = rd.open(demo, frames=3)
+    names = [frame.name for frame in run]
+    assert len(run) == 3
+    assert [run[k].name for k in (-3, -2, -1)] == names
+    assert [frame.name for frame in run[::-1]] == names[::-1]
+    assert [frame.name for frame in run[1:9]] == names[1:]
+    for number in (3, -4):
+        with pytest.raises(IndexError, match=f"e has no frame {number}"):
+            _ = run[number]
+
+
+def test_a_recording_of_unknown_length(demo: Path, demo_camera: rd.Camera, tmp_path: Path) -> None:
+    size = demo_camera.width, demo_camera.height
+    path = tmp_path / "a.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size)
+    for _ in range(3):
+        video.write(np.zeros((*size[::-1], 3), np.uint8))
+    video.release()
+    run = rd.open(path, demo_camera)
+    assert run
+    names = [frame.name for frame in run]
+    assert len(names) == 3
+    assert [frame.name for frame in run[1:]] == names[1:]
+    assert run[2].name == names[2]
+    for call in (lambda: len(run), lambda: run[-1], lambda: run[-2:]):
+        with pytest.raises(rd.Error, match="known only once all are read"):
+            call()
+    with pytest.raises(IndexError, match="has no frame 3"):
+        _ = run[3]
 
 
 def test_a_run_with_another_camera(demo: Path, demo_camera: rd.Camera) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,15 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
+from redetect.messages import excerpt
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
 RAWSEEDS_ROUNDING = 5e-7
+
+#: Which of two streams is interpolated to the times of the other.
+Interpolated = Literal["truth", "poses"]
 
 _POSE_COLUMNS = 4
 _COVARIANCE_COLUMNS = 13
@@ -183,7 +187,7 @@ def matched_streams(
     truth: PlanarPoses,
     *,
     largest_gap_s: float = 0.5,
-    interpolate: str = "truth",
+    interpolate: Interpolated = "truth",
 ) -> tuple[PlanarPoses, PlanarPoses, int]:
     """Both streams at common times, and the number of times without a match.
 
@@ -191,14 +195,16 @@ def matched_streams(
     ----------
     largest_gap_s : float
         Longer gaps are not interpolated.
-    interpolate : str
+    interpolate : "truth" or "poses"
         `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
 
     Raises
     ------
     GroundTruthError
-        If there are no common times.
+        If there are no common times, or `interpolate` is another word.
     """
+    if interpolate not in get_args(Interpolated):
+        raise GroundTruthError(f"interpolate is {excerpt(interpolate)}: expected truth or poses")
     if len(poses) == 0 or len(truth) == 0:
         raise GroundTruthError(
             f"{len(poses)} poses and {len(truth)} of the truth: expected at least one of each"

@@ -355,7 +355,7 @@ def test_page_of_one_frame_has_no_empty_figure(judged_run: Path, tmp_path: Path)
         "Residuals in units of the covariance that the rows state",
     ]
     words = " ".join(" ".join(page.words).split())
-    assert "1 of 1 frames; 9 verticals agree" in words
+    assert "1 of 1 frame; 9 verticals agree" in words
 
 
 HOSTILE = "<script>document.title='in'</script><img/src=x/onerror=alert(2)>\"'&amp;{{7*7}}"

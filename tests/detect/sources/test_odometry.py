@@ -246,15 +246,27 @@ def test_the_shipped_steps_have_the_covariances_of_velocities(
     assert np.abs(np.percentile(lever, [1, 99])).max() < 0.03
 
 
-@pytest.mark.parametrize("low", [-(2**15), 0, -(2**31)])
-def test_counters_of_ticks_may_overflow(low: int, tmp_path: Path) -> None:
-    turn = 2**32 if low == -(2**31) else 2**16
+@pytest.mark.parametrize("turn", [2**16, 2**32])
+@pytest.mark.parametrize("signed", [False, True])
+def test_counters_of_ticks_may_overflow(turn: int, signed: bool, tmp_path: Path) -> None:
+    low = -turn // 2 if signed else 0
     path = tmp_path / "a.ticks"
     count = [turn - 500 + 200 * k for k in range(6)]
     path.write_text("".join(f"{k} {(n % turn) + low} {(-n % turn) + low}\n"
                             for k, n in enumerate(count)))  # fmt: skip
     poses = list(tick_poses(path, 0.4, 0.001))
     np.testing.assert_allclose([p.theta for p in poses], -np.arange(6.0), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [[60_000 * k for k in range(6)], [-60_000 * k for k in range(6)], [0, 30_000, 60_000] * 3],
+)
+def test_fast_counters_of_ticks_do_not_overflow(counts: list[int], tmp_path: Path) -> None:
+    path = tmp_path / "a.ticks"
+    path.write_text("".join(f"{k} {n} {n}\n" for k, n in enumerate(counts)))
+    ways = [math.copysign(math.hypot(p.x, p.y), p.x) for p in tick_poses(path, 0.4, 0.001)]
+    np.testing.assert_allclose(ways, 0.001 * np.array(counts), atol=1e-9)
 
 
 @pytest.mark.parametrize(
