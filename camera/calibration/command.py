@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from camera.calibration.calibrate import (
 )
 from camera.calibration.consensus import view_rms
 from camera.calibration.floor import write_picture
-from camera.calibration.images import calibration_files, calibration_images, is_video
+from camera.calibration.images import calibration_files, calibration_images
 from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
 from camera.camfile import format_camera
@@ -58,7 +57,12 @@ def perform(options: Calibrate) -> int:
         raise CalibrationError(f"{report}: the report is written there: expected a name in .cam")
     for path in (output, report, *names.values()):
         demand_place(path, overwrite=options.force)
-    demand_places_of_pictures(options)
+    if options.pictures is not None:
+        for name in calibration_files(options.images, options.max_images):
+            demand_writable(options.pictures / name)
+            # The names of a video's frames begin with its own.
+            for place in options.pictures.glob(f"{glob.escape(name)}*.corners.png"):
+                demand_place(place, overwrite=options.force)
     board = board_of(options)
     settings = CalibrationSettings(
         aspect=0.5 if options.half else 1.0,
@@ -91,27 +95,9 @@ def perform(options: Calibrate) -> int:
         for name, image in images():
             if name in calibration.names:
                 picture = drawn_corners(image, calibration, calibration.names.index(name))
-                place = place_of_picture(options.pictures, name)
+                place = options.pictures / f"{name.replace(':', '-')}.corners.png"
                 write_picture(picture, place, force=options.force)
     return 0
-
-
-def place_of_picture(folder: Path, name: str) -> Path:
-    """Where a picture with its corners is drawn; the colon before a frame's number is replaced."""
-    return folder / f"{name.replace(':', '-')}.corners.png"
-
-
-def demand_places_of_pictures(options: Calibrate) -> None:
-    """Reject a folder for pictures that is none, or has some that must not be replaced."""
-    if options.pictures is None:
-        return
-    for name, path in calibration_files(options.images, options.max_images).items():
-        place = place_of_picture(options.pictures, name)
-        demand_writable(place)
-        # Which frames of a video are drawn is known once it has been read.
-        drawn = place_of_picture(Path(), glob.escape(name) + (":*" if is_video(path) else ""))
-        for before in options.pictures.glob(str(drawn)):
-            demand_place(before, overwrite=options.force)
 
 
 def report_text(options: Calibrate, calibration: Calibration) -> str:

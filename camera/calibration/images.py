@@ -40,7 +40,7 @@ def calibration_files(inputs: Sequence[Path], most: int) -> dict[str, Path]:
             images += sorted(p for p in visible if p.suffix.lower() in IMAGE_SUFFIXES)
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
-        elif is_video(path):
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
             videos.append(path)
         else:
             images.append(path)
@@ -65,15 +65,10 @@ def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str,
     of each video, evenly spaced.
     """
     for name, path in calibration_files(inputs, most).items():
-        if is_video(path):
+        if path.suffix.lower() in VIDEO_SUFFIXES:
             yield from _frames(path, name, most)
         else:
             yield name, read_grey(path)
-
-
-def is_video(path: Path) -> bool:
-    """Whether a file is a video, by its suffix."""
-    return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def read_grey(path: Path) -> GreyImage:

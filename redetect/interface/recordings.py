@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -33,8 +32,6 @@ class LengthError(OneLineError, TypeError):
 class Recording:
     """The frames of a run, in order; each iteration starts again.
 
-    With `len`, negative indices and any slices if the images are files.
-
     Attributes
     ----------
     name : str
@@ -58,53 +55,37 @@ class Recording:
     def __getitem__(self, number: slice) -> list[RecordedFrame]: ...
 
     def __getitem__(self, number: int | slice) -> RecordedFrame | list[RecordedFrame]:
-        """A frame by its number, from 0, or the frames of a slice.
-
-        Those of a video or bag are read from its beginning, since it has no list of its frames.
+        """A frame by its number, or those of a slice; those before a video's or bag's are read.
 
         Raises
         ------
         IndexError
             If there is no such frame.
         LengthError
-            If a number from the end is given for a video, bag or live camera.
+            For slices and numbers from the end, if the number of frames is not known.
         """
-        frames = self._listed
         if isinstance(number, slice):
-            if frames is not None:
-                return [RecordedFrame(frame, self.camera) for frame in frames[number]]
-            ends = number.start, number.stop, number.step
-            if any(end is not None and end < 0 for end in ends):
-                raise self._length_error()
-            return list(islice(self, *ends))
-        if frames is None and number < 0:
-            raise self._length_error()
-        with suppress(IndexError):
-            if frames is not None:
-                return RecordedFrame(frames[number], self.camera)
-            for frame in islice(self, number, None):
-                return frame
+            return [self[k] for k in range(len(self))[number]]
+        at = number + len(self) if number < 0 else number
+        with keywords_named():
+            frames = self._run.frames if self._listed is None else self._listed
+            for frame in islice(frames, at, None) if at >= 0 else ():
+                return RecordedFrame(frame, self.camera)
         raise IndexError(f"{self.name} has no frame {number}")
 
     def __len__(self) -> int:
-        """Number of frames; `LengthError` for a video, bag or live camera."""
+        """Number of frames; a `LengthError` for a video, bag or live camera."""
         if self._listed is None:
-            raise self._length_error()
+            raise LengthError(f"{self.name}: its length is known only once all frames are read")
         return len(self._listed)
 
     def __bool__(self) -> bool:
-        return True  # also without a known length
+        return True  # also if the length is not known
 
     @cached_property
     def _listed(self) -> list[RunFrame] | None:
-        """All frames, if their images are files of their own, whose list is small."""
-        if self._run.frames.ships_images:
-            return None
-        with keywords_named():
-            return list(self._run.frames)
-
-    def _length_error(self) -> LengthError:
-        return LengthError(f"{self.name}: the number of frames is known only once all are read")
+        """All frames, if their images are files: then they are small."""
+        return None if self._run.frames.ships_images else list(self._run.frames)
 
     @property
     def expected(self) -> int | None:

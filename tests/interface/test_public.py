@@ -309,10 +309,9 @@ def test_a_recording_of_unknown_length(demo: Path, demo_camera: rd.Camera, tmp_p
     assert run
     names = [frame.name for frame in run]
     assert len(names) == 3
-    assert [frame.name for frame in run[1:]] == names[1:]
     assert run[2].name == names[2]
     for call in (lambda: len(run), lambda: run[-1], lambda: run[-2:]):
-        with pytest.raises(rd.Error, match="known only once all are read"):
+        with pytest.raises(rd.Error, match="known only once all frames"):
             call()
     with pytest.raises(IndexError, match="has no frame 3"):
         _ = run[3]

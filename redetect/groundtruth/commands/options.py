@@ -18,7 +18,6 @@ from redetect.groundtruth.settings import (
     RigSettings,
     SyncSettings,
 )
-from redetect.groundtruth.trajectories.streams import Interpolated
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,7 @@ class Score:
     poses: Positional[Path]  # Poses (t, x, y, theta, and perhaps 9 of covariance).
     truth: Positional[Path]  # The same for the truth.
     # Which of the two is interpolated at the other's times.
-    interpolate: Interpolated = "truth"
+    interpolate: Literal["truth", "poses"] = "truth"
     largest_gap_s: float = 0.5  # Nothing is interpolated across longer gaps (s).
     # Align the poses rigidly with the truth first, for solutions with a world of their own.
     align: bool = False
