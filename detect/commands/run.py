@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from camera import Camera
 from detect.drawing.picture_files import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -24,11 +28,16 @@ from detect.runs.plan import (
 )
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
+from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
+from redetect.array_types import GreyImage
 from redetect.messages import counted
+
+#: Least number of images with a tilt, and least lean, for the radius to be estimated with it.
+_FEWEST_TILTS, _LEAST_LEAN_RAD = 4, math.radians(1.0)
 
 
 def perform(command: DetectorFlags) -> int:
@@ -120,7 +129,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     from detect.discs.radius import find_radius
 
     images = list(some_images(run))
-    found = find_radius(images, run.camera, settings)
+    found = find_radius(images, _leaning_as(images, run.camera), settings)
     if found is None:
         raise DetectError(
             f"{len(images)} images: the radius of the discs cannot be estimated from them: "
@@ -132,6 +141,23 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
         file=sys.stderr,
     )
     return replace(settings, radius_m=round(found.radius_m, 4))
+
+
+def _leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
+    """The camera with the lean that the verticals show in most of the images.
+
+    Discs look larger or smaller to a camera that leans.
+    """
+    from detect.lines import detect_lines
+    from lut import cached_vertical_table
+
+    table = cached_vertical_table(camera)
+    tilts = [tilt for tilt in (detect_lines(image, table).tilt for image in images) if tilt]
+    if 2 * len(tilts) < len(images) or len(tilts) < _FEWEST_TILTS:
+        return camera
+    pitch, roll = np.median([(tilt.pitch_rad, tilt.roll_rad) for tilt in tilts], axis=0).tolist()
+    small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
+    return camera if small else leaning_camera(camera, (pitch, roll))
 
 
 def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
-from camera import Camera
+from camera import Camera, read_camera, write_camera
 from detect.cli import main, parsed
 from detect.discs.radius import FACTOR, SMALLEST_M, find_radius
 from detect.options import All, Circles
+from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from tests.detect.commands import Captured
@@ -192,3 +193,14 @@ def test_what_candidates_for_discs_fail(run: Path, capsys: Captured) -> None:
     assert "0 discs of radius 0.06 m in 3 frames. Of " in said
     assert " are not dark (--polarity any)" in said
     assert "try --radius-m auto" in said
+
+
+def test_the_lean_that_verticals_show_does_not_change_the_radius(
+    project_root: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    run, calibration = project_root / "images" / "e", tmp_path / "leaning.cam"
+    write_camera(leaning_camera(read_camera(run / "e.cam"), (math.radians(2.5), 0.0)), calibration)
+    command = ["circles", str(run), "--camera", str(calibration), "--radius-m", "auto"]
+    assert main([*command, "--frames", "24", "-o", str(tmp_path / "e.circles")]) == 0
+    found = number_in(capsys.readouterr().err, "discs have a radius of")
+    assert found == pytest.approx(0.1, rel=0.05)
