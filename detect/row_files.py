@@ -1,11 +1,10 @@
-"""Rows of a run from files, and the heads of those files."""
+"""Rows of a run from files, and the settings in their heads."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
 
@@ -19,59 +18,22 @@ from detect.settings_files import word_value
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun
 from redetect.landmarks import Frame, FrameTilt
-
-#: Phrases in the head of files whose positions are levelled, or corrected for the tilt.
-LEVEL = "level robot frame"
-LEVELLED = "corrected for the tilt of the frames that have one"
+from redetect.landmarks.files import FileHead, read_head
 
 KINDS = ("circles", "lines", "markers", "tilt")
-# The head is the part before the first row; real ones are much shorter.
-_LONGEST_BYTES = 1 << 16
 
 
-@dataclass(frozen=True)
-class FileHead:
-    """The known parts of the head of a file of rows.
+def circle_settings_of(head: FileHead) -> CircleSettings:
+    """The settings of discs in the head of a file; those that it does not contain are the defaults.
 
-    Settings that it does not contain have their defaults; a DetectError is raised if one has an
-    impossible value.
+    A DetectError is raised if one has an impossible value.
     """
-
-    comments: tuple[str, ...] = ()  # its lines without comment signs
-    settings: tuple[tuple[str, str], ...] = ()  # names and values, as written
-    level: bool = False  # positions are corrected for the frames' tilts, or true level ones
-    name: str = ""  # of the file, for messages
-
-    @property
-    def circle_settings(self) -> CircleSettings:
-        """The settings of discs."""
-        known = {each.name for each in fields(CircleSettings)}
-        try:
-            words = [(name, word) for name, word in self.settings if name in known]
-            return CircleSettings(**{n: word_value(CircleSettings, n, word) for n, word in words})
-        except DetectError as error:
-            raise DetectError(f"{self.name}: {error}") from None
-
-
-def read_head(path: Path) -> FileHead:
-    """Read the head of a file of rows; a DetectError if the file cannot be read."""
+    known = {each.name for each in fields(CircleSettings)}
     try:
-        with path.open("rb") as stream:
-            start = stream.read(_LONGEST_BYTES)
-    except OSError as error:
-        raise DetectError(f"{path}: cannot be read: {error.strerror}") from None
-    lines = map(str.strip, start.decode("utf-8", "replace").splitlines())
-    head = takewhile(lambda line: not line or line.startswith("#"), lines)
-    comments = [line.removeprefix("#").strip() for line in head]
-    settings = tuple(
-        (name, value)
-        for text in comments
-        if text.startswith("settings ")
-        for name, equals, value in (word.partition("=") for word in text.split()[1:])
-        if equals
-    )
-    level = any(LEVELLED in text or LEVEL in text for text in comments)
-    return FileHead(tuple(comments), settings, level, str(path))
+        words = [(name, word) for name, word in head.settings if name in known]
+        return CircleSettings(**{n: word_value(CircleSettings, n, word) for n, word in words})
+    except DetectError as error:
+        raise DetectError(f"{head.name}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -107,7 +69,7 @@ class RunRows:
     @cached_property
     def circle_settings(self) -> CircleSettings:
         """The settings with which discs were detected."""
-        return self.heads.get("circles", FileHead()).circle_settings
+        return circle_settings_of(self.heads.get("circles", FileHead()))
 
     def of(self, prefix: str) -> SeenRows:
         """The rows of an image, by the prefix of its STEP."""

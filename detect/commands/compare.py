@@ -12,9 +12,10 @@ from detect.comparison.report import comparison_tables
 from detect.comparison.result import Comparison, DiscComparison, Kind
 from detect.errors import DetectError
 from detect.options import Compare
-from detect.row_files import read_head
+from detect.row_files import circle_settings_of
 from detect.seen import Sight
 from redetect.command_line import EXIT_ERROR
+from redetect.landmarks.files import read_head
 from redetect.storage import write_bytes
 
 
@@ -54,7 +55,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
         if camera is None:
             named = command.camera
             camera = camera_in(command.run) if named is None else read_camera(named)
-        settings, level = read_head(detected).circle_settings, read_head(reference).level
+        settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
         sight = None if camera is None else Sight.by(camera, settings, level)
     return compare_with_file(
         kind,

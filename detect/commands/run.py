@@ -14,7 +14,7 @@ from camera import Camera
 from detect.drawing.picture_files import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
-from detect.row_files import KINDS, RunRows, read_head
+from detect.row_files import KINDS, RunRows
 from detect.runs.hints import hints, some_images
 from detect.runs.outputs import frames_tilt_place, lean_sentence
 from detect.runs.plan import (
@@ -34,6 +34,7 @@ from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import GreyImage
+from redetect.landmarks.files import read_head
 from redetect.messages import counted
 
 #: Least number of images with a tilt, and least lean, for the radius to be estimated with it.

@@ -22,7 +22,6 @@ from detect.comparison.result import DiscComparison
 from detect.errors import DetectError
 from detect.options import Tune
 from detect.report.figures import DATA, MARK
-from detect.row_files import read_head
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.stream import with_first_look
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
@@ -37,6 +36,7 @@ from redetect import __version__
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
 from redetect.landmarks import Frame, LandmarkFileError, frames_of_rows, parse_rows
+from redetect.landmarks.files import read_head
 from redetect.reporting.page import figure_file
 from redetect.storage import demand_free, write_bytes
 

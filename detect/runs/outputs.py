@@ -16,13 +16,13 @@ from typing import Any
 
 from camera import Camera
 from detect.errors import EXIT_FRAMES_FAILED
-from detect.row_files import LEVELLED
 from detect.runs.plan import FramePlan, Job, Lean, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
 from redetect import __version__
 from redetect.json_text import json_text
 from redetect.landmarks import format_head
+from redetect.landmarks.files import LEVELLED
 from redetect.landmarks.times import TIMES_HEAD
 
 #: The kind of the tilts that the second pass writes (`detect.runs.level_run`).

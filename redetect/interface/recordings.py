@@ -14,12 +14,12 @@ from detect.comparison.compare import compare_with_file
 from detect.comparison.result import Comparison, Kind
 from detect.errors import DetectError
 from detect.options import Compare, CompareOptions, SourceOptions
-from detect.row_files import read_head
 from detect.seen import Sight
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
 from redetect.interface.inputs import keywords_named, path_of
+from redetect.landmarks.files import read_head
 from redetect.messages import OneLineError, excerpt
 
 PathLike = str | os.PathLike[str]

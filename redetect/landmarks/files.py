@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -39,7 +40,12 @@ from redetect.messages import excerpt
 from redetect.storage import write_whole
 from redetect.storage.bounded import FilePath
 
-_LONGEST_ROW_BYTES = 1 << 16
+#: Phrases in the head of files whose positions are true level ones, or corrected for the tilt.
+LEVEL = "level robot frame"
+LEVELLED = "corrected for the tilt of the frames that have one"
+
+# The head is the part before the first row; real ones are much shorter.
+_LONGEST_HEAD_BYTES = _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
@@ -52,6 +58,42 @@ _LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBE
 _STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
 _CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
 _LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"
+
+
+@dataclass(frozen=True)
+class FileHead:
+    """The known parts of the comments at the head of a file of rows."""
+
+    comments: tuple[str, ...] = ()  #: its lines without comment signs
+    #: names and values of the detector's settings, as written
+    settings: tuple[tuple[str, str], ...] = ()
+    level: bool = False  #: positions are corrected for the frames' tilts, or true level ones
+    name: str = ""  #: of the file, for messages
+
+    @property
+    def covers_tilt(self) -> bool:
+        """Whether the covariances of discs include that of an unknown tilt."""
+        settings = dict(self.settings)
+        tilt = settings.get("tilt_sigma_deg", "0")
+        return settings.get("refine") == "True" and tilt.strip("0.") != ""
+
+
+def read_head(path: FilePath) -> FileHead:
+    """Read the head of a file of rows; a LandmarkFileError if the file cannot be read."""
+    with opened(path, "landmark file") as stream:
+        start = stream.read(_LONGEST_HEAD_BYTES)
+    lines = map(str.strip, start.decode("utf-8", "replace").splitlines())
+    head = takewhile(lambda line: not line or line.startswith("#"), lines)
+    comments = [line.removeprefix("#").strip() for line in head]
+    settings = tuple(
+        (name, value)
+        for text in comments
+        if text.startswith("settings ")
+        for name, equals, value in (word.partition("=") for word in text.split()[1:])
+        if equals
+    )
+    level = any(LEVELLED in text or LEVEL in text for text in comments)
+    return FileHead(tuple(comments), settings, level, os.fspath(path))
 
 
 def read_rows(path: FilePath) -> Iterator[Row]:

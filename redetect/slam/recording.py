@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.landmarks.files import read_head
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise, common_tilt_jacobian
@@ -29,9 +29,6 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
 PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
-# In the head of files by `detect`: the covariances of their discs include that of a tilt.
-_TILTED = re.compile(rb" refine=True .*tilt_sigma_deg=(?!0(\.0*)?\s)")
-_HEAD_BYTES = 1 << 16
 # Share of the variance of discs' tilts that is assumed to be common to all frames.
 _COMMON_SHARE = 0.5
 # Indices of the covariance's numbers in a STEP row.
@@ -254,8 +251,7 @@ def read_recording(
     found = recording_of_frames(frames, " and ".join(map(os.fspath, files)), noise)
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
-    with files[0].open("rb") as stream:
-        return replace(found, tilted=bool(_TILTED.search(stream.read(_HEAD_BYTES))))
+    return replace(found, tilted=read_head(files[0]).covers_tilt)
 
 
 def recording_of_frames(

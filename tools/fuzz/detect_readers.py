@@ -16,7 +16,7 @@ import numpy as np
 from camera import CameraError, parse_camera
 from camera.calibration.images import read_grey
 from detect.errors import DetectError, FrameError
-from detect.row_files import read_head
+from detect.row_files import circle_settings_of
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
@@ -24,6 +24,7 @@ from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses,
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
+from redetect.landmarks.files import read_head
 from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
 from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader, npz
@@ -107,7 +108,7 @@ def _message(encoding: str, step: int, bytes_there: int, big: int = 0) -> bytes:
 
 
 def _head(path: Path) -> object:
-    return read_head(path).circle_settings
+    return circle_settings_of(read_head(path))
 
 
 def _journal(path: Path) -> object:

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bars
-from detect.row_files import SeenRows, read_head
+from detect.row_files import SeenRows, circle_settings_of
 from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
 from detect.sources.poses import SomeFrames
 from lut import ring
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, Step, circle_landmarks
+from redetect.landmarks.files import read_head
 from tests.detect.commands import Captured, assert_refused
 from tests.pictures import changed, read_grey
 
@@ -173,7 +174,7 @@ def test_pictures_without_rows_are_counted(
 def test_settings_and_tilt_are_read_from_the_head(small_run: Path) -> None:
     assert main(["circles", str(small_run), "--outer-ring", "1.5"]) == 0
     head = read_head(small_run / "detected.circles")
-    assert head.circle_settings == CircleSettings(outer_ring=1.5)
+    assert circle_settings_of(head) == CircleSettings(outer_ring=1.5)
     assert not head.level
     assert main(["all", str(small_run), "--tilt", "frame", "--force"]) == 0
     assert read_head(small_run / "detected.circles").level
