@@ -174,6 +174,13 @@ def project_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> 
 
 
 @kernel()
+def distance_of_floor_point(numbers: FloatArray, x_robot: float, y_robot: float) -> float:
+    """Distance of a floor point from the camera's centre, metres."""
+    x, y = x_robot - numbers[_CENTRE_X], y_robot - numbers[_CENTRE_Y]
+    return math.sqrt(x * x + y * y + numbers[_CENTRE_Z] ** 2)
+
+
+@kernel()
 def project_floor_points(numbers: FloatArray, floor_xy: FloatArray) -> FloatArray:
     """(N, 2) pixels of (N, 2) floor points, as `project_floor_point`."""
     pixels = np.empty((len(floor_xy), 2))

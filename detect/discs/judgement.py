@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from camera.kernels import project_floor_point
+from camera.kernels import distance_of_floor_point, project_floor_point
 from detect.discs.hough import HoughCandidates
 from detect.discs.rim import (
     COS,
@@ -218,10 +218,9 @@ def glance(
     u0, v0 = project_floor_point(camera_numbers, x, y)
     ux, vx = project_floor_point(camera_numbers, x + radius, y)
     uy, vy = project_floor_point(camera_numbers, x, y + radius)
-    cx, cy, cz = camera_numbers[19:22]
     # The scale changes from the centre to the rim by up to radius over distance, on either side.
     step = GLANCED_AT[1] - GLANCED_AT[0]
-    flat = 2.0 * radius < step * math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + cz**2)
+    flat = 2.0 * radius < step * distance_of_floor_point(camera_numbers, x, y)
     height, width = image.shape
     for k in range(GLANCED):
         cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
