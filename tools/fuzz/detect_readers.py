@@ -24,6 +24,7 @@ from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses,
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
+from redetect.landmarks import LandmarkError
 from redetect.landmarks.files import read_head
 from redetect.storage.bounded import claimed_size
 from redetect.storage.parts import left_part
@@ -198,7 +199,8 @@ DETECT_READERS: tuple[Reader, ...] = (
            (b"# t left right\n0 0 0\n1 500 510\n",), NUMBERS),
     Reader("velocities", "e.velocities", lambda p: steps_of(velocity_poses(p)), _DETECT,
            (b"# t v omega sigma_v sigma_omega\n0 1 0.1 0.01 0.02\n1 0 0 0 0\n",), NUMBERS),
-    Reader("settings", "detected.circles", _head, _DETECT, _HEADS, _SETTING_WORDS),
+    Reader("settings", "detected.circles", _head, (DetectError, LandmarkError), _HEADS,
+           _SETTING_WORDS),
     Reader("journal", ".detected.journal", _journal, (), _JOURNALS, _JOURNAL_WORDS),
     Reader("cached table", "table", _table, (), (), NPZ_WORDS, files=10,
            made_seeds=_table_content),
