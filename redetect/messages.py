@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 #: Environment variable that is set if only warnings and errors are to be shown.
 QUIET = "REDETECT_QUIET"
@@ -19,6 +22,8 @@ LONGEST_MESSAGE = 1000
 _LONGEST_EXCERPT = 60
 _ELLIPSIS = " ... "
 
+#: A command in backquotes, which keeps its flags, or a flag.
+_FLAG = re.compile(r"(`[^`]*`)|(?<![\w/-])--([a-z][a-z-]*)")
 #: Python does not format numbers of thousands of digits.
 _MOST_BITS = 1000
 
@@ -86,3 +91,24 @@ def imported_for(
         yield
     except ImportError:
         raise error(f"{use}: install it by pip install 'redetect[{extra}]'{otherwise}") from None
+
+
+def path_of(value: Any, expected: str, error: type[Exception]) -> Path:
+    """A path; an error with what was expected if the value is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise error(f"{excerpt(value)}: expected {expected}")
+    return Path(value)
+
+
+@contextmanager
+def keywords_named() -> Iterator[None]:
+    """Errors of a function that name flags, `--image-topic`, name its keywords, `image_topic`."""
+    try:
+        yield
+    except OneLineError as error:
+        error.args = (_FLAG.sub(_keyword, str(error)),)
+        raise
+
+
+def _keyword(found: re.Match[str]) -> str:
+    return found[1] or f"`{found[2].replace('-', '_')}`"

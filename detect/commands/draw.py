@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from camera.calibration.images import quiet_opencv
+from detect.drawing import demand_pictures, picture_name
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of, processed
-from detect.drawing.picture_files import demand_pictures, picture_name
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.row_files import RunRows, open_rows

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera
-from detect.drawing.picture_files import demand_pictures
+from detect.drawing import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.row_files import KINDS, RunRows

@@ -12,8 +12,8 @@ import numpy as np
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
+from detect.drawing import picture_name
 from detect.drawing.frame import draw_rows, processed
-from detect.drawing.picture_files import picture_name
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import RowFiles

@@ -26,11 +26,10 @@ from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
-from redetect.interface.inputs import keywords_named, path_of
 from redetect.json_text import json_text
 from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
-from redetect.messages import counted, excerpt
+from redetect.messages import counted, excerpt, keywords_named, path_of
 from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table
 
 ImageLike = NDArray[np.uint8] | str | os.PathLike[str]

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect.bounds import demand_fields
-from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
-from redetect.messages import excerpt
+from redetect.messages import excerpt, keywords_named, path_of
 from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
 from redetect.slam.commands.filters import localized_run_of, path_distance
 from redetect.slam.commands.map import mapped_run_of

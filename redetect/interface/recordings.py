@@ -18,9 +18,8 @@ from detect.seen import Sight
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
-from redetect.interface.inputs import keywords_named, path_of
 from redetect.landmarks.files import read_head
-from redetect.messages import OneLineError, excerpt
+from redetect.messages import OneLineError, excerpt, keywords_named, path_of
 
 PathLike = str | os.PathLike[str]
 
