@@ -30,9 +30,16 @@ from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
 from detect.settings import CircleSettings, Polarity
-from lut import DiscShape, DiscTable, VoteShape, VoteTable, cached_disc_table, cached_vote_table
+from lut import (
+    DiscShape,
+    DiscTable,
+    VoteShape,
+    VoteTable,
+    build_vote_table,
+    cached_disc_table,
+    cached_vote_table,
+)
 from lut.outlines import fingerprint, floor_positions
-from lut.votes import build_vote_table
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.tables import ByContent
 
@@ -181,9 +188,8 @@ def judged_discs(
     taken = np.flatnonzero(log_odds >= settings.evidence)
     best_first = np.argsort(-log_odds[taken], kind="stable")
     # Without those too close to a better one.
-    best = taken[
-        np.sort(suppress_close(judgement.floor_xy[taken], best_first, settings.separation_m))
-    ]
+    kept = suppress_close(judgement.floor_xy[taken], best_first, settings.separation_m)
+    best = taken[np.sort(kept)]
     return judgement.where(best), log_odds[best]
 
 

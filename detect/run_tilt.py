@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from detect.settings import LEAST_FRAMES as LEAST_FRAMES
+from detect.settings import LEAST_FRAMES
 from redetect.array_types import BoolArray, FloatArray
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
@@ -110,7 +110,7 @@ class RunTilt:
         )
 
 
-def own_pitch(camera: Camera) -> tuple[float, float]:
+def camera_pitch_weights(camera: Camera) -> tuple[float, float]:
     """Weights of pitch and roll in the pitch of a camera, by its bearing in eighths of a turn."""
     x, y = camera.rotation[:2, 2]
     bearing_rad = 0.25 * math.pi * round(math.atan2(x, -y) / (0.25 * math.pi))
@@ -121,7 +121,7 @@ def tilt_of_run(
     verticals: FrameTilts,
     outlines: FrameTilts | None = None,
     common_variance: FloatArray | None = None,
-    own: tuple[float, float] = (1.0, 0.0),
+    pitch_weights: tuple[float, float] = (1.0, 0.0),
 ) -> RunTilt | None:
     """Estimate the tilt of a run from the tilts of its frames, in their order.
 
@@ -129,11 +129,15 @@ def tilt_of_run(
     discs; None if fewer than `LEAST_FRAMES` frames have one. `common_variance`,
     (2,) rad^2, is that of the error of pitch and roll common to all frames, if the calibration
     states it: then the lean is that of the verticals, otherwise it depends on the outlines, too.
-    `own` is the camera's `own_pitch`, which errors of its height change in outlines.
+    Errors of the camera's height change its own pitch in outlines (`camera_pitch_weights`).
     """
     if np.count_nonzero(verticals.known) < LEAST_FRAMES:
         unsure = _UNSURE_RAD if common_variance is None else _UNSURE_STATED_RAD
-        return None if outlines is None else _tilt_by_outlines(verticals, outlines, unsure, own)
+        return (
+            None
+            if outlines is None
+            else _tilt_by_outlines(verticals, outlines, unsure, pitch_weights)
+        )
     if outlines is None or np.count_nonzero(outlines.known & verticals.known) < LEAST_FRAMES:
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
@@ -151,7 +155,7 @@ def tilt_of_run(
     if common_variance is None:
         common_variance = COMMON_RAD**2 + between**2 / 12.0  # the latter: uniform between them
         common_variance = exact * _EXACT_RAD**2 + (1.0 - exact) * common_variance
-    pitch_sigma = math.sqrt((1.0 - exact) * np.dot(own, between) ** 2 / 12.0)
+    pitch_sigma = math.sqrt((1.0 - exact) * np.dot(pitch_weights, between) ** 2 / 12.0)
     return RunTilt(
         lean + 0.5 * between,
         np.sqrt(lean_variance + common_variance),
@@ -178,7 +182,7 @@ def usual_tilt(verticals: FrameTilts, outlines: FrameTilts) -> float:
 
 
 def _tilt_by_outlines(
-    verticals: FrameTilts, outlines: FrameTilts, unsure: float, own: tuple[float, float]
+    verticals: FrameTilts, outlines: FrameTilts, unsure: float, pitch_weights: tuple[float, float]
 ) -> RunTilt | None:
     """The tilt of a run of which few frames show verticals, mainly from the outlines of discs.
 
@@ -197,7 +201,7 @@ def _tilt_by_outlines(
         return None
     run = tilt_of_run(mean, None, np.zeros(2))
     assert run is not None
-    error = np.hypot(COMMON_RAD, unsure * np.array(own))
+    error = np.hypot(COMMON_RAD, unsure * np.array(pitch_weights))
     believed = unsure**2 / (unsure**2 + error**2 + run.lean_sigma**2)
     lean_variance = (1.0 - believed) * unsure**2
     common = by_outlines**2 * lean_variance + (1.0 - by_outlines) ** 2 * COMMON_RAD**2

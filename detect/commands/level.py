@@ -23,7 +23,7 @@ from camera.uncertainty import covariance_of, with_covariance
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.run_tilt import COMMON_RAD, FrameTilts, frame_tilts, own_pitch, tilt_of_run
+from detect.run_tilt import COMMON_RAD, FrameTilts, camera_pitch_weights, frame_tilts, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.seen import leaning_camera, level_matrix
@@ -69,7 +69,8 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
     """The mounting of a run's camera, compared with the given one."""
     height_m = float(camera.centre[2])
     plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
-    tilts, apart, failures, own = [], [], [], own_pitch(camera)
+    tilts, apart, failures = [], [], []
+    pitch_weights = camera_pitch_weights(camera)
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
             advance()
@@ -85,7 +86,7 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
             ]
             tilts.append(found.tilt)
             level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
-            apart.append(np.dot(np.subtract(level[1:], level[0]), own))
+            apart.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))
     report_failures(len(failures), failures)
     if not tilts:
         raise DetectError(f"{run.folder}: none of its images could be processed")

@@ -68,7 +68,7 @@ _DENSE_WINDOW = 2048
 #: Of this many neighbouring pixels at the edge, two are taken, so that their correlation is known:
 #: all for most discs, less for one whose edge has too many.
 _EDGE_SPACINGS = (1, 4, 8, 16, 32, 64)
-_NEVER, _SOMETIMES, _ALWAYS = range(3)
+_NEVER, _SOMETIMES, _AT_EDGE = range(3)
 #: Shift of the subsampled pixels from row to row, as a share of their spacing; it repeats rarely.
 _SHIFT = 0.381966
 
@@ -251,6 +251,7 @@ def _choose(
     per_radius = F32(1.0 / (candidate.radius * start.radius))
     length = last_u - first_u + 1
     limit, count = CAPACITY - SECTORS * _SECTOR_WHOLE, 0
+    # If the patch is full, it is filled again with fewer pixels of the edge.
     for spacing in _EDGE_SPACINGS:
         every = spacing * (1 + window // (spacing * _DENSE_WINDOW))
         shift = max(1, int(_SHIFT * every + 0.5))
@@ -266,7 +267,7 @@ def _choose(
                 row_y[k] = (places[k, 1] - y0) * per_radius
             _take(length, candidate.blur, blur_ratio, reach, view, patch)
             for k in range(length):
-                wanted = taken[k] == _ALWAYS and turn % spacing < 2
+                wanted = taken[k] == _AT_EDGE and turn % spacing < 2
                 wanted |= taken[k] == _SOMETIMES and turn == 0
                 if wanted and count < limit:
                     pixel[count] = begin + k
@@ -281,7 +282,7 @@ def _choose(
 def _take(
     length: int, blur: float, blur_ratio: float, reach: Reach, view: View, patch: Any
 ) -> None:
-    """Decide which pixels of a row are taken: all at the edge, a subset of others within reach."""
+    """Decide which pixels of a row may be taken: those at the edge, and others within reach."""
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
@@ -308,7 +309,7 @@ def _take(
         # At the candidate itself, where all terms are zero, there is no edge.
         edge = off_2 < edge_u * gu + edge_v * gv
         taken = _SOMETIMES if within else _NEVER
-        patch.taken[k] = _ALWAYS if within & edge else taken
+        patch.taken[k] = _AT_EDGE if within & edge else taken
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)

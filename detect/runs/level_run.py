@@ -10,7 +10,14 @@ import numpy as np
 
 from camera import Camera
 from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
-from detect.run_tilt import FrameTilts, RunTilt, frame_tilts, own_pitch, tilt_of_run, usual_tilt
+from detect.run_tilt import (
+    FrameTilts,
+    RunTilt,
+    camera_pitch_weights,
+    frame_tilts,
+    tilt_of_run,
+    usual_tilt,
+)
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import FrameRows, Lean, RunSummary
 from detect.settings import CircleSettings
@@ -40,7 +47,9 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt |
     (rad). None if few of them have a tilt.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
-    found = tilt_of_run(verticals, outlines, common_tilt_variance(camera), own_pitch(camera))
+    found = tilt_of_run(
+        verticals, outlines, common_tilt_variance(camera), camera_pitch_weights(camera)
+    )
     return found, found.usual_rad if found else usual_tilt(verticals, outlines)
 
 
@@ -72,14 +81,14 @@ def level_run(
 ) -> Iterator[Mapping[str, str]]:
     """The rows of each frame with levelled discs, and `RUN_TILT`.
 
-    If too few frames have a tilt (`detect.run_tilt.LEAST_FRAMES`), each frame is levelled by its
+    If too few frames have a tilt (`detect.settings.LEAST_FRAMES`), each frame is levelled by its
     own; unknown tilts have the standard deviation of the settings, or of the known ones. It or the
     tilt of the run is stored in the summary. `read` returns the rows of all frames before
     levelling, and is called twice.
     """
     frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)
-    found = summary.tilt = tilt_of_run(verticals, outlines, common, own_pitch(camera))
+    found = summary.tilt = tilt_of_run(verticals, outlines, common, camera_pitch_weights(camera))
     if found is not None:
         numbers = np.column_stack([found.tilt, found.variance]).tolist()
         tilts: list[FrameTilt | None] = [

@@ -129,7 +129,8 @@ class Recording:
             return 0.0
         effect = np.sum(common_tilt_jacobian(self.circles.xy) ** 2, axis=(1, 2))
         stated = np.trace(self.circles.covariance, axis1=1, axis2=2)
-        return _COMMON_SHARE / float(np.max(effect / stated))
+        largest = float(np.max(effect / stated))
+        return _COMMON_SHARE / largest if largest > 0.0 else 0.0
 
     def part(self, first: int, last: int | None = None) -> Recording:
         """The frames from one on, up to another or the end."""

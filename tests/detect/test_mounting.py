@@ -20,8 +20,9 @@ from camera.model_checks import checked_pose
 from camera.uncertainty import covariance_of, with_covariance
 from detect.commands.level import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.levelling import common_covariance
-from detect.run_tilt import LEAST_FRAMES, FrameTilts
+from detect.run_tilt import FrameTilts
 from detect.seen import image_positions, level_seen
+from detect.settings import LEAST_FRAMES
 from redetect.storage import OutputExistsError
 from tests.detect.commands import Captured
 

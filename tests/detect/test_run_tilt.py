@@ -14,13 +14,13 @@ from camera import Camera
 from camera.model_checks import checked_pose
 from detect.run_tilt import (
     COMMON_RAD,
-    LEAST_FRAMES,
     FrameTilts,
     RunTilt,
-    own_pitch,
+    camera_pitch_weights,
     tilt_of_run,
     usual_tilt,
 )
+from detect.settings import LEAST_FRAMES
 
 FloatArray = NDArray[np.float64]
 FRAMES = 600
@@ -128,13 +128,15 @@ def test_to_a_camera_that_looks_aside_roll_is_its_pitch(published_camera: Camera
     for bearing_deg, own in ((0.0, (1.0, 0.0)), (-90.0, (0.0, -1.0)), (180.0, (-1.0, 0.0))):
         turn = Rotation.from_euler("z", bearing_deg, degrees=True).as_matrix()
         pose = checked_pose("sensor2World", turn @ published_camera.robot_from_camera)
-        assert own_pitch(replace(published_camera, robot_from_camera=pose)) == pytest.approx(own)
+        assert camera_pitch_weights(
+            replace(published_camera, robot_from_camera=pose)
+        ) == pytest.approx(own)
     true, measured, variance = sequence(2)
     nothing = FrameTilts(np.full_like(true, np.nan), variance)
     outlines = FrameTilts(measured, variance)
     aside = FrameTilts(measured[:, ::-1], variance[:, ::-1])
     ahead = found_tilt(nothing, outlines)
-    turned = tilt_of_run(nothing, aside, own=(0.0, 1.0))
+    turned = tilt_of_run(nothing, aside, pitch_weights=(0.0, 1.0))
     assert turned is not None
     np.testing.assert_allclose(turned.lean, ahead.lean[::-1], atol=1e-4)
     np.testing.assert_allclose(turned.lean_sigma, ahead.lean_sigma[::-1], rtol=0.01)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect.run_tilt import LEAST_FRAMES
 from detect.runs.level_run import level_run
 from detect.runs.plan import RunSummary
 from detect.seen import level_seen
-from detect.settings import CircleSettings
+from detect.settings import LEAST_FRAMES, CircleSettings
 from redetect.landmarks.files import frames_of_rows, parse_rows
 
 LEAN = -0.04, 0.01
