@@ -24,8 +24,8 @@ from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
-from detect.row_files import KINDS, SeenRows
-from detect.seen import Sight, circle_on_floor
+from detect.projection import DiscProjection, circle_on_floor
+from detect.row_files import KINDS, ImageRows
 from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
@@ -61,7 +61,11 @@ _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def draw_rows(
-    image: GreyImage, sight: Sight | None, rows: SeenRows, settings: CircleSettings, title: str = ""
+    image: GreyImage,
+    projection: DiscProjection | None,
+    rows: ImageRows,
+    settings: CircleSettings,
+    title: str = "",
 ) -> ByteArray:
     """Draw rows of a frame into its image (H, W), with a caption below it.
 
@@ -70,20 +74,20 @@ def draw_rows(
     S is 2 for small images, to separate labels, otherwise 1.
     """
     scale = 2 if image.shape[1] < _SMALL_PX else 1
-    canvas = canvas_of(image, None if sight is None else sight.camera)
+    canvas = canvas_of(image, None if projection is None else projection.camera)
     canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
     words, labels = [title] if title else [], list[Box]()
     if not processed(rows):
         words.append("not processed")
     options = CompareOptions()
-    if sight is not None and rows.lines is not None:
+    if projection is not None and rows.lines is not None:
         match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
         compared = rows.reference_lines is not None
-        _draw_lines(canvas, sight.camera, match, compared, scale, labels)
+        _draw_lines(canvas, projection.camera, match, compared, scale, labels)
         words.append(_count("verticals", match, compared))
-    if sight is not None and rows.circles is not None:
+    if projection is not None and rows.circles is not None:
         discs = rows.reference_circles, rows.circles, rows.unlisted
-        match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
+        match = match_frame("circles", title, discs, options, projection.for_frame(*discs[:2]))
         compared = rows.reference_circles is not None
         _draw_discs(canvas, match, settings, compared, scale, labels)
         words.append(_count("discs", match, compared))
@@ -96,7 +100,7 @@ def draw_rows(
     return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38)
 
 
-def processed(rows: SeenRows) -> bool:
+def processed(rows: ImageRows) -> bool:
     """Whether any file of detected rows has the image."""
     return any(getattr(rows, kind) is not None for kind in KINDS)
 
@@ -151,10 +155,10 @@ def _draw_discs(
     taken: list[Box],
 ) -> None:
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
-    view = match.view
-    assert view is not None
+    projection = match.projection
+    assert projection is not None
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
-    for edge in view.reference_px(rings):
+    for edge in projection.reference_px(rings):
         draw_curve(canvas, _scaled(edge, scale), MISSED_COLOUR, closed=True)
     drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
@@ -165,7 +169,7 @@ def _draw_discs(
     rims = []
     for row, _, edge_colour in drawn:
         for radius_m, colour in zip(radii, (_OUTLINE_COLOUR, edge_colour, _OUTLINE_COLOUR)):
-            outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
+            outline = projection.detected_px(circle_on_floor((row.px, row.py), radius_m))
             rims.append(_scaled(outline, scale))
             draw_curve(canvas, rims[-1], colour, closed=True)
     gap = np.array([3.0 * enlargement(canvas), 0.0])
