@@ -98,7 +98,7 @@ def _circles(command: Circles, run: Run) -> Job:
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
     plan = FramePlan(run.camera, lines=command.detector)
-    places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
+    places = {"lines": output, "tilt": command.tilt_output or output.with_suffix(".tilt")}
     return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
 
 
