@@ -105,12 +105,10 @@ class DiscProjection:
     detected_tilt: Tilt | None = None
 
     @classmethod
-    def for_settings(
-        cls, camera: Camera, settings: CircleSettings, reference_level: bool = False
-    ) -> DiscProjection:
-        """The projection of discs that were detected with some settings."""
+    def of(cls, camera: Camera, settings: CircleSettings, level: bool = False) -> DiscProjection:
+        """The projection of discs detected with some settings; whether the reference is level."""
         sigma_rad = max(settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
-        return cls(camera, settings.radius_m, sigma_rad, reference_level)
+        return cls(camera, settings.radius_m, sigma_rad, level)
 
     def for_frame(self, reference: Frame | None, detected: Frame | None) -> DiscProjection:
         """The projection of a frame with these rows."""

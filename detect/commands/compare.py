@@ -56,9 +56,8 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
             named = command.camera
             camera = camera_in(command.run) if named is None else read_camera(named)
         settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
-        projection = (
-            None if camera is None else DiscProjection.for_settings(camera, settings, level)
-        )
+        if camera is not None:
+            projection = DiscProjection.of(camera, settings, level)
     return compare_with_file(
         kind,
         reference,

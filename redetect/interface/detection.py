@@ -200,7 +200,7 @@ class Detection(Table):
     def picture(self) -> NDArray[np.uint8]:
         """(S H + h, S W, 3) the image with the detections: blue, green, red; see `draw_rows`."""
         rows = ImageRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
-        projection = DiscProjection.for_settings(self.camera, self.settings)
+        projection = DiscProjection.of(self.camera, self.settings)
         return draw_rows(self.image, projection, rows, self.settings, self.name)
 
     def __str__(self) -> str:
