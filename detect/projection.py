@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -96,19 +96,11 @@ class DiscProjection:
     """Projects reference and detected discs into the image, each by the tilt that levelled them."""
 
     camera: Camera
-    radius_m: float = 0.10  # of the discs
-    #: Standard deviation of the tilt of rows that are not levelled.
-    tilt_sigma_rad: float = math.radians(USUAL_TILT_DEG)
+    settings: CircleSettings = field(default_factory=CircleSettings)  # of the detected discs
     #: Reference rows are level but do not state their tilt: that of the detected rows is used.
     reference_level: bool = False
     reference_tilt: Tilt | None = None  # that levelled the reference rows
     detected_tilt: Tilt | None = None
-
-    @classmethod
-    def of(cls, camera: Camera, settings: CircleSettings, level: bool = False) -> DiscProjection:
-        """The projection of discs detected with some settings; whether the reference is level."""
-        sigma_rad = max(settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
-        return cls(camera, settings.radius_m, sigma_rad, level)
 
     def for_frame(self, reference: Frame | None, detected: Frame | None) -> DiscProjection:
         """The projection of a frame with these rows."""
@@ -142,12 +134,13 @@ class DiscProjection:
 
         Wider where the tilt between the reference and the detected rows is unknown.
         """
-        edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
+        radius_m = self.settings.radius_m
+        edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), radius_m, 16))
         visible = np.isfinite(edge)
         low = np.where(visible, edge, np.inf).min(axis=1, initial=np.inf)
         high = np.where(visible, edge, -np.inf).max(axis=1, initial=-np.inf)
         gates = np.maximum(0.5 * (high - low), LEAST_GATE_PX)
         if self.reference_level and self.detected_tilt is None:
-            focal_px = np.array([self.camera.scale_x, self.camera.scale_y])
-            gates += _TILT_GATE * self.tilt_sigma_rad * focal_px
+            sigma_rad = max(self.settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
+            gates += _TILT_GATE * sigma_rad * np.array(self.camera.pinhole[:2])
         return np.asarray(gates)

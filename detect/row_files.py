@@ -79,7 +79,7 @@ class RunRows:
     def projection(self, camera: Camera) -> DiscProjection:
         """The projection of discs into the images of a camera."""
         level = "circles" in self.reference and read_head(self.reference["circles"]).level
-        return DiscProjection.of(camera, self.circle_settings, level)
+        return DiscProjection(camera, self.circle_settings, level)
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:

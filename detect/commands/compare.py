@@ -57,7 +57,7 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
             camera = camera_in(command.run) if named is None else read_camera(named)
         settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
         if camera is not None:
-            projection = DiscProjection.of(camera, settings, level)
+            projection = DiscProjection(camera, settings, level)
     return compare_with_file(
         kind,
         reference,

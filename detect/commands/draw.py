@@ -86,7 +86,7 @@ def draw_run(
                 prefix = frame.step.prefix
                 name = picture_name(prefix)
                 image_rows = rows.of(prefix)
-                picture = draw_rows(image, projection, image_rows, rows.circle_settings, name)
+                picture = draw_rows(image, projection, image_rows, name)
                 if plan is not None:
                     picture = _with_rejected(picture, image, frame, plan)
                 if folder is not None:

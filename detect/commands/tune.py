@@ -86,7 +86,7 @@ def perform(options: Tune) -> int:
         compare_frames,
         [rows for _, rows in pairs],
         options=options.matching,
-        projection=DiscProjection.of(run.camera, base, read_head(path).level),
+        projection=DiscProjection(run.camera, base, read_head(path).level),
         unlisted=rows_beside(path, "unlisted"),
     )
     count = len(grid) * len(pairs)

@@ -41,7 +41,7 @@ def perform(options: View) -> int:
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
     frames = SomeFrames(run.frames, every=options.every)
-    projection, settings = source.projection(run.camera), source.circle_settings
+    projection = source.projection(run.camera)
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
     failures: list[str] = []
@@ -69,14 +69,14 @@ def perform(options: View) -> int:
                     kind = "timestamp" if frame.time_s >= _EARLIEST_DATE_S else "duration"
                     recording.set_time("time", **{kind: frame.time_s})
                 rows = source.of(frame.step.prefix)
-                _log_world(rr, recording, rows, poses[position + 1], settings.radius_m)
+                _log_world(rr, recording, rows, poses[position + 1], projection.settings.radius_m)
                 try:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
                     recording.log("camera/image", rr.Clear(recursive=False))
                 else:
-                    picture = draw_rows(image, projection, rows, settings, frame.step.prefix)
+                    picture = draw_rows(image, projection, rows, frame.step.prefix)
                     coloured = np.ascontiguousarray(picture[:, :, ::-1])
                     recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()

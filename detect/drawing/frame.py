@@ -26,7 +26,6 @@ from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
 from detect.projection import DiscProjection, circle_on_floor
 from detect.row_files import KINDS, ImageRows
-from detect.settings import CircleSettings
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
@@ -61,17 +60,12 @@ _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def draw_rows(
-    image: GreyImage,
-    projection: DiscProjection | None,
-    rows: ImageRows,
-    settings: CircleSettings,
-    title: str = "",
+    image: GreyImage, projection: DiscProjection | None, rows: ImageRows, title: str = ""
 ) -> ByteArray:
     """Draw rows of a frame into its image (H, W), with a caption below it.
 
-    Without a calibrated camera only markers are drawn. The settings contain the radii of the discs'
-    outlines. The channels of the picture (S H + h, S W, 3) are in OpenCV's order, blue, green, red;
-    S is 2 for small images, to separate labels, otherwise 1.
+    Without a calibrated camera only markers are drawn. Channels of the picture (S H + h, S W, 3)
+    are in OpenCV's order, blue, green, red; S is 2 for small images, to separate labels, else 1.
     """
     scale = 2 if image.shape[1] < _SMALL_PX else 1
     canvas = canvas_of(image, None if projection is None else projection.camera)
@@ -89,7 +83,7 @@ def draw_rows(
         discs = rows.reference_circles, rows.circles, rows.unlisted
         match = match_frame("circles", title, discs, options, projection.for_frame(*discs[:2]))
         compared = rows.reference_circles is not None
-        _draw_discs(canvas, match, settings, compared, scale, labels)
+        _draw_discs(canvas, match, compared, scale, labels)
         words.append(_count("discs", match, compared))
     if rows.markers is not None:
         _draw_markers(canvas, rows.markers.markers, scale)
@@ -147,16 +141,12 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
 
 
 def _draw_discs(
-    canvas: ByteArray,
-    match: FrameMatch,
-    settings: CircleSettings,
-    compared: bool,
-    scale: int,
-    taken: list[Box],
+    canvas: ByteArray, match: FrameMatch, compared: bool, scale: int, taken: list[Box]
 ) -> None:
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
     projection = match.projection
     assert projection is not None
+    settings = projection.settings
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
     for edge in projection.reference_px(rings):
         draw_curve(canvas, _scaled(edge, scale), MISSED_COLOUR, closed=True)

@@ -98,8 +98,7 @@ def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
         image = read_image(frame, None if inputs.projection is None else inputs.projection.camera)
     except FrameError as error:
         return Part("note", f"{words}: {error}")
-    rows, settings = inputs.files.of(frame.step.prefix), inputs.files.circle_settings
-    picture = draw_rows(image, inputs.projection, rows, settings)
+    picture = draw_rows(image, inputs.projection, inputs.files.of(frame.step.prefix))
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 

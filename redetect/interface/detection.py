@@ -200,8 +200,8 @@ class Detection(Table):
     def picture(self) -> NDArray[np.uint8]:
         """(S H + h, S W, 3) the image with the detections: blue, green, red; see `draw_rows`."""
         rows = ImageRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
-        projection = DiscProjection.of(self.camera, self.settings)
-        return draw_rows(self.image, projection, rows, self.settings, self.name)
+        projection = DiscProjection(self.camera, self.settings)
+        return draw_rows(self.image, projection, rows, self.name)
 
     def __str__(self) -> str:
         words = f"{self.name}: {counted(len(self.discs), 'disc')}, "

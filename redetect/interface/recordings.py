@@ -181,6 +181,6 @@ def compare(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
     seen_by = found[0].camera if camera is None else camera_of(camera)
-    projection = DiscProjection.of(seen_by, found[0].settings, read_head(in_file).level)
+    projection = DiscProjection(seen_by, found[0].settings, read_head(in_file).level)
     frames, names = [one.frame for one in found], (str(in_file), "detections")
     return compare_with_file(kind, in_file, frames, options, projection=projection, names=names)

@@ -219,7 +219,9 @@ def test_rows_that_are_not_levelled_match_level_truth(
         truth.append(frame(k, xy))
         seen.append(frame(k, camera.floor_from_pixel(image_positions(camera, xy, by))))
 
-    projection = DiscProjection.of(camera, CircleSettings(tilt_sigma_deg=sigma_deg), level=True)
+    projection = DiscProjection(
+        camera, CircleSettings(tilt_sigma_deg=sigma_deg), reference_level=True
+    )
     found = compare_frames(truth, seen, projection=projection)
 
     assert (found.recall, found.extra) == (1.0, 0)

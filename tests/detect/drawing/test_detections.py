@@ -26,7 +26,7 @@ def drawn(
     covariance = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
     discs = circle_landmarks(xy, np.full(len(xy), 0.87), covariance, np.full(len(xy), -1))
     rows = ImageRows(circles=Frame(Step("x", *[0.0] * 9), discs))
-    picture = draw_rows(image, DiscProjection(camera), rows, SETTINGS)
+    picture = draw_rows(image, DiscProjection(camera, SETTINGS), rows)
     return picture[: 2 * image.shape[0]]
 
 
