@@ -322,7 +322,7 @@ def match_runs(
     for name in images:
         frames = reference[name], detected[name]
         of_frame = None if projection is None else projection.for_frame(*frames)
-        matches.append(match_frame(kind, name, (*frames, known.get(name)), options, of_frame))
+        matches.append(match_frame(kind, name, *frames, options, of_frame, known.get(name)))
     counts: dict[str, int] = {
         name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
@@ -350,30 +350,32 @@ def match_runs(
 def match_frame(
     kind: Kind,
     name: str,
-    frames: tuple[Frame | None, Frame | None, Frame | None],
+    reference: Frame | None,
+    detected: Frame | None,
     options: CompareOptions,
     projection: DiscProjection | None = None,
+    unlisted: Frame | None = None,
 ) -> FrameMatch:
-    """Match the discs or the lines of one image one to one.
+    """Match the discs or the lines of one image one to one; a frame that is None has no rows.
 
-    `frames` are those of the reference, of the detected and of the unlisted rows; None means no
-    rows. Detected rows that match an unlisted disc or line (or a reference row without ID, if these
+    Detected rows that match an unlisted disc or line (or a reference row without ID, if these
     do not count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if kind == "circles":
         pair_up = partial(pair_discs, options=options, projection=projection)
-    counted, detected, uncounted = ([*getattr(frame, kind, ())] for frame in frames)
+    counted, found, uncounted = (
+        [*getattr(frame, kind, ())] for frame in (reference, detected, unlisted)
+    )
     if kind == "lines":
-        for rows in (counted, detected, uncounted):
+        for rows in (counted, found, uncounted):
             rows.sort(key=_line_order)
     if options.only_identified:
         uncounted += [row for row in counted if not row.identified]
         counted = [row for row in counted if row.identified]
-    pairs = pair_up(counted, detected)
+    pairs = pair_up(counted, found)
     first, left = ([counted[i] for i in side] for side in (pairs.first, pairs.first_alone))
-    second = [detected[j] for j in pairs.second]
-    alone = [detected[j] for j in pairs.second_alone]
+    second, alone = ([found[j] for j in side] for side in (pairs.second, pairs.second_alone))
     aside = pair_up(uncounted, alone)
     if kind == "lines":
         reach = numbers(second, "sigma") * options.sigmas
@@ -386,7 +388,7 @@ def match_frame(
     return FrameMatch(
         name,
         projection,
-        detected,
+        found,
         wanted=first,
         matched=second,
         joined=[row for row, with_another in zip(left, joined) if with_another],

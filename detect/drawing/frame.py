@@ -75,13 +75,14 @@ def draw_rows(
         words.append("not processed")
     options = CompareOptions()
     if projection is not None and rows.lines is not None:
-        match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
+        match = match_frame("lines", title, rows.reference_lines, rows.lines, options)
         compared = rows.reference_lines is not None
         _draw_lines(canvas, projection.camera, match, compared, scale, labels)
         words.append(_count("verticals", match, compared))
     if projection is not None and rows.circles is not None:
-        discs = rows.reference_circles, rows.circles, rows.unlisted
-        match = match_frame("circles", title, discs, options, projection.for_frame(*discs[:2]))
+        discs = rows.reference_circles, rows.circles
+        of_frame = projection.for_frame(*discs)
+        match = match_frame("circles", title, *discs, options, of_frame, rows.unlisted)
         compared = rows.reference_circles is not None
         _draw_discs(canvas, match, compared, scale, labels)
         words.append(_count("discs", match, compared))
