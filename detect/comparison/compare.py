@@ -87,14 +87,13 @@ def compare_with_file(
     uncounted = beside if unlisted is None else list(read_frames(unlisted))
     if kind == "lines":
         return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
-    alike = rows_beside(reference, "lookalikes")
     return compare_frames(
         wanted,
         detected,
         options,
         projection=projection,
         unlisted=uncounted,
-        lookalikes=alike,
+        lookalikes=rows_beside(reference, "lookalikes"),
         names=names,
     )
 
@@ -164,9 +163,8 @@ def compare_frames(
         circle_arrays([row for match in matches for row in getattr(match, side)])
         for side in ("wanted", "matched", "missed", "extra")
     )
-    alike_xy = np.concatenate(
-        [np.zeros((0, 2)), *(_levelled_as_detected(m.wanted, m.projection) for m in matches)]
-    )
+    levelled = [_levelled_xy(match.wanted, match.projection) for match in matches]
+    alike_xy = np.concatenate([np.zeros((0, 2)), *levelled])
     away = first.xy - (np.zeros(2) if projection is None else projection.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     pairs = DiscPairs(first.xy, second.xy - first.xy, second.xy - alike_xy, second.covariance, away)
@@ -210,11 +208,9 @@ def _image_cost(matches: Iterable[FrameMatch]) -> float:
     return float(np.sum(costs))
 
 
-def _levelled_as_detected(
-    reference: Sequence[CircleLandmark], projection: DiscProjection | None
-) -> FloatArray:
+def _levelled_xy(rows: Sequence[CircleLandmark], projection: DiscProjection | None) -> FloatArray:
     """(M, 2) floor positions of reference discs, levelled as the detected ones are."""
-    xy = circle_arrays(reference).xy
+    xy = circle_arrays(rows).xy
     return xy if projection is None else projection.levelled_as_detected(xy)
 
 
@@ -364,9 +360,8 @@ def match_frame(
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if kind == "circles":
         pair_up = partial(pair_discs, options=options, projection=projection)
-    counted, found, uncounted = (
-        [*getattr(frame, kind, ())] for frame in (reference, detected, unlisted)
-    )
+    frames = reference, detected, unlisted
+    counted, found, uncounted = ([*getattr(frame, kind, ())] for frame in frames)
     if kind == "lines":
         for rows in (counted, found, uncounted):
             rows.sort(key=_line_order)
@@ -383,7 +378,7 @@ def match_frame(
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
         joined = np.zeros(len(left), dtype=np.bool_)
-        first_xy = _levelled_as_detected(first, projection)
+        first_xy = _levelled_xy(first, projection)
         errors = np.linalg.norm(circle_arrays(second).xy - first_xy, axis=1)
     return FrameMatch(
         name,
