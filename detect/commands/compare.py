@@ -12,8 +12,8 @@ from detect.comparison.report import comparison_tables
 from detect.comparison.result import Comparison, DiscComparison, Kind
 from detect.errors import DetectError
 from detect.options import Compare
+from detect.projection import DiscProjection
 from detect.row_files import circle_settings_of
-from detect.seen import Sight
 from redetect.command_line import EXIT_ERROR
 from redetect.landmarks.files import read_head
 from redetect.storage import write_bytes
@@ -50,19 +50,20 @@ def comparison_of(command: Compare, camera: Camera | None = None) -> Comparison:
     ):
         if not path.exists():
             raise DetectError(f"{path}: no such landmark file: {advice}")
-    sight = None
+    projection = None
     if not command.lines:
         if camera is None:
             named = command.camera
             camera = camera_in(command.run) if named is None else read_camera(named)
         settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
-        sight = None if camera is None else Sight.by(camera, settings, level)
+        if camera is not None:
+            projection = DiscProjection(camera, settings, level)
     return compare_with_file(
         kind,
         reference,
         read_kind(kind, detected),
         command.matching,
-        sight=sight,
+        projection=projection,
         unlisted=command.unlisted,
         names=(str(reference), str(detected)),
     )

@@ -23,10 +23,10 @@ from camera.uncertainty import covariance_of, with_covariance
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
+from detect.projection import leaning_camera, level_matrix
 from detect.run_tilt import COMMON_RAD, FrameTilts, camera_pitch_weights, frame_tilts, tilt_of_run
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import leaning_camera, level_matrix
 from detect.settings import LEAST_FRAMES, CircleSettings
 from detect.sources.interface import Run
 from detect.sources.opening import open_run
@@ -75,15 +75,11 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
         for frame in run.frames:
             advance()
             (found,) = detect_batch([FrameTask(frame)], plan)
-            if found.error is not None or found.seen is None or found.image is None:
+            if found.error is not None or found.unlevelled is None or found.image is None:
                 failures.append(str(found.error))
                 continue
-            outlines = [
-                tilt_of_outlines(
-                    found.image, camera, found.seen.floor_xy, radius_m, share * height_m
-                )
-                for share in HEIGHT_STEPS
-            ]
+            of_image = found.image, camera, found.unlevelled.floor_xy, radius_m
+            outlines = [tilt_of_outlines(*of_image, share * height_m) for share in HEIGHT_STEPS]
             tilts.append(found.tilt)
             level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
             apart.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))

@@ -14,7 +14,7 @@ from detect.comparison.compare import compare_with_file
 from detect.comparison.result import Comparison, Kind
 from detect.errors import DetectError
 from detect.options import Compare, CompareOptions, SourceOptions
-from detect.seen import Sight
+from detect.projection import DiscProjection
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
@@ -181,6 +181,6 @@ def compare(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
     seen_by = found[0].camera if camera is None else camera_of(camera)
-    sight = Sight.by(seen_by, found[0].settings, read_head(in_file).level)
+    projection = DiscProjection(seen_by, found[0].settings, read_head(in_file).level)
     frames, names = [one.frame for one in found], (str(in_file), "detections")
-    return compare_with_file(kind, in_file, frames, options, sight=sight, names=names)
+    return compare_with_file(kind, in_file, frames, options, projection=projection, names=names)
