@@ -19,7 +19,6 @@ from camera.boards.board import board_of
 from camera.boards.points import find_board
 from camera.calibration.adjustment import Adjusted, Points, adjust, fit_to_centres, project_estimate
 from camera.calibration.calibrate import largest_rms_px
-from camera.calibration.images import read_grey
 from camera.calibration.model import COUNT
 from camera.calibration.pictures import drawn_floor, rectified_floor
 from camera.calibration.start import best_poses, board_poses
@@ -33,6 +32,7 @@ from redetect.array_types import FloatArray
 from redetect.bounds import FINITE, demand
 from redetect.storage import demand_place, write_bytes
 from redetect.storage.bounded import rows_of_numbers
+from redetect.storage.images import read_grey
 
 _FEWEST_POINTS = 4
 
@@ -167,7 +167,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
             f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
             "axes point: use one with one even and one odd number, or a .csv of places u,v,x,y"
         )
-    image = read_grey(path)
+    image = read_grey(path, CalibrationError)
     if image.shape != size[::-1]:
         raise CalibrationError(
             f"{path}: {image.shape[1]} x {image.shape[0]} pixels: expected the calibrated camera's "
@@ -247,7 +247,7 @@ def write_floor_pictures(options: Floor, camera: Camera) -> None:
     if floor.suffix.lower() == ".csv":
         print(f"{floor}: no photograph, so there is no picture of the floor's grid")
         return
-    image = read_grey(floor)
+    image = read_grey(floor, CalibrationError)
     for name, draw in (("grid", drawn_floor), ("from-above", rectified_floor)):
         place = options.pictures / f"{floor.name}.{name}.png"
         write_picture(draw(image, camera), place, force=options.force)

@@ -15,6 +15,7 @@ from redetect.landmarks.files import read_head
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise, common_tilt_jacobian
+from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 UNKNOWN_ID = -1
 
@@ -28,7 +29,7 @@ MOST_STEP_SIGMA_RAD = float(np.pi)
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
-PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+PICTURES = {*IMAGE_SUFFIXES, ".gif"}
 # Share of the variance of discs' tilts that is assumed to be common to all frames.
 _COMMON_SHARE = 0.5
 # Indices of the covariance's numbers in a STEP row.
