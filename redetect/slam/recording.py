@@ -1,4 +1,4 @@
-"""A run's odometry and landmark rows as arrays, checked for values that estimators cannot use."""
+"""A run: its odometry and landmark rows as arrays, checked for estimators, and its calibration."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from camera import Camera, camera_in, read_camera
 from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.files import read_head
@@ -18,6 +19,9 @@ from redetect.slam.models import OdometryNoise, common_tilt_jacobian
 from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 UNKNOWN_ID = -1
+
+#: Origin of bearings where there are none: the robot's.
+NO_CAMERA = np.zeros(2)
 
 #: The noise of odometry without covariances.
 ASSUMED = OdometryNoise()
@@ -215,6 +219,31 @@ def _demand_landmarks(path: Path) -> None:
         )
     if path.suffix.lower() == ".cam":
         raise SlamError(f"{path}: is a calibration: {expected}; calibrations are named by --camera")
+
+
+def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
+    """Read the calibration that belongs to a run, a folder or a file in one.
+
+    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
+    there is none, `camera.CameraError` if it is ambiguous.
+    """
+    if camera is not None:
+        return camera if isinstance(camera, Camera) else read_camera(camera)
+    folder = run if run.is_dir() else run.parent
+    found = camera_in(folder)
+    if found is None:
+        raise SlamError(
+            f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
+            "calibrate` makes one, `camera convert` converts one of another program"
+        )
+    return found
+
+
+def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
+    """(2,) the camera's centre in the robot frame (m); zero if no line needs it."""
+    if not len(recording.lines):
+        return NO_CAMERA
+    return np.array(camera_of_run(run, camera).centre[:2])
 
 
 def read_recording(

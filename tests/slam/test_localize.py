@@ -274,8 +274,8 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     import json
 
     from redetect.plane import between
-    from redetect.slam.commands.files import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+    from redetect.slam.recording import camera_xy_of
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)

@@ -30,7 +30,7 @@ from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.filters import frames
 from redetect.slam.models import common_tilt_jacobian, move, tilt_jacobian
-from redetect.slam.recording import LineRows, Recording
+from redetect.slam.recording import NO_CAMERA, LineRows, Recording
 
 #: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
 #: assume that bearings are linear in these.
@@ -67,7 +67,7 @@ class EkfSlam(frames.Filter):
         self,
         start: ArrayLike = (0.0, 0.0, 0.0),
         start_covariance: ArrayLike | None = None,
-        camera_xy: ArrayLike = frames.NO_CAMERA,
+        camera_xy: ArrayLike = NO_CAMERA,
         *,
         common_tilt_variance: float = 0.0,
         tilt_sigma_rad: float = 0.0,
