@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from camera import Camera, camera_in, read_camera
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
@@ -31,8 +32,9 @@ from detect.comparison.result import (
     normalised_error,
     quantile,
 )
-from detect.errors import CompareError
+from detect.errors import CompareError, DetectError
 from detect.options import CompareOptions
+from detect.row_files import circle_settings_of
 from detect.seen import LEAST_GATE_PX, Sight
 from detect.sources.image_files import image_name
 from redetect.array_types import FloatArray
@@ -48,6 +50,7 @@ from redetect.landmarks import (
     read_frames,
     wrap_angle,
 )
+from redetect.landmarks.files import read_head
 from redetect.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
@@ -61,6 +64,56 @@ _WHOLE_PX = 0.01
 FLOOR_GATE_M = 0.10
 # Breaks ties between pairs of lines, so that the result does not depend on the file's order.
 _line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
+
+
+def compare_run(
+    run: Path,
+    kind: Kind = "circles",
+    detected: Path | None = None,
+    reference: Path | None = None,
+    *,
+    camera: Camera | Path | None = None,
+    options: CompareOptions | None = None,
+    unlisted: Path | None = None,
+) -> Comparison:
+    """Compare the detected discs, or lines, of a run with reference rows, both from files.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder.
+    kind : {"circles", "lines"}
+    detected, reference : Path, optional
+        Files of rows; by default `detected.circles` and `map.circles` (or `.lines`) of the run.
+    camera : Camera or Path, optional
+        Calibration for discs; by default the run's. Without any, they are compared on the floor.
+    options, unlisted
+        As in `compare_with_file`.
+
+    Raises
+    ------
+    DetectError
+        If there is no such file.
+    CompareError, redetect.landmarks.LandmarkFileError
+        As in `compare_with_file`.
+    """
+    reference, detected = reference or run / f"map.{kind}", detected or run / f"detected.{kind}"
+    for path, advice in (
+        (reference, "give the reference rows with --reference"),
+        (detected, f"`detect {kind}` writes it, or give another with --detected"),
+    ):
+        if not path.exists():
+            raise DetectError(f"{path}: no such landmark file: {advice}")
+    sight = None
+    if kind == "circles":
+        camera = camera_in(run) if camera is None else camera
+        camera = read_camera(camera) if isinstance(camera, Path) else camera
+        settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
+        sight = None if camera is None else Sight.by(camera, settings, level)
+    rows, names = read_kind(kind, detected), (str(reference), str(detected))
+    return compare_with_file(
+        kind, reference, rows, options, sight=sight, unlisted=unlisted, names=names
+    )
 
 
 def compare_with_file(
