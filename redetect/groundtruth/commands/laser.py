@@ -8,7 +8,6 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.bounds import demand, whole
-from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
@@ -17,6 +16,7 @@ from redetect.groundtruth.lasers import tracking
 from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
+from redetect.groundtruth.options import Laser
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.json_text import json_text
 from redetect.storage import write_bytes

@@ -8,11 +8,11 @@ from itertools import product
 from pathlib import Path
 
 from redetect.groundtruth.commands import outputs
-from redetect.groundtruth.commands.options import Network as NetworkCommand
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
 from redetect.groundtruth.markers.network_estimation import estimate_network
 from redetect.groundtruth.markers.session import Network, write_network
+from redetect.groundtruth.options import Network as NetworkCommand
 
 
 def perform(command: NetworkCommand) -> int:

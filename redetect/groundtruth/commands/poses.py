@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance, warn
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
+from redetect.groundtruth.options import Poses
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.json_text import json_text
 from redetect.storage import write_bytes

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.commands.options import Sync
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, PtpdLog, read_ptpd
 from redetect.groundtruth.fusion.sync import synchronise
+from redetect.groundtruth.options import Sync
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 
 _CONFIDENCE = 1.959964

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
+from redetect.groundtruth.options import Validate
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation import onboard, reference_poses, scoring

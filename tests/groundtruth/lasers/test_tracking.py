@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.commands.laser import perform, seen_through
-from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     ScanSets,
@@ -42,6 +41,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     explain_set,
     new_points,
 )
+from redetect.groundtruth.options import Laser
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
