@@ -24,7 +24,7 @@ def perform(options: Sync) -> int:
     truth = read_planar_poses(options.groundtruth)
     log = None if options.ptpd is None else read_ptpd(options.ptpd)
     segments = synchronise(odometry, truth, options.settings)
-    determined = [segment for segment in segments if segment.status != "no turns"]
+    determined = [segment for segment in segments if segment.is_determined]
     for segment in segments:
         print(_line(segment))
     if not determined:
@@ -86,7 +86,7 @@ def _rms(values: Any) -> float | None:
 
 def _line(segment: ClockSegment) -> str:
     head = f"{segment.from_s:.2f} .. {segment.to_s:.2f} s: "
-    if segment.status == "no turns":
+    if not segment.is_determined:
         return head + f"cannot be synchronised: {segment.note}"
     offset = _CONFIDENCE * segment.sigma_offset_s
     drift = _CONFIDENCE * segment.sigma_rate
