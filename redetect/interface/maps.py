@@ -26,11 +26,10 @@ from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import (
-    Recording,
     camera_of_run,
     camera_xy_of,
     joined,
-    read_recording,
+    read_runs,
 )
 from redetect.tables import Table, covariance_columns
 
@@ -217,7 +216,7 @@ def map_landmarks(
     command = _checked(
         Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
     )
-    recording = _recording(command)
+    recording = joined(read_runs(command))
     needs_camera = command.calibrate or len(recording.lines) > 0
     mapped = map_run(
         recording,
@@ -268,7 +267,7 @@ def localize(
         places = landmarks.result.landmarks_jointly()
     else:
         places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
-    recording = _recording(command)
+    recording = joined(read_runs(command))
     result = localize_run(
         recording,
         places,
@@ -303,22 +302,6 @@ def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
 def _run(name: PathLike) -> Path:
     expected = "a run folder or a file of rows; `redetect.landmarks.write_frames` writes detections"
     return path_of(name, expected, SlamError)
-
-
-def _recording(flags: Map | Localize) -> Recording:
-    """The rows of the runs that are named, as one run."""
-    return joined(
-        [
-            read_recording(
-                run,
-                circles=flags.circles,
-                lines=flags.lines,
-                stem=flags.stem,
-                noise=flags.odometry_noise,
-            )
-            for run in flags.runs
-        ]
-    )
 
 
 def _checked(command: Command) -> Command:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
@@ -33,6 +33,11 @@ class RunFlags:
     def runs(self) -> tuple[Path, ...]:
         """All runs that are named."""
         return (self.run,)
+
+    @property
+    def rows(self) -> dict[str, Any]:
+        """Which rows are read, as `redetect.slam.recording.landmark_files` has it."""
+        return {"circles": self.circles or not self.lines, "lines": self.lines, "stem": self.stem}
 
 
 @dataclass(frozen=True, kw_only=True)

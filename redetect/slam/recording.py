@@ -16,6 +16,7 @@ from redetect.landmarks.files import read_head
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise, common_tilt_jacobian
+from redetect.slam.options import RunFlags
 from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 UNKNOWN_ID = -1
@@ -283,6 +284,12 @@ def read_recording(
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
     return replace(found, tilted=read_head(files[0]).covers_tilt)
+
+
+def read_runs(flags: RunFlags) -> list[Recording]:
+    """Read the rows of the runs that flags name."""
+    noise = flags.odometry_noise
+    return [read_recording(run, noise=noise, **flags.rows) for run in flags.runs]
 
 
 def recording_of_frames(

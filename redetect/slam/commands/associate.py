@@ -21,7 +21,7 @@ from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined
+from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
 from redetect.storage import demand_free
 
 
@@ -29,7 +29,8 @@ def perform(options: Associate) -> int:
     """Execute the command; returns the exit code."""
     demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
     settings = options.settings
-    sources = [(k, f) for k, run in enumerate(options.runs) for f in files.files_of(options, run)]
+    files_of_runs = [landmark_files(run, **options.rows) for run in options.runs]
+    sources = [(k, file) for k, own in enumerate(files_of_runs) for file in own]
     targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")

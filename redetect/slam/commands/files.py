@@ -12,30 +12,20 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
 from redetect.slam.options import RunFlags
-from redetect.slam.recording import Recording, landmark_files, read_recording
+from redetect.slam.recording import Recording, read_runs
 from redetect.storage import write_bytes
 
 MAP_PICTURE = "map.png"
 
 
-def files_of(flags: RunFlags, run: Path) -> list[Path]:
-    """The landmark files of a run, of the kinds that a command names."""
-    return landmark_files(run, **_wanted(flags))
-
-
-def _wanted(flags: RunFlags) -> dict[str, Any]:
-    return {"circles": flags.circles or not flags.lines, "lines": flags.lines, "stem": flags.stem}
-
-
 def recordings_of(flags: RunFlags) -> list[Recording]:
-    """Read the rows of the runs that a command names, and print what is assumed of odometry."""
-    noise = flags.odometry_noise
-    recordings = [read_recording(run, noise=noise, **_wanted(flags)) for run in flags.runs]
+    """`read_runs`, and print the assumptions about their odometry."""
+    recordings = read_runs(flags)
     for recording in recordings:
         if recording.unstated_steps:
             print(
                 f"{recording.unstated_steps} of {len(recording)} steps have no covariance: assumed "
-                f"{noise.sentence()} (--odometry-noise)",
+                f"{flags.odometry_noise.sentence()} (--odometry-noise)",
                 file=sys.stderr,
             )
         way, reach = lengths_of(recording)
