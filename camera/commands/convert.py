@@ -3,14 +3,7 @@
 from __future__ import annotations
 
 from camera.errors import ConversionError
-from camera.formats.files import (
-    convert,
-    format_of,
-    format_of_name,
-    format_of_text,
-    parse,
-    read_text,
-)
+from camera.formats import files
 from camera.formats.models import ForeignCamera
 from camera.model import Camera
 from camera.options import Convert
@@ -20,12 +13,12 @@ from redetect.storage import demand_place, write_bytes
 def perform(options: Convert) -> int:
     """Execute the command; returns the exit code."""
     demand_place(options.target, overwrite=options.force)
-    text = read_text(options.source)
-    from_format = format_of_text(options.source, text)
-    to_format = format_of_name(options.target)
-    source = parse(text, from_format, str(options.source), options.camera_name)
+    text = files.read_text(options.source)
+    from_format = files.format_of_text(options.source, text)
+    to_format = files.format_of_name(options.target)
+    source = files.parse(text, from_format, str(options.source), options.camera_name)
     try:
-        converted = convert(source, to_format, options)
+        converted = files.convert(source, to_format, options)
     except ConversionError as error:
         raise ConversionError(f"{options.source}: {error}") from None
     camera = converted.camera
@@ -47,7 +40,9 @@ def perform(options: Convert) -> int:
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose is dropped: the format has none (--pose-from restores it)")
-    write_bytes(options.target, format_of(camera, to_format).encode(), overwrite=options.force)
+    write_bytes(
+        options.target, files.format_of(camera, to_format).encode(), overwrite=options.force
+    )
     print(f"written: {options.target}")
     return 0
 

@@ -78,24 +78,9 @@ def compare_run(
 ) -> Comparison:
     """Compare the detected discs, or lines, of a run with reference rows, both from files.
 
-    Parameters
-    ----------
-    run : Path
-        Run folder.
-    kind : {"circles", "lines"}
-    detected, reference : Path, optional
-        Files of rows; by default `detected.circles` and `map.circles` (or `.lines`) of the run.
-    camera : Camera or Path, optional
-        Calibration for discs; by default the run's. Without any, they are compared on the floor.
-    options, unlisted
-        As in `compare_with_file`.
-
-    Raises
-    ------
-    DetectError
-        If there is no such file.
-    CompareError, redetect.landmarks.LandmarkFileError
-        As in `compare_with_file`.
+    By default these are `detected.circles` and `map.circles` (or `.lines`) in the run folder, with
+    its calibration; without any, discs are compared on the floor. Other parameters and errors as of
+    `compare_with_file`, and DetectError if there is no such file.
     """
     reference, detected = reference or run / f"map.{kind}", detected or run / f"detected.{kind}"
     for path, advice in (

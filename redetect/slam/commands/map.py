@@ -13,13 +13,7 @@ import numpy as np
 from camera import write_camera
 from redetect import __version__
 from redetect.bounds import demand_fields
-from redetect.landmarks.map_file import (
-    MAP_NAME,
-    PATH_NAME,
-    covariance_file,
-    write_map,
-    write_path,
-)
+from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping import run_map
@@ -44,10 +38,10 @@ _MOST_FACTOR = 2.5
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
     output = command.output or files.default_output(command.run)
-    joint_name = covariance_file(Path(MAP_NAME)).name
+    joint_name = map_file.covariance_file(Path(map_file.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
-    paths = several if command.more else [PATH_NAME]
-    names = [MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
+    paths = several if command.more else [map_file.PATH_NAME]
+    names = [map_file.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
     names += [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = files.recordings_of(command)
@@ -69,12 +63,12 @@ def perform(command: Map) -> int:
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {__version__}: {name}"]
     final, path = mapped.landmarks_to_write(), mapped.path
-    write_map(output / MAP_NAME, final, head, overwrite=command.force)
+    map_file.write_map(output / map_file.MAP_NAME, final, head, overwrite=command.force)
     if final.joint_covariance is None:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
-        write_path(output / own, path.part(first, end), head, overwrite=command.force)
+        map_file.write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
     results = _results(mapped, check, command)
     files.write_json(output / TABLE_NAME, results, overwrite=command.force)

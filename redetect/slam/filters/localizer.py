@@ -98,32 +98,12 @@ def localize_run(
     camera_xy: ArrayLike = NO_CAMERA,
     names: tuple[str, str] = ("run", "map"),
 ) -> FilterRun:
-    """Localise a run in a map.
+    """Localise a run in a map, with rows paired by their identifiers unless said otherwise.
 
-    Parameters
-    ----------
-    recording : Recording
-    landmark_map : LandmarkMap
-    associator : Associator, optional
-        How rows are paired with landmarks; by default by their identifiers.
-    start : (3,) array_like, or None
-        Pose at the start in the map (m, m, rad); None if it is unknown: it is estimated from the
-        discs of the first frames, whatever their identifiers.
-    start_sigma : (3,) array_like
-        Its standard deviations (m, m, rad).
-    camera_xy : (2,) array_like
-        The camera's centre in the robot frame (m).
-    names : (str, str)
-        Names of the run and of the map in messages.
-
-    Returns
-    -------
-    FilterRun
-
-    Raises
-    ------
-    SlamError
-        If no row shows a landmark of the map, or the place of an unknown start is not certain.
+    Takes the pose at the `start` in the map (m, m, rad) with its standard deviations, both (3,),
+    the camera's centre (2,) in the robot frame (m), and names of run and map for messages. An
+    unknown start, None, is estimated from the discs of the first frames, whatever their
+    identifiers. Raises `SlamError` if that has no certain place, or no row shows a landmark.
     """
     pairing, covariance, found = associator or Associator(), np.diag(np.square(start_sigma)), None
     if start is None:
