@@ -43,7 +43,7 @@ def perform(command: NetworkCommand) -> int:
     for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
         chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
         if chosen:
-            figures = outputs.residual_figures(adjusted, chosen)
+            figures = adjusted.residual_figures(chosen)
             table.append({"camera": name, "board": board, **figures})
     extra = {
         "made_by": outputs.provenance(command.settings),

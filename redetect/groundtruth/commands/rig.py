@@ -40,7 +40,7 @@ def perform(command: RigCommand) -> int:
         for index in range(len(rig.ids))
     ]
     table = [
-        {"marker": marker, **outputs.residual_figures(estimate.adjusted, own)}
+        {"marker": marker, **estimate.adjusted.residual_figures(own)}
         for marker, own in zip(rig.ids, views)
     ]
     pairs = [

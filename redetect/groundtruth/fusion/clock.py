@@ -251,6 +251,43 @@ class PtpdLog:
     drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
 
 
+def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int | None]:
+    """Compare the clocks estimated from headings with ptpd's reports on the robot's clock.
+
+    Returns the number of reports, and of those in determined segments, the rms difference of their
+    offsets from the model's (s), the mean drift of both, and the residual of ptpd's offsets about
+    the best straight line (s). None if undefined.
+    """
+    determined = [segment for segment in model.segments if segment.is_determined]
+    timed = np.isfinite(log.times_s)
+    times, offsets = log.times_s[timed], log.offset_s[timed]
+    groundtruth = times - offsets
+    inside = np.zeros(len(times), dtype=np.bool_)
+    bends = []
+    for segment in determined:
+        here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
+        inside |= here
+        if np.count_nonzero(here) >= 3:
+            t = groundtruth[here] - segment.reference_s
+            line = np.polyfit(t, offsets[here], 1)
+            bends.append(offsets[here] - np.polyval(line, t))
+    expected = model.robot_times(groundtruth[inside]) - groundtruth[inside]
+    difference = offsets[inside] - expected
+    drift = log.drift[np.isfinite(log.drift)]
+    return {
+        "reports": len(log.offset_s),
+        "reports_in_segments": int(np.count_nonzero(inside)),
+        "rms_difference_s": _rms(difference),
+        "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
+        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
+        "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
+    }
+
+
+def _rms(values: Any) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
 def read_ptpd(path: PathLike) -> PtpdLog:
     """Read a log of ptpd.
 

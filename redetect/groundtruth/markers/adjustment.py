@@ -196,6 +196,17 @@ class AdjustedBundle:
         """Cost over degrees of freedom: 1 if the corners' covariances are right."""
         return self.cost / max(1, self.degrees_of_freedom)
 
+    def residual_figures(self, views: Sequence[int]) -> dict[str, float | None]:
+        """Figures of some views: number, outliers, residuals of the others; None without any."""
+        chosen = np.isin(self.bundle.view, views)
+        residuals = self.residuals[chosen & self.used]
+        return {
+            "views": len(views),
+            "left_out": len(np.unique(self.bundle.view[chosen & ~self.used])),
+            "rms_px": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else None,
+            "max_px": float(np.linalg.norm(residuals, axis=1).max()) if len(residuals) else None,
+        }
+
 
 def adjust_bundle(
     bundle: Bundle, *, outlier_sigma: float = 5.0, outlier_px: float = 1.0
