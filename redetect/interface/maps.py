@@ -18,7 +18,7 @@ from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.messages import excerpt, keywords_named, path_of
 from redetect.slam.distances import path_distance
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import Associator, FilterRun
+from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.localizer import localize_run
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import MappedRun, map_run
@@ -169,7 +169,7 @@ class Localization(Poses):
     ----------
     path : redetect.landmarks.map_file.Path2D
         Poses with covariances: the start, and one after each step.
-    result : redetect.slam.filters.frames.FilterRun
+    result : redetect.slam.filters.base.FilterRun
         Details, such as the use of the rows.
     landmarks : redetect.landmarks.map_file.LandmarkMap
         The map.

@@ -12,7 +12,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import Associator, frames_of, run_filter
+from redetect.slam.filters.base import Associator, frames_of, run_filter
 from redetect.slam.filters.localizer import Localizer
 from redetect.slam.models import (
     bearing_jacobians,

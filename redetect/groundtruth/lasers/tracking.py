@@ -44,6 +44,8 @@ _RESIDUALS_S = 0.48
 # lost without a pose in this number of sets at least.
 _VELOCITY_WINDOW_S, _VELOCITY_SETS, _COASTED_SETS = 0.3, 2.01, 2.5
 _LARGEST_CHI2 = 9.0
+# Standard deviation of the start of a fit, by which undetermined directions are held (m).
+_PRIOR_M = 0.02
 # An outline is moved if readings are farther from it on average (m), or more than half of their
 # standard deviation, and at most by this share of its radius.
 _OUTLINE_M, _MOST_MOVED, _TRIMMED, _OUTLINE_ROUNDS = 0.003, 0.25, 0.1, 6
@@ -130,7 +132,7 @@ class Tracker:
             corrections=np.full((scanners, 3), np.nan),
             correction_sigma=np.full((scanners, 3), np.nan), fronts={},
         )  # fmt: skip
-        self.prior_m = np.full(n, 0.02)
+        self.prior_m = np.full(n, _PRIOR_M)
         self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
     def run(self) -> LaserTrack:
@@ -163,7 +165,7 @@ class Tracker:
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
-            self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - determined_s)
+            self.prior_m[i] = _PRIOR_M + 0.5 * self.speed * (t - determined_s)
             try:
                 fitted = self._fit(i, predicted, motion, t - posed_s)
             except GeometryError as reason:
@@ -346,7 +348,7 @@ class Tracker:
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
         start, _ = self._aligned(seen, start)
-        found = refine(seen, start, self.fixed, self.body, self.settings, 0.02)
+        found = refine(seen, start, self.fixed, self.body, self.settings, _PRIOR_M)
         beams = explain_set(self.sets[i], self.fixed, self.body, found.pose)
         wrong = beams.through + beams.hidden + beams.beside
         return float(found.chi2 + self.settings.gate_sigma**2 * wrong)

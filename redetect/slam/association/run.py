@@ -239,7 +239,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         stretches.append(own.stretches(closed.at, length, stride=length, least=least))
     if len(parts) == 1:
         return parts[0]
-    run.report("laying parts on each other")
+    run.report("registering the parts")
     motions, pairs, left = register_maps([part.at.xy for part in parts], stretches)
     if left:
         raise SlamError(

@@ -15,8 +15,8 @@ from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.distances import map_distance, path_distance
 from redetect.slam.errors import SlamError
+from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-from redetect.slam.filters.frames import Associator, FilterRun
 from redetect.slam.filters.localizer import localize_run
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map

@@ -21,7 +21,7 @@ from scipy.linalg import block_diag
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import (
+from redetect.slam.filters.base import (
     POSE_SIZE,
     Associator,
     Filter,

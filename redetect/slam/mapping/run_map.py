@@ -217,11 +217,11 @@ def map_run(
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
-    begin = _in_place(recording, graph, first_sight(graph, start), name)
+    begin = _parts_registered(recording, graph, first_sight(graph, start), name)
     has_lines = len(recording.lines) > 0
     plain_only = not has_lines and wanted == Weighting() and solver == "separable"
     # First odometry and discs, then with lines.
-    minima = [_plain(recording, graph, begin, 1e-10 if plain_only else _COARSE, name)]
+    minima = [_fitted_to_discs(recording, graph, begin, 1e-10 if plain_only else _COARSE, name)]
     estimate = minima[-1].at
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     if has_lines:
@@ -268,7 +268,7 @@ def map_run(
     )
 
 
-def _plain(
+def _fitted_to_discs(
     recording: Recording, graph: Graph, begin: Estimate, tolerance: float, name: str
 ) -> Minimum[Estimate]:
     """Least squares of odometry and discs.
@@ -286,14 +286,14 @@ def _plain(
         return minima[0]
     with suppress(SlamError):
         poses = filtered_poses(recording, begin.poses[0])
-        again = _in_place(recording, graph, first_sight(graph, poses=poses), name)
+        again = _parts_registered(recording, graph, first_sight(graph, poses=poses), name)
         minima.append(solve(graph, again, Weighting(), tolerance=tolerance))
     if not minima:
         raise error
     return min(minima, key=lambda minimum: minimum.costs[-1])
 
 
-def _in_place(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
+def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
     """An initial estimate with the parts between lost steps registered by their common discs.
 
     Each part is mapped separately. The first stays; the next is always the part with most discs in

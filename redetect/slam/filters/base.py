@@ -1,4 +1,4 @@
-"""A recording frame by frame, as input of the filters: innovations, pairing, the loop over a run.
+"""The base of both filters: innovations, pairing of rows with landmarks, the loop over a run.
 
 Rows without identifiers are paired with landmarks of the filter's state, discs and lines
 separately, frame by frame, by `redetect.slam.association.compatibility`.
