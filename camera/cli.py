@@ -13,12 +13,12 @@ PROGRAM = Program(
     "Print boards, calibrate a camera, estimate its pose, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
-        Board: "camera.boards.board",
-        Calibrate: "camera.calibration.command",
-        Floor: "camera.calibration.floor",
+        Board: "camera.commands.board",
+        Calibrate: "camera.commands.calibrate",
+        Floor: "camera.commands.floor",
         # Needs detection, so the command is implemented in `detect`.
         Level: "detect.commands.level",
-        Convert: "camera.formats.command",
+        Convert: "camera.commands.convert",
     },
 )
 

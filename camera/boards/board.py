@@ -1,4 +1,4 @@
-"""``camera board``: calibration boards, their dimensions in metres, and PDF pages at true scale.
+"""Calibration boards, their dimensions in metres, and PDF pages at true scale.
 
 A board's frame: origin in the middle of its points, x right, y up, z out of the print, held so that
 a checkerboard's top left square is black, or a ChArUco board's first marker (as OpenCV prints it)
@@ -19,12 +19,10 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Rectangle
 
-from camera import options
 from camera.errors import CalibrationError
 from camera.options import BoardFlags, BoardKind
 from redetect.array_types import FloatArray
 from redetect.messages import excerpt
-from redetect.storage import demand_place, write_bytes
 
 # Larger values are assumed to be millimetres.
 _LARGEST_SQUARE_M = 10.0
@@ -143,18 +141,6 @@ def charuco_of(board: Board) -> cv2.aruco.CharucoBoard:
         )
     size = board.columns, board.rows
     return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
-
-
-def perform(command: options.Board) -> int:
-    """Execute the command; returns the exit code."""
-    demand_place(command.output, overwrite=command.force)
-    if command.board == "discs":
-        sheet = sheet_of_discs(command.circle_m, command.columns, command.rows)
-    else:
-        sheet = sheet_of_board(board_of(command))
-    write_bytes(command.output, pdf_of(sheet), overwrite=command.force)
-    print(f"written: {command.output}: {sheet.text}; print at 100 %, measure the bar")
-    return 0
 
 
 class Sheet(NamedTuple):

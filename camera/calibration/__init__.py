@@ -2,5 +2,5 @@
 
 `calibrate` computes a camera from points: `start` by homographies, `adjustment` by least squares of
 the `model`, `choice` of the lens's free coefficients, and checks of the result. `floor` estimates
-the camera's pose from known points on the floor; `command` is `camera calibrate`.
+the camera's pose from known points on the floor.
 """

@@ -24,10 +24,11 @@ from camera.calibration.consensus import (
     find_consensus,
     listed,
 )
-from camera.calibration.model import CalibrationSettings, FreeLens, corner_radius
+from camera.calibration.model import COUNT, CalibrationSettings, FreeLens, corner_radius
 from camera.calibration.start import normals_spread_deg
 from camera.errors import CalibrationError, CameraError
-from camera.uncertainty import UNPOSED, projection_sigma, with_intrinsics
+from camera.model import PARAMETERS, Camera
+from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
 
@@ -202,6 +203,21 @@ def calibrate(
         warnings.insert(0, f"{wrong} points excluded: they are far from their expected positions")
     holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
     return Calibration(adjusted, points, names, outliers, lens, holdout, tuple(warnings))
+
+
+def calibrated_camera(calibration: Calibration) -> Camera:
+    """The calibrated camera with the covariance of its lens, without a pose."""
+    size = {"width": calibration.points.width, "height": calibration.points.height}
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    covariance[:COUNT, :COUNT] = calibration.adjusted.covariance
+    try:
+        camera = with_intrinsics(UNPOSED, calibration.intrinsics, **size)
+        return with_covariance(camera, covariance)
+    except CameraError as error:
+        raise CalibrationError(
+            f"the calibration is not a possible camera: {error}; take pictures that cover the "
+            "image's corners, or use fewer --coefficients"
+        ) from None
 
 
 class Aspect(NamedTuple):

@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from camera.calibration.images import quiet_opencv
 from detect.drawing import demand_pictures, picture_name
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of, processed
 from detect.errors import DetectError, FrameError
@@ -28,6 +27,7 @@ from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage
 from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
+from redetect.storage.images import quiet_opencv
 
 Video = Callable[[ByteArray], None]
 

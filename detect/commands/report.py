@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from detect.commands.compare import comparison_of
 from detect.commands.run import perform as detect_run
-from detect.options import All, Compare, Demo, Report, RowFiles
+from detect.comparison.compare import compare_run
+from detect.options import All, Demo, Report, RowFiles
 from detect.report.page import gather, report_page
 from detect.sources.opening import demand_recording, open_source
 from redetect.messages import counted
@@ -44,7 +44,7 @@ def _demo(command: Demo) -> int:
     code = detect_run(All(run=run, output=command.output, force=command.force))
     if code != 0:
         return code
-    result = comparison_of(Compare(run=run, detected=command.output / "detected.circles"))
+    result = compare_run(run, detected=command.output / "detected.circles")
     _report(Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force))
     print("", *result.sentences(), sep="\n")
     return 0

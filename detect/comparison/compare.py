@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from camera import Camera, camera_in, read_camera
 from detect.comparison.result import (
     Comparison,
     DiscComparison,
@@ -31,9 +32,10 @@ from detect.comparison.result import (
     normalised_error,
     quantile,
 )
-from detect.errors import CompareError
+from detect.errors import CompareError, DetectError
 from detect.options import CompareOptions
 from detect.projection import LEAST_GATE_PX, DiscProjection
+from detect.row_files import circle_settings_of
 from detect.sources.image_files import image_name
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
@@ -48,6 +50,7 @@ from redetect.landmarks import (
     read_frames,
     wrap_angle,
 )
+from redetect.landmarks.files import read_head
 from redetect.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
@@ -61,6 +64,41 @@ _WHOLE_PX = 0.01
 FLOOR_GATE_M = 0.10
 # Breaks ties between pairs of lines, so that the result does not depend on the file's order.
 _line_order = attrgetter("alpha", "sigma", "beta", "xtop", "ytop", "xbottom", "ybottom", "ids")
+
+
+def compare_run(
+    run: Path,
+    kind: Kind = "circles",
+    detected: Path | None = None,
+    reference: Path | None = None,
+    *,
+    camera: Camera | Path | None = None,
+    options: CompareOptions | None = None,
+    unlisted: Path | None = None,
+) -> Comparison:
+    """Compare the detected discs, or lines, of a run with reference rows, both from files.
+
+    By default these are `detected.circles` and `map.circles` (or `.lines`) in the run folder, with
+    its calibration; without any, discs are compared on the floor. Other parameters and errors as of
+    `compare_with_file`, and DetectError if there is no such file.
+    """
+    reference, detected = reference or run / f"map.{kind}", detected or run / f"detected.{kind}"
+    for path, advice in (
+        (reference, "give the reference rows with --reference"),
+        (detected, f"`detect {kind}` writes it, or give another with --detected"),
+    ):
+        if not path.exists():
+            raise DetectError(f"{path}: no such landmark file: {advice}")
+    projection = None
+    if kind == "circles":
+        camera = camera_in(run) if camera is None else camera
+        camera = read_camera(camera) if isinstance(camera, Path) else camera
+        settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
+        projection = None if camera is None else DiscProjection(camera, settings, level)
+    rows, names = read_kind(kind, detected), (str(reference), str(detected))
+    return compare_with_file(
+        kind, reference, rows, options, projection=projection, unlisted=unlisted, names=names
+    )
 
 
 def compare_with_file(

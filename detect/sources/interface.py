@@ -22,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, camera_in
-from camera.calibration.images import decoded_image
 from detect.errors import DetectError, FrameError
 from redetect.array_types import GreyImage
 from redetect.landmarks import Step
-from redetect.storage.bounded import MOST_PIXELS, claimed_size, read_bounded
+from redetect.storage.bounded import read_bounded
+from redetect.storage.image_headers import MOST_PIXELS, claimed_size
+from redetect.storage.images import decoded_image
 
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream

@@ -8,7 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from camera import Camera, read_camera
-from camera.calibration.images import IMAGE_SUFFIXES
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import WILDCARDS, ImageFiles
@@ -23,6 +22,7 @@ from detect.sources.poses import (
 )
 from detect.sources.video import LiveCamera, VideoFile
 from redetect.landmarks import LandmarkError, read_steps
+from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 #: Extensions of bags that are a single file.
 _BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})

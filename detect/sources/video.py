@@ -18,10 +18,10 @@ from pathlib import Path
 
 import cv2
 
-from camera.calibration.images import opened_video, quiet_opencv
 from detect.errors import DetectError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from redetect.interrupts import interrupts_call
+from redetect.storage.images import opened_video, quiet_opencv
 
 _log = logging.getLogger("redetect")
 

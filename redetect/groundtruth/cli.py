@@ -6,7 +6,7 @@ Exit codes: 0 success; 1 the command failed, or gave no pose; 2 wrong command li
 from __future__ import annotations
 
 from redetect.command_line import Program
-from redetect.groundtruth.commands.options import COMMANDS
+from redetect.groundtruth.options import COMMANDS
 
 PROGRAM = Program(
     "groundtruth",

@@ -16,16 +16,21 @@ from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.messages import excerpt, keywords_named, path_of
-from redetect.slam.commands.files import MAP_NAME, PATH_NAME, read_runs
-from redetect.slam.commands.filters import localized_run_of, path_distance
-from redetect.slam.commands.map import mapped_run_of
+from redetect.slam.distances import path_distance
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import FilterRun
-from redetect.slam.mapping.run_map import MappedRun
+from redetect.slam.filters.base import Associator, FilterRun
+from redetect.slam.filters.localizer import localize_run
+from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import joined
+from redetect.slam.recording import (
+    camera_of_run,
+    camera_xy_of,
+    joined,
+    read_runs,
+)
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
@@ -143,8 +148,10 @@ class RunMap(Table):
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        map_file.write_map(place / MAP_NAME, self.result.landmarks_to_write(), overwrite=overwrite)
-        map_file.write_path(place / PATH_NAME, self.path, overwrite=overwrite)
+        map_file.write_map(
+            place / map_file.MAP_NAME, self.result.landmarks_to_write(), overwrite=overwrite
+        )
+        map_file.write_path(place / map_file.PATH_NAME, self.path, overwrite=overwrite)
 
     def joint_covariance(self) -> Any:
         """(2 M, 2 M) covariance of all positions, discs first (m^2)."""
@@ -162,7 +169,7 @@ class Localization(Poses):
     ----------
     path : redetect.landmarks.map_file.Path2D
         Poses with covariances: the start, and one after each step.
-    result : redetect.slam.filters.frames.FilterRun
+    result : redetect.slam.filters.base.FilterRun
         Details, such as the use of the rows.
     landmarks : redetect.landmarks.map_file.LandmarkMap
         The map.
@@ -209,7 +216,16 @@ def map_landmarks(
     command = _checked(
         Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
     )
-    mapped = mapped_run_of(command, joined(read_runs(command)))
+    recording = joined(read_runs(command))
+    needs_camera = command.calibrate or len(recording.lines) > 0
+    mapped = map_run(
+        recording,
+        camera_of_run(command.run, command.camera) if needs_camera else None,
+        Weighting.of(command),
+        start=command.start,
+        solver=command.solver,
+        name=", ".join(map(str, command.runs)),
+    )
     return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
 
@@ -251,7 +267,16 @@ def localize(
         places = landmarks.result.landmarks_jointly()
     else:
         places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
-    result = localized_run_of(command, joined(read_runs(command)), places)
+    recording = joined(read_runs(command))
+    result = localize_run(
+        recording,
+        places,
+        Associator(command.association, command.gate_probability),
+        start=command.known_start,
+        start_sigma=command.start_sigma,
+        camera_xy=camera_xy_of(recording, command.run, command.camera),
+        names=(str(command.run), str(command.map)),
+    )
     return Localization(result.path, result, places)
 
 

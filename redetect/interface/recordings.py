@@ -9,11 +9,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, overload
 
-from detect.commands.compare import comparison_of
-from detect.comparison.compare import compare_with_file
+from detect.comparison.compare import compare_run, compare_with_file
 from detect.comparison.result import Comparison, Kind
 from detect.errors import DetectError
-from detect.options import Compare, CompareOptions, SourceOptions
+from detect.options import CompareOptions, SourceOptions
 from detect.projection import DiscProjection
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
@@ -164,23 +163,23 @@ def compare(
     detect.errors.CompareError
         If an image has two frames, or no image is in both.
     """
-    options, run = options or CompareOptions(), path_of(run, "a run folder", DetectError)
+    run = path_of(run, "a run folder", DetectError)
+    kind: Kind = "lines" if lines else "circles"
+    seen_by = None if camera is None else camera_of(camera)
     in_file = None if reference is None else Path(reference)
     if detected is None or isinstance(detected, str | os.PathLike):
         path = None if detected is None else Path(detected)
-        command = Compare(run, lines=lines, reference=in_file, detected=path, matching=options)
-        return comparison_of(command, None if camera is None else camera_of(camera))
+        return compare_run(run, kind, path, in_file, camera=seen_by, options=options)
     found = list(detected) if isinstance(detected, Iterable) else [detected]
     for one in found:
         if not isinstance(one, Detection):
             raise DetectError(f"{excerpt(one)}: expected a Detection, or the name of a file")
-    kind: Kind = "lines" if lines else "circles"
     in_file = in_file or run / f"map.{kind}"
     if not found or not in_file.is_file():
         raise DetectError(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
-    seen_by = found[0].camera if camera is None else camera_of(camera)
+    seen_by = seen_by or found[0].camera
     projection = DiscProjection(seen_by, found[0].settings, read_head(in_file).level)
     frames, names = [one.frame for one in found], (str(in_file), "detections")
     return compare_with_file(kind, in_file, frames, options, projection=projection, names=names)

@@ -22,6 +22,9 @@ from redetect.storage.bounded import FilePath, read_bounded, read_plain_array
 
 N = TypeVar("N", int, float)
 
+#: Names of the files of a map and of a path in a folder of results.
+MAP_NAME, PATH_NAME = "map.csv", "path.csv"
+
 MAP_COLUMNS = ("kind", "id", "x_m", "y_m", "cxx_m2", "cxy_m2", "cyy_m2", "rows")
 #: Columns of a map of discs with exact positions.
 SHORT_MAP_COLUMNS = ("id", "x_m", "y_m", "rows")

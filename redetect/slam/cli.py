@@ -18,7 +18,7 @@ PROGRAM = Program(
         Localize: "redetect.slam.commands.filters",
         Ekf: "redetect.slam.commands.filters",
         Associate: "redetect.slam.commands.associate",
-        Noise: "redetect.slam.noise",
+        Noise: "redetect.slam.commands.noise",
         Export: "redetect.slam.commands.export",
         Import: "redetect.slam.commands.export",
     },

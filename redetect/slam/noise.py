@@ -1,29 +1,16 @@
-"""``slam noise``: adds white Gaussian noise to a run's rows and their covariances."""
+"""White Gaussian noise on a run's rows, with their covariances raised to match."""
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from redetect import landmarks
-from redetect.slam.options import Noise
-from redetect.slam.recording import Recording, landmark_files
+from redetect.slam.recording import Recording
 from redetect.slam.settings import AddedNoise
-
-
-def perform(options: Noise) -> int:
-    """Execute the command; returns the exit code."""
-    noise, lines = options.noise, options.lines
-    (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
-    target = options.output or source.with_name(f"noisy{source.suffix}")
-    rows = noisy_rows(landmarks.read_rows(source), noise)
-    landmarks.write_rows(target, rows, overwrite=options.force)
-    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
-    return 0
 
 
 def noisy_rows(rows: Iterable[landmarks.Row], noise: AddedNoise) -> Iterator[landmarks.Row]:

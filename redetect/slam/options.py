@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from redetect.bounds import MaybePath, MaybeStr
+from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
-from redetect.slam.settings import AddedNoise, AssociateSettings
+from redetect.slam.settings import AddedNoise, AssociateSettings, Place, PlaceSigma
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +33,11 @@ class RunFlags:
     def runs(self) -> tuple[Path, ...]:
         """All runs that are named."""
         return (self.run,)
+
+    @property
+    def rows(self) -> dict[str, Any]:
+        """Which rows are read, as `redetect.slam.recording.landmark_files` has it."""
+        return {"circles": self.circles or not self.lines, "lines": self.lines, "stem": self.stem}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +76,7 @@ class Map(RunsFlags):
     # Robust loss: `huber`, `cauchy` or `geman-mcclure` reduces the weight of outliers.
     loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
     loss_scale: float = 3.0  # Scale of the robust loss, standard deviations.
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
+    start: Place = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     # Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
     # pictures; by default `slam` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
@@ -106,7 +112,7 @@ class FilterFlags(RunFlags):
     association: Literal["known", "nearest", "joint"] = "known"
     # Share of correct rows that pass the gate; not used with known association.
     gate_probability: float = 0.999
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
+    start: Place = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     reference: MaybePath = None  # A path.csv to measure the distance from.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     interactive: bool = False  # Also show the pictures in windows.
@@ -121,12 +127,21 @@ class Localize(FilterFlags):
 
     map: Path  # The map (written by `slam map`).
     # Standard deviations of the pose at the start.
-    start_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_sigma: PlaceSigma = (0.0, 0.0, 0.0)
     # The pose at the start is unknown: it is estimated from the discs of the first frames, whatever
     # their identifiers (global localisation). Needs `--association joint` without identifiers.
     lost: bool = False
     # Folder for path.csv, localize.json and pictures; by default `slam/localize` in the run folder.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
+
+    @property
+    def known_start(self) -> Place | None:
+        """The pose at the start; None if it is unknown."""
+        if not self.lost:
+            return self.start
+        if any(self.start) or any(self.start_sigma):
+            raise SlamError("--lost and --start: expected one of them")
+        return None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""A run's odometry and landmark rows as arrays, checked for values that estimators cannot use."""
+"""A run: its odometry and landmark rows as arrays, checked for estimators, and its calibration."""
 
 from __future__ import annotations
 
@@ -9,14 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
+from camera import Camera, camera_in, read_camera
 from redetect import landmarks
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.files import read_head
 from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise, common_tilt_jacobian
+from redetect.slam.options import RunFlags
+from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 UNKNOWN_ID = -1
+
+#: Origin of bearings where there are none: the robot's.
+NO_CAMERA = np.zeros(2)
 
 #: The noise of odometry without covariances.
 ASSUMED = OdometryNoise()
@@ -28,7 +34,7 @@ MOST_STEP_SIGMA_RAD = float(np.pi)
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
 #: Suffixes of images.
-PICTURES = {".bmp", ".gif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff"}
+PICTURES = {*IMAGE_SUFFIXES, ".gif"}
 # Share of the variance of discs' tilts that is assumed to be common to all frames.
 _COMMON_SHARE = 0.5
 # Indices of the covariance's numbers in a STEP row.
@@ -216,6 +222,31 @@ def _demand_landmarks(path: Path) -> None:
         raise SlamError(f"{path}: is a calibration: {expected}; calibrations are named by --camera")
 
 
+def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
+    """Read the calibration that belongs to a run, a folder or a file in one.
+
+    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
+    there is none, `camera.CameraError` if it is ambiguous.
+    """
+    if camera is not None:
+        return camera if isinstance(camera, Camera) else read_camera(camera)
+    folder = run if run.is_dir() else run.parent
+    found = camera_in(folder)
+    if found is None:
+        raise SlamError(
+            f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
+            "calibrate` makes one, `camera convert` converts one of another program"
+        )
+    return found
+
+
+def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
+    """(2,) the camera's centre in the robot frame (m); zero if no line needs it."""
+    if not len(recording.lines):
+        return NO_CAMERA
+    return np.array(camera_of_run(run, camera).centre[:2])
+
+
 def read_recording(
     run: str | os.PathLike[str],
     *,
@@ -253,6 +284,12 @@ def read_recording(
     if not files[0].is_file():  # a pipe cannot be read twice
         return found
     return replace(found, tilted=read_head(files[0]).covers_tilt)
+
+
+def read_runs(flags: RunFlags) -> list[Recording]:
+    """Read the rows of the runs that flags name."""
+    noise = flags.odometry_noise
+    return [read_recording(run, noise=noise, **flags.rows) for run in flags.runs]
 
 
 def recording_of_frames(

@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 from redetect.bounds import PROBABILITY, Bounded, NotNegative, Positive, from_to, whole
 from redetect.slam.errors import SlamError
 
-#: Bounds of positions given by flags (m, rad) and of their standard deviations.
-PLACE, PLACE_SIGMA = from_to(-1e12, 1e12), from_to(0.0, 1e12)
+#: A pose given by flags (m, m, rad), and its standard deviations.
+Place = Annotated[tuple[float, float, float], from_to(-1e12, 1e12)]
+PlaceSigma = Annotated[tuple[float, float, float], from_to(0.0, 1e12)]
 Method = Literal["nearest", "joint"]
 
 

@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from camera import Camera
+from camera import Camera, CameraError
 from camera.boards.board import Board
-from camera.calibration.images import calibration_images, read_grey
+from camera.calibration.images import calibration_images
 from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
-from redetect.storage.bounded import without_orientation
+from redetect.storage.image_headers import without_orientation
+from redetect.storage.images import read_grey
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6
@@ -42,7 +43,7 @@ def test_how_a_telephone_was_held_turns_no_picture(tmp_path: Path, orientation: 
     assert upright is not None
     assert turned is not None
     assert not np.array_equal(turned, upright)  # what OpenCV does unless told
-    np.testing.assert_array_equal(read_grey(path), upright)
+    np.testing.assert_array_equal(read_grey(path, CameraError), upright)
     np.testing.assert_array_equal(decode_gray(path.read_bytes(), path), upright)
 
 
@@ -76,7 +77,7 @@ def test_nor_does_what_a_tiff_says_of_it(
     path.write_bytes(held_tiff(picture, orientation, order))
     np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, (32, 24)), grey)
     if not deep:  # those are brought to the full range
-        np.testing.assert_array_equal(read_grey(path), grey)
+        np.testing.assert_array_equal(read_grey(path, CameraError), grey)
 
 
 def test_damaged_words_of_a_tiff_stay() -> None:

@@ -10,7 +10,8 @@ import pytest
 from camera import Camera
 from camera.boards.board import Board
 from camera.calibration.adjustment import Estimate, Points, circle_shifts
-from camera.calibration.floor import describe_pose, on_floor, place_on_floor
+from camera.calibration.floor import on_floor, place_on_floor
+from camera.commands.floor import describe_pose
 from camera.errors import CalibrationError
 from camera.uncertainty import intrinsics_of
 

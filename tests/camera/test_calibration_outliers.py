@@ -14,11 +14,17 @@ from scipy.stats import chi2
 
 from camera import Camera, read_camera
 from camera.calibration.adjustment import Estimate, fit_points
-from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
-from camera.calibration.command import camera_of, describe
+from camera.calibration.calibrate import (
+    BoardView,
+    Calibration,
+    calibrate,
+    calibrated_camera,
+    points_of,
+)
 from camera.calibration.consensus import demand_different_views
 from camera.calibration.model import CalibrationSettings
 from camera.cli import main
+from camera.commands.calibrate import describe
 from camera.errors import CalibrationError
 from camera.rotations import rotation_of
 from camera.uncertainty import UNPOSED, covariance_of, intrinsics_of
@@ -114,7 +120,7 @@ def test_a_picture_without_a_residual_is_reported() -> None:
         found = calibrate(views, BOARD, (640, 480), settings)
         assert found.outliers == (("04.png", np.inf),)
         assert_true(found)
-    assert "excluded: 04.png, where no pose" in describe(found, camera_of(found))
+    assert "excluded: 04.png, where no pose" in describe(found, calibrated_camera(found))
 
 
 def test_pictures_that_contradict_each_other_are_named() -> None:

@@ -12,8 +12,8 @@ import pytest
 from camera import Camera
 from camera.cli import main
 from camera.errors import ConversionError
-from camera.formats.command import convert, format_of, format_of_text, parse
 from camera.formats.conversion import convert_to_camera
+from camera.formats.files import convert, format_of, format_of_text, parse
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import format_kalibr, format_ros, parse_kalibr, parse_ros
 from camera.options import Convert, Format

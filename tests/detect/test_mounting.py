@@ -18,9 +18,9 @@ from camera.cli import main
 from camera.model import PARAMETERS
 from camera.model_checks import checked_pose
 from camera.uncertainty import covariance_of, with_covariance
-from detect.commands.level import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.levelling import common_covariance
 from detect.projection import image_positions, level_positions
+from detect.run_mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import FrameTilts
 from detect.settings import LEAST_FRAMES
 from redetect.storage import OutputExistsError

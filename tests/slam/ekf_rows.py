@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
-from redetect.slam.filters.frames import FrameRows
+from redetect.slam.filters.base import FrameRows
 from redetect.slam.filters.localizer import Localizer
 from redetect.slam.recording import CircleRows, LineRows
 

@@ -8,8 +8,8 @@ from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
+from redetect.slam.filters.base import Associator, FrameRows
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-from redetect.slam.filters.frames import Associator, FrameRows
 from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,

@@ -18,9 +18,10 @@ from redetect.landmarks.map_file import (
     read_path,
 )
 from redetect.slam.cli import main
-from redetect.slam.commands.filters import lost_lines, map_distance, path_distance
+from redetect.slam.commands.filters import lost_lines
+from redetect.slam.distances import map_distance, path_distance
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import FilterRun, RowCount
+from redetect.slam.filters.base import FilterRun, RowCount
 from redetect.slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import circle_rows
 

@@ -12,7 +12,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import Associator, frames_of, run_filter
+from redetect.slam.filters.base import Associator, frames_of, run_filter
 from redetect.slam.filters.localizer import Localizer
 from redetect.slam.models import (
     bearing_jacobians,
@@ -274,8 +274,8 @@ def test_the_demo_run_is_near_its_truth(project_root: Path) -> None:
     import json
 
     from redetect.plane import between
-    from redetect.slam.commands.files import camera_xy_of
     from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+    from redetect.slam.recording import camera_xy_of
 
     run_folder = project_root / "images" / "e"
     recording = read_recording(run_folder, circles=True, lines=True)

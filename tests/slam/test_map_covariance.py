@@ -19,7 +19,6 @@ from redetect.landmarks.map_file import (
     write_map,
 )
 from redetect.plane import chain_steps
-from redetect.slam.commands.files import camera_of_run
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.mapping.solve import equations_at, joint_covariance
@@ -27,6 +26,7 @@ from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import (
     LineRows,
     Recording,
+    camera_of_run,
     frames_of_discs,
     read_recording,
 )

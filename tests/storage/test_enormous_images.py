@@ -12,12 +12,12 @@ import pytest
 
 from camera import Camera, CameraError
 from camera.boards.board import Board
-from camera.calibration.images import read_grey
 from detect.errors import FrameError
 from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
-from redetect.storage.bounded import MOST_PIXELS, claimed_size
+from redetect.storage.image_headers import MOST_PIXELS, claimed_size
+from redetect.storage.images import read_grey
 from tests.detect.runs.claimed_images import SIDE, jpeg, png
 
 
@@ -31,7 +31,7 @@ def test_pictures_for_calibrations_and_of_boards(
         f"{path}: cannot be decoded: claims {SIDE}x{SIDE} px: expected at most {MOST_PIXELS} pixels"
     )
     with pytest.raises(CameraError, match=said):
-        read_grey(path)
+        read_grey(path, CameraError)
     board = Board("checkerboard", 5, 4, 0.1)
     with pytest.raises(GroundTruthError, match=said):
         find_boards(BoardImage("a", "b", 0, path), board, published_camera)
@@ -51,7 +51,7 @@ def test_chunks_of_a_png_that_claim_gigabytes(tmp_path: Path, chunk: bytes, deep
     path = tmp_path / "a.png"
     path.write_bytes(content)
     with pytest.raises(CameraError, match="cannot be decoded: expected an image"):
-        read_grey(path)
+        read_grey(path, CameraError)
     with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
         decode_gray(bytes(content), path, (8, 8))
 
@@ -60,9 +60,9 @@ def test_pictures_of_other_kinds_of_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.tiff"
     assert cv2.imwrite(str(path), np.full((8, 8), 0.5, np.float32))
     with pytest.raises(CameraError, match="holds float32: expected images of 8 or 16 bits"):
-        read_grey(path)
+        read_grey(path, CameraError)
     path.write_bytes(b"")
     with pytest.raises(CameraError, match="cannot be decoded: expected an image"):
-        read_grey(path)
+        read_grey(path, CameraError)
     with pytest.raises(CameraError, match="Is a directory"):
-        read_grey(tmp_path)
+        read_grey(tmp_path, CameraError)

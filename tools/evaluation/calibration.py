@@ -17,11 +17,11 @@ from camera.boards.points import circle_centroids, find_board
 from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
 from camera.calibration.choice import holdout_error
-from camera.calibration.images import read_grey
 from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from camera.uncertainty import intrinsics_of, projection_sigma, with_intrinsics
 from redetect.array_types import FloatArray, IntArray
+from redetect.storage.images import read_grey
 from tools.evaluation.boards import board_poses, projection_difference, rays_of, render_board
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
@@ -110,7 +110,7 @@ def read_group(
         discs = [d for d in truth["discs"] if d["how"] == "measured" and d["visible"]][::every]
         uv = np.array([[d["u"], d["v"]] for d in discs])
         xy = np.array([[d["px"], d["py"], 0.0] for d in discs])
-        image = read_grey(next((path.parent / "images").iterdir()))
+        image = read_grey(next((path.parent / "images").iterdir()), CalibrationError)
         size = (image.shape[1], image.shape[0])
         dark = image if truth["polarity"] == "dark" else 255 - image
         # The truth only says where to search; the points are measured in the image.

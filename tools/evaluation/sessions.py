@@ -20,10 +20,8 @@ from redetect.groundtruth.fusion.clock import ClockSegment, read_clock
 from redetect.groundtruth.lasers.acquisition import load_session
 from redetect.groundtruth.lasers.scanners import Scanner, read_scanners
 from redetect.groundtruth.lasers.tracking import (
-    OK,
-    REACQUIRED,
-    UNDETERMINED,
     LaserTrack,
+    SetStatus,
     combined_poses,
     track_by_lasers,
     track_without_suspects,
@@ -139,7 +137,8 @@ def errors_in_room(session: Path, track: LaserTrack, sets_per_pose: int) -> dict
     poses = combined_poses(track, sets_per_pose)
     poses = poses.only(inside(poses.times_s))
     wanted = inside(track.times_s)
-    with_pose = wanted & np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
+    undetermined = track.status == SetStatus.UNDETERMINED_DIRECTION
+    with_pose = wanted & (track.is_determined | undetermined)
     score = score_poses(*matched_streams(poses, read_planar_poses(session / "truth.csv")))
     return {
         "found": float(with_pose.sum() / wanted.sum()),
@@ -261,7 +260,7 @@ def _seen_by(laser: PlanarPoses, times_s: FloatArray) -> BoolArray:
 def _clock_errors(session: Path, segments: list[ClockSegment]) -> dict[str, float]:
     """Largest errors of offset (ms) and rate (ppm) over the segments with turns."""
     pieces = json.loads((session / "truth.json").read_text())["clock"]["pieces"]
-    turning = [segment for segment in segments if segment.status != "no turns"]
+    turning = [segment for segment in segments if segment.is_determined]
     offsets, rates = [], []
     for segment in turning:
         begun = [p for p in pieces if p["from_s"] is None or p["from_s"] <= segment.reference_s]

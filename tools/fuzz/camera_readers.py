@@ -9,7 +9,7 @@ from pathlib import Path
 from camera import CameraError, format_camera, parse_camera, read_camera
 from camera.calibration.floor import read_floor_points
 from camera.formats.colmap import format_colmap, parse_colmap
-from camera.formats.command import format_of_text, read_text
+from camera.formats.files import format_of_text, read_text
 from camera.formats.models import ForeignCamera
 from camera.formats.yaml_files import (
     format_kalibr,

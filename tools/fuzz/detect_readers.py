@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from camera import CameraError, parse_camera
-from camera.calibration.images import read_grey
 from detect.errors import DetectError, FrameError
 from detect.row_files import circle_settings_of
 from detect.runs.stream import Journal
@@ -26,7 +25,8 @@ from lut.cache import cached_vertical_table
 from redetect.array_types import ByteArray
 from redetect.landmarks import LandmarkError
 from redetect.landmarks.files import read_head
-from redetect.storage.bounded import claimed_size
+from redetect.storage.image_headers import claimed_size
+from redetect.storage.images import read_grey
 from redetect.storage.parts import left_part
 from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader, npz
 
@@ -64,7 +64,7 @@ def _image(path: Path) -> object:
 def _calibration_image(path: Path) -> object:
     size = claimed_size(path.read_bytes()) if path.is_file() else None
     small = size is None or size[0] * size[1] <= _MOST_PIXELS
-    return read_grey(path) if small else None
+    return read_grey(path, CameraError) if small else None
 
 
 def steps_of(poses: Iterable[TimedPose]) -> object:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from redetect.groundtruth.commands.options import Fuse
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion import stream_errors
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
+from redetect.groundtruth.options import Fuse
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     read_planar_poses,

@@ -8,7 +8,6 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.bounds import demand, whole
-from redetect.groundtruth.commands.options import Laser
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
@@ -16,7 +15,9 @@ from redetect.groundtruth.fusion.stream_errors import COMMON
 from redetect.groundtruth.lasers import tracking
 from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
+from redetect.groundtruth.lasers.tracking import SetStatus
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
+from redetect.groundtruth.options import Laser
 from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.json_text import json_text
 from redetect.storage import write_bytes
@@ -60,12 +61,11 @@ def perform(options: Laser) -> int:
     content = {**provenance(settings, files), "sets_per_pose": average, **described}
     write_json(summary, content, overwrite=options.force)
 
-    expected = int(np.sum(track.status != tracking.LOST))
-    determined = int(np.isin(track.status, (tracking.OK, tracking.REACQUIRED)).sum())
-    coasted = int((track.status == tracking.COASTING).sum())
     print(
-        f"{len(sets)} sets of scans, {len(track.fronts)} visits, {expected} sets with the robot: "
-        f"{len(poses)} poses, {determined} of them determined in all directions; {coasted} without"
+        f"{len(sets)} sets of scans, {len(track.fronts)} visits, "
+        f"{np.sum(track.status != SetStatus.LOST)} sets with the robot: {len(poses)} poses, "
+        f"{np.sum(track.is_determined)} of them determined in all directions; "
+        f"{np.sum(track.status == SetStatus.COASTING)} without"
     )
     if track.outline_moved_m:
         warn(
@@ -79,11 +79,11 @@ def perform(options: Laser) -> int:
             f"{1e3 * track.outline_sigma_m:.0f} mm each: so are all poses, and their covariances "
             "include it"
         )
-    share = seen_through(track)
-    if share > _MOST_SEEN_THROUGH:
+    if track.seen_through > _MOST_SEEN_THROUGH:
         warn(
-            f"{100.0 * share:.0f} % of the beams that should meet the robot see what is "
-            "behind it: the outline in robot.json is too large, or the pose of a scanner is wrong"
+            f"{100.0 * track.seen_through:.0f} % of the beams that should meet the robot see "
+            "what is behind it: the outline in robot.json is too large, or the pose of a scanner "
+            "is wrong"
         )
     for segment in described["segments"]:
         print(f"  {segment['from_s']:.2f} to {segment['to_s']:.2f} s: front: {segment['front']}")
@@ -113,33 +113,23 @@ def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) ->
         )
 
 
-def seen_through(track: tracking.LaserTrack) -> float:
-    """Share of the beams that should meet the robot, but see the background behind it."""
-    totals = np.sum(track.beams[np.isin(track.status, (tracking.OK, tracking.REACQUIRED))], axis=0)
-    counts = BeamCounts(*np.asarray(totals, dtype=np.int64).reshape(-1).tolist())
-    return counts.through / max(counts.expected, 1)
-
-
 def set_lines(track: tracking.LaserTrack) -> list[str]:
     """A line of JSON for every set of scans."""
     lines = []
-    for i, status in enumerate(track.status.tolist()):
-        line: dict[str, Any] = {
-            "t": round(float(track.times_s[i]), 6),
-            "status": tracking.STATUS[status],
-        }
-        if status != tracking.LOST:
+    for i, status in enumerate(map(SetStatus, track.status.tolist())):
+        line: dict[str, Any] = {"t": round(float(track.times_s[i]), 6), "status": status.words}
+        if status != SetStatus.LOST:
             line["visit"] = int(track.segment[i])
-        if status not in (tracking.LOST, tracking.COASTING):
+        if status not in (SetStatus.LOST, SetStatus.COASTING):
             beams = {name: int(n) for name, n in zip(BeamCounts._fields, track.beams[i])}
             line["readings"] = int(track.readings[i])
             line["rms_m"] = round(float(track.rms_m[i]), 5)
             line["chi2_per_freedom"] = round(float(track.chi2[i]), 3)
             line["beams"] = beams
             line["disturbed"] = beams["hidden"] + beams["beside"] >= _DISTURBED
-        if status == tracking.UNDETERMINED:
+        if status == SetStatus.UNDETERMINED_DIRECTION:
             line["direction"] = [round(float(v), 4) for v in track.weak[i]]
-        if i in track.reasons and status == tracking.COASTING:
+        if i in track.reasons and status == SetStatus.COASTING:
             line["reason"] = track.reasons[i]
         lines.append(json_text(line, indent=None))
     return lines
@@ -162,11 +152,10 @@ def describe(
         shift, sigma = (values.tolist() for values in left_out.get(scanner.name, found))
         entry = {"name": scanner.name, "correction": shift, "sigma": sigma}
         entries.append({**entry, "suspect": bool(out or excess[k] > 1.0), "left_out": out})
-    good = np.isin(track.status, (tracking.OK, tracking.REACQUIRED))
-    shared = (track.covariances - track.noise)[good]
-    counts = np.bincount(track.status, minlength=len(tracking.STATUS)).tolist()
+    shared = (track.covariances - track.noise)[track.is_determined]
+    counts = np.bincount(track.status, minlength=len(SetStatus)).tolist()
     return {
-        "sets": {status: count for status, count in zip(tracking.STATUS, counts) if count},
+        "sets": {status.words: count for status, count in zip(SetStatus, counts) if count},
         "outline_moved_m": track.outline_moved_m,
         "outline_sigma_m": track.outline_sigma_m,
         "segments": segments,

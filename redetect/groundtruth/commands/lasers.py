@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.lasers import scanners
 from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.walls import still_scan
+from redetect.groundtruth.options import Lasers
 from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.storage import write_bytes

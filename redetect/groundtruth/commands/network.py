@@ -8,11 +8,11 @@ from itertools import product
 from pathlib import Path
 
 from redetect.groundtruth.commands import outputs
-from redetect.groundtruth.commands.options import Network as NetworkCommand
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
 from redetect.groundtruth.markers.network_estimation import estimate_network
 from redetect.groundtruth.markers.session import Network, write_network
+from redetect.groundtruth.options import Network as NetworkCommand
 
 
 def perform(command: NetworkCommand) -> int:
@@ -43,7 +43,7 @@ def perform(command: NetworkCommand) -> int:
     for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
         chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
         if chosen:
-            figures = outputs.residual_figures(adjusted, chosen)
+            figures = adjusted.residual_figures(chosen)
             table.append({"camera": name, "board": board, **figures})
     extra = {
         "made_by": outputs.provenance(command.settings),

@@ -57,18 +57,6 @@ def progress(items: Sequence[T], label: str) -> Iterable[T]:
     return track(items, label, console=Console(stderr=True))
 
 
-def residual_figures(adjusted: Any, views: Sequence[int]) -> dict[str, Any]:
-    """Figures of some of a bundle's views: number, outliers, residuals of the others."""
-    chosen = np.isin(adjusted.bundle.view, views)
-    residuals = adjusted.residuals[chosen & adjusted.used]
-    return {
-        "views": len(views),
-        "left_out": len(np.unique(adjusted.bundle.view[chosen & ~adjusted.used])),
-        "rms_px": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else None,
-        "max_px": float(np.linalg.norm(residuals, axis=1).max()) if len(residuals) else None,
-    }
-
-
 def print_table(rows: Sequence[dict[str, Any]]) -> None:
     """Print rows with the same keys in columns."""
     words = [list(rows[0])] + [

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.options import Poses
 from redetect.groundtruth.commands.outputs import check_outputs, progress, provenance, warn
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers import session
-from redetect.groundtruth.markers.track import Track, report_entry, track_by_markers
+from redetect.groundtruth.markers.track import PoseStatus, Track, report_entry, track_by_markers
+from redetect.groundtruth.options import Poses
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.json_text import json_text
 from redetect.storage import write_bytes
@@ -88,7 +88,7 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
             for view, good in zip(tracked.views, tracked.estimate.views):
                 seen[view.marker.id] += 1
                 left_out[view.marker.id] += not good
-    total, failed = left_out.total(), track.counts["failed"]
+    total, failed = left_out.total(), track.counts[PoseStatus.FAILED]
     if total:
         print(f"{total} markers disagree with the others at their time: ignored")
     if total <= _MANY_LEFT_OUT * seen.total() and failed <= _MANY_LEFT_OUT * len(track.times):

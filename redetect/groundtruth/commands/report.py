@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from redetect import __version__
-from redetect.groundtruth.commands.options import Report
 from redetect.groundtruth.commands.outputs import check_outputs, warn
+from redetect.groundtruth.options import Report
 from redetect.groundtruth.report.inputs import gather
 from redetect.groundtruth.report.page import report_page
 from redetect.storage import write_bytes

@@ -9,10 +9,10 @@ import numpy as np
 from camera import camera_file_in, read_camera
 from redetect.bounds import ABOVE_0, demand
 from redetect.groundtruth.commands import outputs
-from redetect.groundtruth.commands.options import Rig as RigCommand
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.rig_estimation import estimate_rig
+from redetect.groundtruth.options import Rig as RigCommand
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.storage import write_bytes
 
@@ -40,7 +40,7 @@ def perform(command: RigCommand) -> int:
         for index in range(len(rig.ids))
     ]
     table = [
-        {"marker": marker, **outputs.residual_figures(estimate.adjusted, own)}
+        {"marker": marker, **estimate.adjusted.residual_figures(own)}
         for marker, own in zip(rig.ids, views)
     ]
     pairs = [

@@ -6,9 +6,9 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from redetect.groundtruth.commands.options import Score
 from redetect.groundtruth.commands.outputs import check_outputs
 from redetect.groundtruth.files import write_json
+from redetect.groundtruth.options import Score
 from redetect.groundtruth.trajectories.streams import (
     matched_streams,
     moved_poses,

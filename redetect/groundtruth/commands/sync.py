@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
-from redetect.groundtruth.commands.options import Sync
 from redetect.groundtruth.commands.outputs import check_outputs, provenance
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, PtpdLog, read_ptpd
+from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, compare_with_ptpd, read_ptpd
 from redetect.groundtruth.fusion.sync import synchronise
+from redetect.groundtruth.options import Sync
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 
 _CONFIDENCE = 1.959964
@@ -24,10 +22,9 @@ def perform(options: Sync) -> int:
     truth = read_planar_poses(options.groundtruth)
     log = None if options.ptpd is None else read_ptpd(options.ptpd)
     segments = synchronise(odometry, truth, options.settings)
-    determined = [segment for segment in segments if segment.status != "no turns"]
     for segment in segments:
         print(_line(segment))
-    if not determined:
+    if not any(segment.is_determined for segment in segments):
         print("no segment could be synchronised: no clock file is written")
         return 1
     model = ClockModel(segments)
@@ -36,7 +33,7 @@ def perform(options: Sync) -> int:
         "segments": segments,
     }
     if log is not None:
-        document["ptpd"] = compare_with_ptpd(model, determined, log)
+        document["ptpd"] = compare_with_ptpd(model, log)
         rms, inside = (document["ptpd"][k] for k in ("rms_difference_s", "reports_in_segments"))
         print(
             f"ptpd: {len(log.offset_s)} reports, {inside} compared, "
@@ -46,47 +43,9 @@ def perform(options: Sync) -> int:
     return 0
 
 
-def compare_with_ptpd(
-    model: ClockModel, determined: list[ClockSegment], log: PtpdLog
-) -> dict[str, float | int | None]:
-    """Compare the clocks estimated from headings with ptpd's reports on the robot's clock.
-
-    Returns the number of reports, and of those in determined segments, the rms difference of their
-    offsets from the model's (s), the mean drift of both, and the residual of ptpd's offsets about
-    the best straight line (s). None if undefined.
-    """
-    timed = np.isfinite(log.times_s)
-    times, offsets = log.times_s[timed], log.offset_s[timed]
-    groundtruth = times - offsets
-    inside = np.zeros(len(times), dtype=np.bool_)
-    bends = []
-    for segment in determined:
-        here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
-        inside |= here
-        if np.count_nonzero(here) >= 3:
-            t = groundtruth[here] - segment.reference_s
-            line = np.polyfit(t, offsets[here], 1)
-            bends.append(offsets[here] - np.polyval(line, t))
-    expected = model.robot_times(groundtruth[inside]) - groundtruth[inside]
-    difference = offsets[inside] - expected
-    drift = log.drift[np.isfinite(log.drift)]
-    return {
-        "reports": len(log.offset_s),
-        "reports_in_segments": int(np.count_nonzero(inside)),
-        "rms_difference_s": _rms(difference),
-        "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
-        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
-        "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
-    }
-
-
-def _rms(values: Any) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
-
-
 def _line(segment: ClockSegment) -> str:
     head = f"{segment.from_s:.2f} .. {segment.to_s:.2f} s: "
-    if segment.status == "no turns":
+    if not segment.is_determined:
         return head + f"cannot be synchronised: {segment.note}"
     offset = _CONFIDENCE * segment.sigma_offset_s
     drift = _CONFIDENCE * segment.sigma_rate

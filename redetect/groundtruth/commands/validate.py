@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.groundtruth.commands.options import Validate
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
+from redetect.groundtruth.options import Validate
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation import onboard, reference_poses, scoring
@@ -75,7 +75,7 @@ def perform(options: Validate) -> int:
         "figures": figures,
         "published": scoring.PUBLISHED,
         "refused": [*refused, *without],
-        "distances": _distance_figures(solved, survey.sigma_m),
+        "distances": reference_poses.distance_figures(solved, survey.sigma_m),
         "rows": [
             {**row, "note": r.note, "points": r.points, "rms_m": r.rms_m}
             for row, r in zip(rows, references)
@@ -167,7 +167,7 @@ def summary_lines(
     distances: dict[str, Any],
 ) -> list[str]:
     """The printed figures, with RAWSEEDS' beside them."""
-    refined = sum(reference.scans == "used" for reference in references)
+    refined = sum(reference.scans == onboard.ScanUse.USED for reference in references)
     chi2 = distances["chi2_per_freedom"]
     return [
         f"reference poses    {len(references)} ({len(refused)} refused), {refined} refined by "
@@ -203,16 +203,3 @@ def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     if not on_board:
         warn("no scans of a scanner on board: using distances only")
     return on_board, files
-
-
-def _distance_figures(
-    solved: Sequence[reference_poses.DistancePose], sigma_m: float
-) -> dict[str, Any]:
-    good = [d for d in solved if d.status in ("ok", "ambiguous")]
-    residuals = np.concatenate([d.residuals_m for d in good]) if good else np.zeros(0)
-    freedom = sum(d.freedom for d in good)
-    return {
-        "sigma_m": sigma_m,
-        "rms_m": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0,
-        "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
-    }

@@ -16,8 +16,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from enum import StrEnum
 from itertools import pairwise
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +30,6 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike
 from redetect.storage.bounded import read_content
 
-Status = Literal["ok", "no turns", "jump", "at a bound"]
 #: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.
 _RATE, _SECONDS, _SIGMA = inside(0.5, 1.5), from_to(-1e15, 1e15), NOT_NEGATIVE
 # Probability that segments of one line pass the test whether they are.
@@ -53,6 +53,15 @@ _PARTS_PER_BILLION = 1e-9
 _LEAST_STEP_S = 0.5
 
 
+class ClockStatus(StrEnum):
+    """How the clocks over a segment were found."""
+
+    OK = "ok"
+    NO_TURNS = "no turns"  #: It cannot be synchronised: its numbers follow from the others
+    JUMP = "jump"  #: Its two halves disagree, since a clock was set
+    AT_A_BOUND = "at a bound"  #: The optimum is at a limit of the search range
+
+
 @dataclass(frozen=True)
 class ClockSegment:
     """The two clocks over one segment of the ground truth."""
@@ -66,13 +75,15 @@ class ClockSegment:
     sigma_offset_s: float = math.inf  # Standard deviations; infinite if not determined
     sigma_rate: float = math.inf
     turned_rad: float = 0.0  # Sum of the absolute values of the robot's turns
-    # `ok`; `no turns`: the segment cannot be synchronised, its numbers follow from the others;
-    # `jump`: its two halves disagree, since a clock was set; `at a bound`: the optimum is at a
-    # limit of the search range.
-    status: Status = "ok"
+    status: ClockStatus = ClockStatus.OK
     note: str = ""  # Details of the status
     own_offset_s: float | None = None  # From the segment alone, if one line replaced these two
     own_sigma_s: float | None = None
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether its numbers are its own."""
+        return self.status != ClockStatus.NO_TURNS
 
 
 @dataclass(frozen=True)
@@ -179,11 +190,11 @@ def _segment(row: JsonObject) -> ClockSegment:
             values[name] = row.number(name, _RATE if name == "rate" else _SECONDS)
     if values["to_s"] < values["from_s"]:
         raise row.wrong("to_s", "it not to end before it begins")
-    status: Any = row.text("status")
-    if status not in get_args(Status):
-        raise row.wrong("status", f"one of {', '.join(get_args(Status))}")
+    if (status := row.text("status")) not in list(ClockStatus):
+        raise row.wrong("status", f"one of {', '.join(ClockStatus)}")
     note = row.values.get("note", "")
-    return ClockSegment(**values, status=status, note=note if isinstance(note, str) else "")
+    note = note if isinstance(note, str) else ""
+    return ClockSegment(**values, status=ClockStatus(status), note=note)
 
 
 def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
@@ -194,8 +205,8 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     better. They are unchanged if fewer than two are determined, a clock was set, or one line does
     not explain them: its squared error has a probability below one in a thousand.
     """
-    determined = [segment for segment in segments if segment.status == "ok"]
-    others = {segment.status for segment in segments} - {"ok", "no turns"}
+    determined = [segment for segment in segments if segment.status == ClockStatus.OK]
+    others = {segment.status for segment in segments} - {ClockStatus.OK, ClockStatus.NO_TURNS}
     if len(determined) < 2 or others:
         return list(segments)
     middle = float(np.mean([segment.reference_s for segment in determined]))
@@ -216,7 +227,7 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     result = []
     for segment in segments:
         at = np.array([1.0, segment.reference_s - middle])
-        if segment.status == "ok":
+        if segment.status == ClockStatus.OK:
             segment = replace(
                 segment,
                 offset_s=float(at @ line),
@@ -238,6 +249,43 @@ class PtpdLog:
     times_s: FloatArray  # (N,): times of the reports (UTC seconds); NaN where the log has none.
     offset_s: FloatArray  # (N,): clock minus master
     drift: FloatArray  # (N,): observed drift as a share; NaN where not reported
+
+
+def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int | None]:
+    """Compare the clocks estimated from headings with ptpd's reports on the robot's clock.
+
+    Returns the number of reports, and of those in determined segments, the rms difference of their
+    offsets from the model's (s), the mean drift of both, and the residual of ptpd's offsets about
+    the best straight line (s). None if undefined.
+    """
+    determined = [segment for segment in model.segments if segment.is_determined]
+    timed = np.isfinite(log.times_s)
+    times, offsets = log.times_s[timed], log.offset_s[timed]
+    groundtruth = times - offsets
+    inside = np.zeros(len(times), dtype=np.bool_)
+    bends = []
+    for segment in determined:
+        here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
+        inside |= here
+        if np.count_nonzero(here) >= 3:
+            t = groundtruth[here] - segment.reference_s
+            line = np.polyfit(t, offsets[here], 1)
+            bends.append(offsets[here] - np.polyval(line, t))
+    expected = model.robot_times(groundtruth[inside]) - groundtruth[inside]
+    difference = offsets[inside] - expected
+    drift = log.drift[np.isfinite(log.drift)]
+    return {
+        "reports": len(log.offset_s),
+        "reports_in_segments": int(np.count_nonzero(inside)),
+        "rms_difference_s": _rms(difference),
+        "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
+        "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
+        "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
+    }
+
+
+def _rms(values: Any) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
 def read_ptpd(path: PathLike) -> PtpdLog:

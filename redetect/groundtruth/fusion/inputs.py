@@ -111,14 +111,13 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
     return hidden
 
 
-def gather(
+def measured_poses(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
-) -> tuple[NDArray[np.str_], FloatArray, FloatArray, FloatArray, dict[str, int]]:
+) -> tuple[PlanarPoses, NDArray[np.str_], dict[str, int]]:
     """All measurements within the odometry's time, in order, with usable covariances.
 
-    Of several poses at one time in a stream, the last counts. Returns each measurement's stream,
-    times (M,), poses (M, 3) and covariances (M, 3, 3), and by stream the number of covariances that
-    had to be increased.
+    Of several poses at one time in a stream, the last counts. Also returns each measurement's
+    stream (M,), and by stream the number of covariances that had to be increased.
     """
     found = []
     repaired = {}
@@ -137,7 +136,8 @@ def gather(
             f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
         )
     order = np.argsort(times, kind="stable")
-    return names[order], times[order], poses[order], covariances[order], repaired
+    together = PlanarPoses(times[order], poses[order], covariances[order])
+    return together, names[order], repaired
 
 
 def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:

@@ -292,17 +292,18 @@ def movement_problem(
 
     The nodes are from the first measurement within the odometry's time to the last.
     """
-    names, times, measured, covariances, repaired = inputs.gather(odometry, streams)
+    found, names, repaired = inputs.measured_poses(odometry, streams)
+    assert found.covariances is not None
     odometry = last_of_each_time(odometry)
-    inside = odometry.times_s[odometry.during(times[0], times[-1])]
-    node_times = np.union1d(inside, times)
+    inside = odometry.times_s[odometry.during(found.times_s[0], found.times_s[-1])]
+    node_times = np.union1d(inside, found.times_s)
     controls, unseen = inputs.movements(odometry, node_times)
     return MovementProblem(
         times_s=node_times,
         controls=controls,
         unseen=unseen,
         measured=kernels.MeasuredPoses(
-            np.searchsorted(node_times, times).astype(np.int64), measured, covariances
+            np.searchsorted(node_times, found.times_s), found.poses, found.covariances
         ),
         streams=names,
         repaired=repaired,

@@ -22,7 +22,7 @@ from scipy.optimize import Bounds, minimize, minimize_scalar
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.clock import ClockSegment, knots_of, on_one_line
+from redetect.groundtruth.fusion.clock import ClockSegment, ClockStatus, knots_of, on_one_line
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
@@ -150,7 +150,7 @@ def _if_matching(
 ) -> ClockSegment:
     """A segment's clock, undetermined if the streams' movements do not agree by it."""
     here = segment.only(segment.during(clock.from_s, clock.to_s))
-    if clock.status == "no turns" or search.matches(here, clock.offset_s):
+    if not clock.is_determined or search.matches(here, clock.offset_s):
         return clock
     note = f"no offset within {bounds.largest_offset_s:g} s makes odometry's movements agree"
     return _undetermined(here, clock.turned_rad, note)
@@ -217,16 +217,16 @@ def _segment(
             sigma_offset_s=float(best.sigmas[0]),
             sigma_rate=float(best.sigmas[1]),
             turned_rad=turned,
-            status="at a bound" if at_bound else "ok",
+            status=ClockStatus.AT_A_BOUND if at_bound else ClockStatus.OK,
         )
     ]
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
     """The clock of a segment at an end of which it was set."""
-    if clock.status != "ok":
+    if clock.status != ClockStatus.OK:
         return clock
-    return replace(clock, status="jump", note=f"the clock was set near {time_s:.2f} s")
+    return replace(clock, status=ClockStatus.JUMP, note=f"the clock was set near {time_s:.2f} s")
 
 
 class ClockFit(NamedTuple):
@@ -412,7 +412,7 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
 
 def _differ(parts: list[ClockSegment]) -> bool:
     """Whether the clock is determined before and after a jump, and differs there."""
-    determined = [part for part in parts if part.status != "no turns"]
+    determined = [part for part in parts if part.is_determined]
     for before, after in pairwise(determined):
         place = 0.5 * (before.to_s + after.from_s)
         offsets, variances = [], []
@@ -430,18 +430,19 @@ def _differ(parts: list[ClockSegment]) -> bool:
 
 def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSegment:
     from_s, to_s, at_s = (float(f(segment.times_s)) for f in (np.min, np.max, np.mean))
-    return ClockSegment(from_s, to_s, at_s, turned_rad=turned_rad, status="no turns", note=note)
+    status = ClockStatus.NO_TURNS
+    return ClockSegment(from_s, to_s, at_s, turned_rad=turned_rad, status=status, note=note)
 
 
 def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
     """Interpolate the offsets of undetermined segments from the others."""
-    determined = [segment for segment in segments if segment.status != "no turns"]
+    determined = [segment for segment in segments if segment.is_determined]
     if not determined:
         return segments
     times, offsets = knots_of(determined)
     return [
-        replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
-        if segment.status == "no turns"
-        else segment
+        segment
+        if segment.is_determined
+        else replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
         for segment in segments
     ]

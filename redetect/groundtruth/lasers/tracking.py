@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from scipy.ndimage import convolve1d
 from scipy.stats import trim_mean
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
 from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
@@ -34,9 +35,6 @@ from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differen
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, compose, invert, rotation
 
-LOST, OK, UNDETERMINED, REACQUIRED, COASTING, UNRESOLVED = range(6)
-STATUS = ("lost", "ok", "undetermined direction", "reacquired", "coasting", "front unknown")
-
 #: Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 
@@ -46,6 +44,8 @@ _RESIDUALS_S = 0.48
 # lost without a pose in this number of sets at least.
 _VELOCITY_WINDOW_S, _VELOCITY_SETS, _COASTED_SETS = 0.3, 2.01, 2.5
 _LARGEST_CHI2 = 9.0
+# Standard deviation of the start of a fit, by which undetermined directions are held (m).
+_PRIOR_M = 0.02
 # An outline is moved if readings are farther from it on average (m), or more than half of their
 # standard deviation, and at most by this share of its radius.
 _OUTLINE_M, _MOST_MOVED, _TRIMMED, _OUTLINE_ROUNDS = 0.003, 0.25, 0.1, 6
@@ -60,14 +60,28 @@ _AVERAGED_S = 0.08
 _LEAST_SPAN_S = 0.05
 
 
+class SetStatus(IntEnum):
+    """What a set of scans shows of the robot."""
+
+    LOST = 0
+    OK = 1
+    UNDETERMINED_DIRECTION = 2
+    REACQUIRED = 3  #: As `OK`, the first after it was lost
+    COASTING = 4  #: There is no pose, but the robot is not lost yet
+    FRONT_UNKNOWN = 5
+
+    @property
+    def words(self) -> str:
+        """As files and messages have it."""
+        return self.name.lower().replace("_", " ")
+
+
 @dataclass(frozen=True, eq=False)
 class LaserTrack:
     """Result for every set of scans."""
 
     times_s: FloatArray  # (N,)
-    # (N,): index into `STATUS`. Poses are valid if it is OK or REACQUIRED, and except for one
-    # direction if it is UNDETERMINED.
-    status: IntArray
+    status: IntArray  # (N,): of `SetStatus`
     segment: IntArray  # (N,): number of the set's acquisition; -1 if the robot is lost
     poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
     covariances: FloatArray  # (N, 3, 3): from the readings' noise and the scanners' poses
@@ -86,6 +100,17 @@ class LaserTrack:
     # Standard deviation of its faces from the readings (m), where it is noticed; else 0
     outline_sigma_m: float = 0.0
 
+    @property
+    def is_determined(self) -> BoolArray:
+        """(N,) whether the pose is valid in all directions."""
+        return np.isin(self.status, (SetStatus.OK, SetStatus.REACQUIRED))
+
+    @property
+    def seen_through(self) -> float:
+        """Share of the beams that should meet the robot, but see the background behind it."""
+        counts = BeamCounts(*np.sum(self.beams[self.is_determined], axis=0).astype(int).tolist())
+        return counts.through / max(counts.expected, 1)
+
 
 class Tracker:
     """Follows the robot, which moves no faster than a speed (m/s), through sets of scans."""
@@ -99,7 +124,7 @@ class Tracker:
         n, scanners = len(sets), len(fixed.origins)
         self.track = LaserTrack(
             sets.times_s,
-            status=np.full(n, LOST), segment=np.full(n, -1),
+            status=np.full(n, SetStatus.LOST), segment=np.full(n, -1),
             poses=np.full((n, 3), np.nan), covariances=np.full((n, 3, 3), np.nan),
             noise=np.full((n, 3, 3), np.nan), motion=np.zeros((n, 3)),
             readings=np.zeros(n, dtype=np.int64), rms_m=np.full(n, np.nan),
@@ -107,7 +132,7 @@ class Tracker:
             corrections=np.full((scanners, 3), np.nan),
             correction_sigma=np.full((scanners, 3), np.nan), fronts={},
         )  # fmt: skip
-        self.prior_m = np.full(n, 0.02)
+        self.prior_m = np.full(n, _PRIOR_M)
         self.information, self.gradient = np.zeros((scanners, 3, 3)), np.zeros((scanners, 3))
 
     def run(self) -> LaserTrack:
@@ -130,8 +155,8 @@ class Tracker:
                     continue
                 with suppress(GeometryError):
                     pose, motion = self._fit(i, found, np.zeros(3), 0.0), np.zeros(3)
-                    if self.track.status[i] == OK:
-                        self.track.status[i] = REACQUIRED
+                    if self.track.status[i] == SetStatus.OK:
+                        self.track.status[i] = SetStatus.REACQUIRED
                     segment, begun, tracked = segment + 1, i, True
                     posed_s = before_s = determined_s = t
                     self.track.segment[i] = segment
@@ -140,12 +165,12 @@ class Tracker:
             predicted = pose + motion * step
             self.track.segment[i] = segment
             # Undetermined directions: as uncertain as the motion since they were last determined.
-            self.prior_m[i] = 0.02 + 0.5 * self.speed * (t - determined_s)
+            self.prior_m[i] = _PRIOR_M + 0.5 * self.speed * (t - determined_s)
             try:
                 fitted = self._fit(i, predicted, motion, t - posed_s)
             except GeometryError as reason:
                 self.track.reasons[i] = str(reason)
-                self.track.status[i], pose = COASTING, predicted
+                self.track.status[i], pose = SetStatus.COASTING, predicted
                 continue
             error = pose_differences(fitted, predicted)
             # At first the motion is unknown, and follows the poses more quickly.
@@ -154,7 +179,7 @@ class Tracker:
             if step > 0.0:
                 motion = motion + (_MOTION_GAIN + 0.3 * young) / step * error
             posed_s = t
-            determined_s = t if self.track.status[i] == OK else determined_s
+            determined_s = t if self.track.status[i] == SetStatus.OK else determined_s
         return self._finished()
 
     def _fit(
@@ -213,7 +238,8 @@ class Tracker:
         self.track.readings[i], self.track.rms_m[i] = found.used, found.rms_m
         self.track.chi2[i] = found.chi2 / max(found.used - 3.0, 1.0)
         self.track.beams[i] = beams
-        self.track.status[i] = UNDETERMINED if found.open_directions else OK
+        is_open = found.open_directions
+        self.track.status[i] = SetStatus.UNDETERMINED_DIRECTION if is_open else SetStatus.OK
 
     def _finished(self) -> LaserTrack:
         good = np.flatnonzero(np.isfinite(self.track.poses[:, 0]))
@@ -245,11 +271,12 @@ class Tracker:
         found = self._refine(i, seen, self.track.poses[i].copy())
         if found.used < self.settings.least_readings:
             self.track.reasons[i] = f"{found.used} readings on the outline"
-            self.track.status[i], self.track.poses[i] = COASTING, np.nan
+            self.track.status[i], self.track.poses[i] = SetStatus.COASTING, np.nan
             return
         self._store(i, found, explain_set(self.sets[i], self.fixed, self.body, found.pose))
         # Keeps the result of the whole visit, or of its first set.
-        if status == UNRESOLVED or (status == REACQUIRED and self.track.status[i] == OK):
+        was_reacquired = status == SetStatus.REACQUIRED and self.track.status[i] == SetStatus.OK
+        if was_reacquired or status == SetStatus.FRONT_UNKNOWN:
             self.track.status[i] = status
         self.information += found.information
         self.gradient += found.gradient
@@ -260,7 +287,7 @@ class Tracker:
         The mean of most, outward, and the deviation of the halves of its faces (m), of which poses
         have a covariance (3, 3), in the robot's frame.
         """
-        rows = np.flatnonzero(np.isin(self.track.status, (OK, REACQUIRED)))
+        rows = np.flatnonzero(self.track.is_determined)
         faces, normals = self.body.faces, face_normals(self.body.faces)
         off, halves = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i in rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(np.int64)]:
@@ -307,7 +334,7 @@ class Tracker:
             best = int(order[0])
             by = f"driven forward, {ahead[best]:.2f} m"
             if ahead[best] - ahead[int(order[1])] < 2.0 * self.settings.forward_m:
-                self.track.status[rows] = UNRESOLVED
+                self.track.status[rows] = SetStatus.FRONT_UNKNOWN
                 return "unknown: the outline does not show it and the robot hardly drove"
         if best > 0:
             self.track.poses[rows] = compose(self.track.poses[rows], choices[best])
@@ -321,7 +348,7 @@ class Tracker:
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
         start, _ = self._aligned(seen, start)
-        found = refine(seen, start, self.fixed, self.body, self.settings, 0.02)
+        found = refine(seen, start, self.fixed, self.body, self.settings, _PRIOR_M)
         beams = explain_set(self.sets[i], self.fixed, self.body, found.pose)
         wrong = beams.through + beams.hidden + beams.beside
         return float(found.chi2 + self.settings.gate_sigma**2 * wrong)
@@ -458,8 +485,8 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     """
     if sets_per_pose < 1:
         raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
-    determined = np.isin(track.status, (OK, REACQUIRED))
-    rows = np.flatnonzero(determined | (track.status == UNDETERMINED))
+    determined = track.is_determined
+    rows = np.flatnonzero(determined | (track.status == SetStatus.UNDETERMINED_DIRECTION))
     if not len(rows):
         return PlanarPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     times = track.times_s[rows]

@@ -137,19 +137,10 @@ class Bundle:
         return len(self.cameras) + self.parts
 
     @property
-    def world_from_camera(self) -> FloatArray:
-        """(C, 4, 4)."""
-        return self.poses[: len(self.cameras)]
-
-    @property
-    def body_from_part(self) -> FloatArray:
-        """(P, 4, 4)."""
-        return self.poses[len(self.cameras) : self.shared]
-
-    @property
-    def world_from_body(self) -> FloatArray:
-        """(B, 4, 4)."""
-        return self.poses[self.shared :]
+    def chain(self) -> Chain:
+        """Its cameras and poses."""
+        cameras, parts, bodies = np.split(self.poses, [len(self.cameras), self.shared])
+        return Chain(self.cameras, cameras, bodies, parts)
 
     @property
     def unknowns(self) -> int:
@@ -165,12 +156,6 @@ class Bundle:
         steps = np.zeros((len(self.free), 6))
         steps[self.free] = step.reshape(-1, 6)
         return replace(self, poses=self.poses @ se3.exp(steps))
-
-    @property
-    def chain(self) -> Chain:
-        """Its cameras and poses."""
-        poses = (self.world_from_camera, self.world_from_body, self.body_from_part)
-        return Chain(self.cameras, *poses)
 
     def pixels(self) -> FloatArray:
         """(N, 2) pixels at which the points are expected; NaN where they cannot be seen."""
@@ -211,6 +196,17 @@ class AdjustedBundle:
         """Cost over degrees of freedom: 1 if the corners' covariances are right."""
         return self.cost / max(1, self.degrees_of_freedom)
 
+    def residual_figures(self, views: Sequence[int]) -> dict[str, float | None]:
+        """Figures of some views: number, outliers, residuals of the others; None without any."""
+        chosen = np.isin(self.bundle.view, views)
+        residuals = self.residuals[chosen & self.used]
+        return {
+            "views": len(views),
+            "left_out": len(np.unique(self.bundle.view[chosen & ~self.used])),
+            "rms_px": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else None,
+            "max_px": float(np.linalg.norm(residuals, axis=1).max()) if len(residuals) else None,
+        }
+
 
 def adjust_bundle(
     bundle: Bundle, *, outlier_sigma: float = 5.0, outlier_px: float = 1.0
@@ -233,7 +229,7 @@ def adjust_bundle(
         used = kept
         # A body without used points is not moved.
         free = bundle.free.copy()
-        bodies = np.arange(len(bundle.world_from_body))
+        bodies = np.arange(len(free) - bundle.shared)
         free[bundle.shared :] &= np.isin(bodies, bundle.seen.body[used])
         bundle = replace(bundle, free=free)
         bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)

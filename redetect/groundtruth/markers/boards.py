@@ -27,7 +27,6 @@ import numpy as np
 from camera import Camera, read_camera
 from camera.boards.board import Board
 from camera.boards.points import find_board
-from camera.calibration.images import read_grey
 from camera.errors import CalibrationError
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
@@ -35,6 +34,7 @@ from redetect.groundtruth.files import JsonObject
 from redetect.groundtruth.markers.session import parse_pose
 from redetect.messages import excerpt
 from redetect.storage.bounded import path_inside
+from redetect.storage.images import read_grey
 
 #: Half the side of a corner's refinement window, as a fraction of a square: cameras are calibrated
 #: and far away here, so that blur and noise cause larger errors than the lens's distortion.
@@ -124,10 +124,7 @@ def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     Raises `GroundTruthError` if the image cannot be read, its size differs from the calibration's,
     or no board is found.
     """
-    try:
-        grey = read_grey(image.image)
-    except CalibrationError as error:
-        raise GroundTruthError(str(error)) from None
+    grey = read_grey(image.image, GroundTruthError)
     if grey.shape != (camera.height, camera.width):
         raise GroundTruthError(
             f"{image.image}: is {grey.shape[1]}x{grey.shape[0]} px: expected "

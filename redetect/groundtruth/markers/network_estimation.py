@@ -71,10 +71,10 @@ def estimate_network(
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
     if setup.double is not None:
-        offset = adjusted.bundle.body_from_part[list(parts).index(SECOND)]
+        offset = adjusted.bundle.chain.body_from_part[list(parts).index(SECOND)]
     return NetworkEstimate(
         names,
-        adjusted.bundle.world_from_camera,
+        adjusted.bundle.chain.world_from_camera,
         adjusted.camera_covariance * adjusted.reduced_cost,
         offset,
         adjusted,

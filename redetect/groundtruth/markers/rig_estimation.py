@@ -136,7 +136,7 @@ def estimate_rig(
     except GeometryError as error:
         raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
     covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
-    poses = adjusted.bundle.body_from_part
+    poses = adjusted.bundle.chain.body_from_part
     rig = replace(rig, robot_from_marker=poses, covariance=covariance)
     return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,9 +21,6 @@ from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import squared_mahalanobis
 
-Status = Literal["clear", "resolved", "unresolved", "rejected", "failed", "unseen"]
-
-STATUSES: tuple[Status, ...] = get_args(Status)
 # Costs as negative log-likelihoods: skipping a frame is cheaper than two jumps around it, and a
 # robot that was carried elsewhere costs one jump.
 _JUMP_COST = 20.0
@@ -35,6 +33,17 @@ _CHANCE = 1e-3
 _Step = tuple[int, int, float]
 
 
+class PoseStatus(StrEnum):
+    """Whether a time has a pose, and why not."""
+
+    CLEAR = "clear"  #: There is only one candidate
+    RESOLVED = "resolved"  #: One of several candidates, by the times before and after
+    UNRESOLVED = "unresolved"  #: No candidate is likely enough
+    REJECTED = "rejected"  #: No candidate fits the times before and after
+    FAILED = "failed"  #: No pose explains the corners
+    UNSEEN = "unseen"  #: No marker of the rig is in any image
+
+
 @dataclass(frozen=True, eq=False)
 class TrackedTime:
     """Result for one time."""
@@ -42,10 +51,7 @@ class TrackedTime:
     time_s: float  # Mean of the images' times that show a marker of the rig
     images: tuple[MarkerFrame, ...]
     views: tuple[View, ...]  # The rig's markers in them
-    # `clear`, or `resolved` by the neighbours: there is a pose. `unresolved`: several poses are
-    # possible; `rejected`: the candidates do not fit the times before and after; `failed`: no pose
-    # explains the corners; `unseen`: no marker of the rig in any image.
-    status: Status
+    status: PoseStatus
     estimate: PoseEstimate | None = None
     choice: Choice | None = None
     reason: str = ""  # Why there is no pose, or a remark on it
@@ -65,9 +71,9 @@ class Track:
         return [(t.time_s, t.pose) for t in self.times if t.pose is not None]
 
     @property
-    def counts(self) -> dict[Status, int]:
+    def counts(self) -> dict[PoseStatus, int]:
         """Number of times by status."""
-        return {status: sum(t.status == status for t in self.times) for status in STATUSES}
+        return {status: sum(t.status == status for t in self.times) for status in PoseStatus}
 
     @property
     def reduced_cost(self) -> float:
@@ -175,22 +181,22 @@ def _estimated(
     shown = {view.frame for view in views}
     time_s = float(np.mean([f.time_s for f in group if f in shown or not shown]))
     if not views:
-        return TrackedTime(time_s, group, views, "unseen")
+        return TrackedTime(time_s, group, views, PoseStatus.UNSEEN)
     try:
         estimate = estimate_pose(pose_problem(views, rig, network, settings))
     except GeometryError as error:
-        return TrackedTime(time_s, group, views, "failed", reason=str(error))
-    return TrackedTime(time_s, group, views, "unresolved", estimate)
+        return TrackedTime(time_s, group, views, PoseStatus.FAILED, reason=str(error))
+    return TrackedTime(time_s, group, views, PoseStatus.UNRESOLVED, estimate)
 
 
 def _decided(tracked: TrackedTime, choice: Choice) -> TrackedTime:
     reasons = {
-        "rejected": "does not fit the times before and after",
-        "resolved": "planar ambiguity, decided by the neighbours",
-        "unresolved": "planar ambiguity, not decided by the neighbours",
+        PoseStatus.REJECTED: "does not fit the times before and after",
+        PoseStatus.RESOLVED: "planar ambiguity, decided by the neighbours",
+        PoseStatus.UNRESOLVED: "planar ambiguity, not decided by the neighbours",
     }
     pose = None
-    if choice.status in ("clear", "resolved"):
+    if choice.status in (PoseStatus.CLEAR, PoseStatus.RESOLVED):
         assert tracked.estimate is not None
         assert choice.candidate is not None
         pose = tracked.estimate.candidates[choice.candidate]
@@ -203,9 +209,7 @@ class Choice:
     """The candidate of a frame that is the robot's pose."""
 
     candidate: int | None  # None if no candidate of the frame fits its neighbours
-    # `clear` (there was only one), `resolved` by the neighbours, `unresolved` (the given candidate
-    # is the most likely one, but not likely enough), or `rejected`
-    status: Status
+    status: PoseStatus  # If it is unresolved, the candidate is the most likely one
     margin: float  # Natural logarithm of the odds against the next candidate; infinite without one.
 
 
@@ -223,16 +227,17 @@ def choose_candidates(
         costs = through[frame == number]
         # The cheapest sequence skips the frame.
         if cheapest < costs.min() - _ROUNDING:
-            choices.append(Choice(None, "rejected", float(costs.min() - cheapest)))
+            choices.append(Choice(None, PoseStatus.REJECTED, float(costs.min() - cheapest)))
             continue
         total = costs + np.array(estimate.log_odds)
         order = np.argsort(total, kind="stable")
         if len(order) == 1:
-            choices.append(Choice(0, "clear", float("inf")))
+            choices.append(Choice(0, PoseStatus.CLEAR, float("inf")))
             continue
         margin = float(total[order[1]] - total[order[0]])
         decided = margin >= np.log(settings.ambiguity_odds)
-        choices.append(Choice(int(order[0]), "resolved" if decided else "unresolved", margin))
+        status = PoseStatus.RESOLVED if decided else PoseStatus.UNRESOLVED
+        choices.append(Choice(int(order[0]), status, margin))
     return choices
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -29,12 +30,10 @@ from redetect.groundtruth.lasers.walls import (
     wall_curves,
 )
 from redetect.groundtruth.trajectories.streams import pose_differences
-from redetect.groundtruth.validation.reference_poses import DistancePose
+from redetect.groundtruth.validation.reference_poses import DistancePose, DistanceStatus
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import whitening
 from redetect.plane import apply, compose, rotation
-
-ScanStatus = Literal["used", "undetermined", "disagrees", "no scans", "not asked"]
 
 # The robot is assumed at rest for this long before and after the time of the distances.
 _STILL_S = 0.5
@@ -80,6 +79,16 @@ class StillScans(NamedTuple):
         return np.concatenate([apply(m, s.points) for m, s in zip(self.mounts, self.scans)])
 
 
+class ScanUse(StrEnum):
+    """Whether scans on board refine a reference pose, and why not."""
+
+    USED = "used"
+    UNDETERMINED = "undetermined"  #: The walls do not determine a direction
+    DISAGREES = "disagrees"  #: With the distances
+    NO_SCANS = "no scans"  #: Too few readings match walls
+    NOT_ASKED = "not asked"
+
+
 @dataclass(frozen=True, eq=False)
 class ReferencePose:
     """A reference pose, and how it was determined."""
@@ -87,9 +96,7 @@ class ReferencePose:
     distances: DistancePose
     pose: FloatArray  # (3,): x, y (m), theta (rad)
     covariance: FloatArray  # (3, 3)
-    # `used`; `undetermined`: the walls do not determine a direction; `disagrees`: with the
-    # distances; `no scans`: too few readings match walls; `not asked`.
-    scans: ScanStatus
+    scans: ScanUse
     note: str  # Why the scans are not used
     points: int = 0  # Number of points of the scans that are matched to walls
     rms_m: float = math.nan  # Of their distances from the walls; NaN without points
@@ -143,18 +150,18 @@ def reference_poses(
     references: list[ReferencePose] = []
     refused: list[Refused] = []
     for d in distances:
-        if d.status != "ok":
+        if d.status != DistanceStatus.OK:
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
         elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
             references.append(refined_by_walls(d, still_scans(onboard, time), segments))
         else:
-            references.append(_unrefined(d, "not asked"))
+            references.append(_unrefined(d, ScanUse.NOT_ASKED))
     return references, refused
 
 
 def _unrefined(
-    d: DistancePose, scans: ScanStatus, reason: str = "", still: StillScans | None = None
+    d: DistancePose, scans: ScanUse, reason: str = "", still: StillScans | None = None
 ) -> ReferencePose:
     """The pose from distances alone."""
     return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
@@ -181,10 +188,10 @@ def refined_by_walls(
         )
         found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:
-        return _unrefined(distances, "no scans", str(error))
+        return _unrefined(distances, ScanUse.NO_SCANS, str(error))
     if found.open_directions[0]:
         reason = "the walls do not determine a direction"
-        return _unrefined(distances, "undetermined", reason, still)
+        return _unrefined(distances, ScanUse.UNDETERMINED, reason, still)
     of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
     apart = pose_differences(found.poses[0], prior)
@@ -194,7 +201,7 @@ def refined_by_walls(
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
             "from the pose by distances, more than the covariances allow"
         )
-        return _unrefined(distances, "disagrees", reason, still)
+        return _unrefined(distances, ScanUse.DISAGREES, reason, still)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
@@ -202,7 +209,7 @@ def refined_by_walls(
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
     points, rms_m = int(found.used[0]), float(found.rms_m[0])
-    return ReferencePose(distances, pose, combined, "used", "", points, rms_m, still)
+    return ReferencePose(distances, pose, combined, ScanUse.USED, "", points, rms_m, still)
 
 
 class RefinedMounts(NamedTuple):
@@ -222,7 +229,7 @@ def range_errors(
     """
     angles, errors = [np.zeros(0)], [np.zeros(0)]
     for reference in references:
-        if reference.still is None or reference.scans != "used":
+        if reference.still is None or reference.scans != ScanUse.USED:
             continue
         for mount, scan in zip(reference.still.mounts, reference.still.scans):
             pose = compose(reference.pose, mount)
@@ -244,8 +251,8 @@ def refine_mounts(
     None if fewer than three poses have both distances and scans.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
-    accepted = [r for r in references if r.distances.status == "ok"]
-    used = [r for r in accepted if r.scans in ("used", "disagrees")]
+    accepted = [r for r in references if r.distances.status == DistanceStatus.OK]
+    used = [r for r in accepted if r.scans in (ScanUse.USED, ScanUse.DISAGREES)]
     stills = [r.still for r in used if r.still is not None]
     if len(stills) < 3:
         return None

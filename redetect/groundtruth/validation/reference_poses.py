@@ -18,7 +18,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -45,7 +46,6 @@ _LARGEST_SIGMA_M, _LARGEST_SIGMA_DEG = 0.1, 5.0
 DIMENSIONS_HEAD = "name,x1_m,y1_m,x2_m,y2_m,measured_m"
 FIDUCIAL_DISTANCES_HEAD = "a,b,distance_m"
 
-Status = Literal["ok", "ambiguous", "undetermined", "inconsistent"]
 #: Two fiducials and the measured distance between them (m).
 FiducialDistance = tuple[str, str, float]
 
@@ -111,15 +111,22 @@ def _points(content: JsonObject, key: str) -> dict[str, FloatArray]:
     return points
 
 
+class DistanceStatus(StrEnum):
+    """Whether distances determine a pose, and why not."""
+
+    OK = "ok"
+    AMBIGUOUS = "ambiguous"  #: Several poses fit
+    UNDETERMINED = "undetermined"  #: A direction is not determined
+    INCONSISTENT = "inconsistent"  #: No pose fits
+
+
 @dataclass(frozen=True, eq=False)
 class DistancePose:
     """A reference pose from its distances."""
 
     index: int  # The pose's number in the file
     time_s: float  # Median of its distances' times
-    # `ok`; `ambiguous`: several poses fit; `undetermined`: a direction is not determined;
-    # `inconsistent`: no pose fits.
-    status: Status
+    status: DistanceStatus
     reason: str  # Why it is not ok; empty if it is
     pose: FloatArray  # (3,): best x, y (m), theta (rad); NaN with fewer than three distances
     covariance: FloatArray  # (3, 3): from the distances' standard deviation
@@ -139,6 +146,18 @@ def poses_from_distances(survey: Survey, distances: Sequence[Distance]) -> list[
         by_pose.setdefault(distance.pose, []).append(distance)
     found = [_solve(index, rows, survey) for index, rows in by_pose.items()]
     return sorted(found, key=lambda pose: (pose.time_s, pose.index))
+
+
+def distance_figures(solved: Sequence[DistancePose], sigma_m: float) -> dict[str, float | None]:
+    """Residuals of the poses that fit their distances, of standard deviation `sigma_m` (m)."""
+    good = [d for d in solved if d.status in (DistanceStatus.OK, DistanceStatus.AMBIGUOUS)]
+    residuals = np.concatenate([d.residuals_m for d in good]) if good else np.zeros(0)
+    freedom = sum(d.freedom for d in good)
+    return {
+        "sigma_m": sigma_m,
+        "rms_m": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0,
+        "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
+    }
 
 
 class Measured(NamedTuple):
@@ -196,7 +215,8 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
     if len(rows) < 3:
         reason, nothing = f"{len(rows)} distances: expected 3 or more", np.full(len(rows), np.nan)
         pose, open_ = np.full(3, np.nan), np.full((3, 3), np.inf)
-        return DistancePose(index, time_s, "undetermined", reason, pose, open_, nothing, math.nan)
+        status = DistanceStatus.UNDETERMINED
+        return DistancePose(index, time_s, status, reason, pose, open_, nothing, math.nan)
     measured = Measured(
         np.array([survey.fiducials[row.fiducial] for row in rows]),
         np.array([survey.robot_points[row.point] for row in rows]),
@@ -207,7 +227,7 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
     residuals, jacobian = distance_residuals(poses[0], measured)
     covariance, freedom = _covariance(jacobian, survey.sigma_m), len(rows) - 3
     if freedom > 0 and float(chdtrc(freedom, costs[0])) < _GROSS_PROBABILITY:
-        status: Status = "inconsistent"
+        status = DistanceStatus.INCONSISTENT
         worst = int(np.argmax(np.abs(residuals)))
         reason = (
             "the distances are inconsistent: the largest residual, "
@@ -220,20 +240,21 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
     return DistancePose(index, time_s, status, reason, pose, covariance, residuals, chi2)
 
 
-def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Status, str]:
+def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[DistanceStatus, str]:
     """Status of the first of the poses (C, 3) that fit, with its covariance (3, 3)."""
     sigma = np.sqrt(np.diagonal(covariance))
     place, turn = float(np.hypot(sigma[0], sigma[1])), math.degrees(sigma[2])
     # NaN and infinity fail these comparisons too.
     if not (place < _LARGEST_SIGMA_M and turn < _LARGEST_SIGMA_DEG):
-        return "undetermined", (
+        return DistanceStatus.UNDETERMINED, (
             f"too uncertain by its distances: sigma {place:.3g} m, {turn:.3g} deg: expected at "
             f"most {_LARGEST_SIGMA_M:g} m and {_LARGEST_SIGMA_DEG:g} deg"
         )
     if len(candidates) > 1:
         places = (f"({x:.2f}, {y:.2f}, {math.degrees(t):.0f} deg)" for x, y, t in candidates)
-        return "ambiguous", f"{len(candidates)} poses fit the distances: {', '.join(places)}"
-    return "ok", ""
+        reason = f"{len(candidates)} poses fit the distances: {', '.join(places)}"
+        return DistanceStatus.AMBIGUOUS, reason
+    return DistanceStatus.OK, ""
 
 
 def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:

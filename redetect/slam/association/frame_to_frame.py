@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import IntArray
 from redetect.slam.association.compatibility import compatible
+from redetect.slam.filters.base import FrameRows, frames_of
 from redetect.slam.filters.ekf_slam import EkfSlam
-from redetect.slam.filters.frames import FrameRows, frames_of
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 

@@ -253,7 +253,10 @@ def lines_by_points(
         used = (labels >= 0) & (rows >= _PATH_ROWS)
         for _ in range(3):
             solution = solve_path(
-                *(scaled, circle_labels, np.where(used, labels, count), path),
+                scaled,
+                circle_labels,
+                np.where(used, labels, count),
+                path,
                 np.concatenate([points, [[np.nan, np.nan]]]),
                 camera_xy=camera_xy,
                 sigma_scale=disc_sigma_scale,

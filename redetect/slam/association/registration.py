@@ -167,8 +167,8 @@ def register_maps(
     pairs: list[IntArray] = []
     waiting = list(range(1, len(places)))
     while True:
-        laid = ((k, register(stretches[k], xy)) for k in waiting)
-        k, found = next(((k, found) for k, found in laid if found), (0, None))
+        tried = ((k, register(stretches[k], xy)) for k in waiting)
+        k, found = next(((k, found) for k, found in tried if found), (0, None))
         if found is None:
             return motions, pairs, waiting
         waiting.remove(k)

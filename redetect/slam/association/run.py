@@ -110,19 +110,24 @@ def associate_run(
     path = None
     if settings.map_level and len(recording.circles):
         run = _Run(_without_lines(recording), settings, camera_xy, report)
-        labels, path, _, matches, _ = _closed_by_parts(run, circle_labels)
+        closed = _closed_by_parts(run, circle_labels)
+        labels, path, matches = closed.at.labels, closed.at.path, closed.matches
         circle_labels = without_clutter(recording, labels, path, settings)
         if len(line_labels):
             report("verticals on the path of the discs")
             line_labels, path_of_both = lines_by_points(
-                *(recording, path, labels, line_labels),
+                recording,
+                path,
+                labels,
+                line_labels,
                 camera_xy=camera_xy,
                 disc_sigma_scale=settings.sigma_scale,
             )
             line_labels = _merged_lines(recording, path_of_both, line_labels, settings, camera_xy)
     elif settings.map_level:
         run = _Run(recording, settings, camera_xy, report)
-        line_labels, path, _, matches, _ = _closed_by_parts(run, line_labels)
+        closed = _closed_by_parts(run, line_labels)
+        line_labels, path, matches = closed.at.labels, closed.at.path, closed.matches
     return RunAssociation(
         in_order(circle_labels),
         in_order(line_labels),
@@ -163,9 +168,7 @@ class _Solved(NamedTuple):
 class _Closed(NamedTuple):
     """A run whose loops are closed."""
 
-    labels: IntArray  # (n,): see `_Run`
-    path: FloatArray  # (N + 1, 3): the path solved with these labels
-    xy: FloatArray  # (M, 2): the landmarks' positions (m)
+    at: _Solved
     matches: tuple[loops.Match, ...]  # the loops
     stretch_frames: int  # length of the stretches that were matched
 
@@ -190,14 +193,23 @@ class _Run(NamedTuple):
     def merged(self, labels: IntArray, pairs: Sequence[tuple[int, int]]) -> tuple[IntArray, int]:
         return merge_labels(self.frames, labels, pairs, _MOST_TOGETHER if self.by_discs else 0.0)
 
+    def stretches(self, at: _Solved, length: int, **limits: int) -> list[loops.Stretch]:
+        """Stretches of the run; `limits` as in `redetect.slam.association.loops.stretches_of`."""
+        count = len(self.recording)
+        return loops.stretches_of(self.frames, at.labels, at.xy, count, length=length, **limits)
+
     def solved(self, labels: IntArray, path: FloatArray | None) -> _Solved:
         recording, none, line_xy = self.recording, np.zeros(0, dtype=np.int64), None
         if not self.by_discs:
             start = chain_steps(recording.steps) if path is None else path
             line_xy = intersect_bearings(recording, start, labels, camera_xy=self.camera_xy)
-        of_kinds = (labels, none) if self.by_discs else (none, labels)
+        circle_labels, line_labels = (labels, none) if self.by_discs else (none, labels)
         found = solve_path(
-            *(_with_sway(recording, self.settings), *of_kinds, path, line_xy),
+            _with_sway(recording, self.settings),
+            circle_labels,
+            line_labels,
+            path,
+            line_xy,
             camera_xy=self.camera_xy,
             sigma_scale=self.settings.sigma_scale,
         )
@@ -223,30 +235,29 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         own = run._replace(recording=part)
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        some, length = (own.frames, closed.labels, closed.xy, len(part)), closed.stretch_frames
-        least = ANYWHERE.least_agreeing
-        stretches.append(loops.stretches_of(*some, length=length, stride=length, least=least))
+        length, least = closed.stretch_frames, ANYWHERE.least_agreeing
+        stretches.append(own.stretches(closed.at, length, stride=length, least=least))
     if len(parts) == 1:
         return parts[0]
-    run.report("laying parts on each other")
-    motions, pairs, left = register_maps([part.xy for part in parts], stretches)
+    run.report("registering the parts")
+    motions, pairs, left = register_maps([part.at.xy for part in parts], stretches)
     if left:
         raise SlamError(
             f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "
             "cannot be registered with the others: expected common landmarks"
         )
-    counts = np.cumsum([0, *(len(part.xy) for part in parts)])
-    together = np.concatenate([part.labels + count for part, count in zip(parts, counts)])
-    laid = [compose(motions[k], part.path[int(k > 0) :]) for k, part in enumerate(parts)]
+    counts = np.cumsum([0, *(len(part.at.xy) for part in parts)])
+    together = np.concatenate([part.at.labels + count for part, count in zip(parts, counts)])
+    paths = [compose(motions[k], part.at.path[int(k > 0) :]) for k, part in enumerate(parts)]
     labels, _ = run.merged(together, pairs_by_votes(pairs))
-    whole = _closed(run, labels, np.concatenate(laid))
+    whole = _closed(run, labels, np.concatenate(paths))
     matches = [match for closed in (*parts, whole) for match in closed.matches]
     return whole._replace(matches=tuple(matches))
 
 
 def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Closed:
     """Close all loops, starting from a path (by default odometry)."""
-    recording, settings, frames, search = run.recording, run.settings, run.frames, loops.Search()
+    recording, search = run.recording, loops.Search()
     if path is not None:  # most of it is in its place already
         search = _EVERYWHERE._replace(
             most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
@@ -258,17 +269,15 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
         for number in range(1, _MOST_ROUNDS + 1):
             run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
-            some = (frames, at.labels, at.xy, len(recording))
-            compared = loops.stretches_of(*some, length=length, most=loops.MOST_COMPARED)
+            compared = run.stretches(at, length, most=loops.MOST_COMPARED)
             found = loops.find_matches(compared, search)
             found = consistent_matches(found, matches, at.path, recording.step_covariance)
             at, found = _with_matches(run, at, found)
-            stretches = loops.stretches_of(frames, at.labels, at.xy, len(recording), length=length)
             spread = _isotropic(len(at.xy), loops.REACH_M)
             if run.by_discs:
-                swayed = _with_sway(recording, settings)
-                spread = _spread(swayed, at.path, at.labels, settings.sigma_scale)
-            pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
+                swayed = _with_sway(recording, run.settings)
+                spread = _spread(swayed, at.path, at.labels, run.settings.sigma_scale)
+            pairs = pairs_by_position(run.stretches(at, length), spread, _SAME_PLACE)
             labels, by_position = run.merged(at.labels, pairs)
             if by_position:
                 at = run.solved(labels, at.path)
@@ -278,7 +287,7 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
             attached = _EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES
             search = _EVERYWHERE._replace(stretch_frames=length, attached_frames=attached)
         if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
-            return _Closed(at.labels, at.path, at.xy, tuple(matches), length)
+            return _Closed(at, tuple(matches), length)
         length = min(2 * length, _LONGEST)
         search = loops.Search(stretch_frames=length)
 
@@ -286,8 +295,10 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
 def _sparse(run: _Run, at: _Solved, length: int) -> bool:
     """Whether stretches of a length have too few discs to be recognised."""
     often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
-    some = (run.frames[often], at.labels[often], at.xy, len(run.recording))
-    stretches = loops.stretches_of(*some, length=length, stride=length, least=0)
+    frames, labels, count = run.frames[often], at.labels[often], len(run.recording)
+    stretches = loops.stretches_of(
+        frames, labels, at.xy, count, length=length, stride=length, least=0
+    )
     return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
 
 

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from redetect.array_types import IntArray
+from redetect.slam.association.run import RunAssociation
+from redetect.slam.recording import UNKNOWN_ID, Recording
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,28 @@ class AssociationScore:
     right_rows: float
     wrong_merges: int  # sum over labels of the number of their landmarks besides the first
     splits: int  # sum over landmarks of the number of labels of their rows besides the first
+
+
+#: Scores of each kind's rows, before and after the map level.
+Scores = dict[str, dict[str, AssociationScore]]
+
+
+def score_run(recording: Recording, found: RunAssociation) -> Scores:
+    """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
+
+    Kinds are those with any ID in the file; stages ``local`` and, after the map level, ``map``.
+    """
+    discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
+    scores: Scores = {}
+    for kind, ids, local, final in (
+        ("circles", discs, found.local_circle_labels, found.circle_labels),
+        ("lines", list(recording.lines.ids), found.local_line_labels, found.line_labels),
+    ):
+        if any(ids):
+            scores[kind] = {"local": score_association(local, ids)}
+            if found.path is not None:
+                scores[kind]["map"] = score_association(final, ids)
+    return scores
 
 
 def score_association(labels: IntArray, ids: Sequence[tuple[int, ...]]) -> AssociationScore:

@@ -15,24 +15,22 @@ from redetect import __version__
 from redetect.array_types import IntArray
 from redetect.bounds import NOT_NEGATIVE, demand, whole
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
-from redetect.slam.association.run import RunAssociation, associate_run
-from redetect.slam.association.score import AssociationScore, score_association
+from redetect.slam.association.run import associate_run
+from redetect.slam.association.score import Scores, score_run
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording, joined
+from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
 from redetect.storage import demand_free
-
-#: Scores of each kind's rows, before and after the map level.
-Scores = dict[str, dict[str, AssociationScore]]
 
 
 def perform(options: Associate) -> int:
     """Execute the command; returns the exit code."""
     demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
     settings = options.settings
-    sources = [(k, f) for k, run in enumerate(options.runs) for f in files.files_of(options, run)]
+    files_of_runs = [landmark_files(run, **options.rows) for run in options.runs]
+    sources = [(k, file) for k, own in enumerate(files_of_runs) for file in own]
     targets = [_target(options, k, source, len(sources) > 1) for k, source in sources]
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
@@ -40,7 +38,7 @@ def perform(options: Associate) -> int:
     demand_free([*targets, report], overwrite=options.force)
     runs = files.recordings_of(options)
     recording = joined(runs)
-    camera_xy = files.camera_xy_of(recording, options.run, options.camera)
+    camera_xy = camera_xy_of(recording, options.run, options.camera)
 
     tries: list[dict[str, Any]] = []
     for factor in (0.0, *options.noise):
@@ -82,24 +80,6 @@ def perform(options: Associate) -> int:
     }
     files.write_json(report, content, overwrite=options.force)
     return 0
-
-
-def score_run(recording: Recording, found: RunAssociation) -> Scores:
-    """Score the association with the file's own IDs: ``scores["circles"]["local"]`` and so on.
-
-    Kinds are those with any ID in the file; stages ``local`` and, after the map level, ``map``.
-    """
-    discs = [(int(i),) if i != UNKNOWN_ID else () for i in recording.circles.ids]
-    scores: Scores = {}
-    for kind, ids, local, final in (
-        ("circles", discs, found.local_circle_labels, found.circle_labels),
-        ("lines", list(recording.lines.ids), found.local_line_labels, found.line_labels),
-    ):
-        if any(ids):
-            scores[kind] = {"local": score_association(local, ids)}
-            if found.path is not None:
-                scores[kind]["map"] = score_association(final, ids)
-    return scores
 
 
 def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +13,12 @@ from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
 from redetect.landmarks import CircleLandmark, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
-from redetect.slam.commands.files import camera_of_run, recording_of
+from redetect.slam.commands.files import recording_of
 from redetect.slam.errors import SlamError
-from redetect.slam.mapping.audit import Audit, audit_run
+from redetect.slam.mapping.audit import Audit, audit_run, audited_rows
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
-from redetect.slam.recording import Recording, landmark_files
+from redetect.slam.recording import Recording, camera_of_run, landmark_files
 from redetect.storage import demand_free, write_bytes
 
 _COLUMNS = (
@@ -55,18 +54,6 @@ def perform(options: Options) -> int:
     if options.pictures is not None and camera is not None:
         _draw(options, camera, audit, source)
     return 0
-
-
-def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
-    """Rows of a file, contradicting ones corrected or dropped, all others unchanged."""
-    new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
-    disc = -1
-    for row in rows:
-        disc += isinstance(row.record, CircleLandmark)
-        if not isinstance(row.record, CircleLandmark) or disc not in new_id:
-            yield row
-        elif apply == "mend":
-            yield row.with_record(replace(row.record, ids=(new_id[disc],)))
 
 
 def _table(recording: Recording, audit: Audit, rows: Iterable[Row]) -> list[list[object]]:

@@ -13,14 +13,14 @@ from redetect.landmarks.axes import MEANING
 from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path, write_table
 from redetect.landmarks.times import read_times
 from redetect.plane import chain_steps
-from redetect.slam.commands.files import camera_xy_of, recording_of
+from redetect.slam.commands.files import recording_of
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import data_sets
 from redetect.slam.formats.g2o import graph_of_run, read_g2o, write_g2o
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.tum import read_tum, write_tum
 from redetect.slam.options import Export, Import
-from redetect.slam.recording import Recording, frames_of_discs
+from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs
 from redetect.storage import demand_free
 
 

@@ -1,4 +1,4 @@
-"""Files of the commands: the run, its camera, and outputs."""
+"""Files of the commands: runs and outputs."""
 
 from __future__ import annotations
 
@@ -9,31 +9,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from camera import Camera, camera_in, read_camera
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
-from redetect.slam.errors import SlamError
-from redetect.slam.filters.frames import NO_CAMERA
 from redetect.slam.options import RunFlags
-from redetect.slam.recording import Recording, landmark_files, read_recording
+from redetect.slam.recording import Recording, read_runs
 from redetect.storage import write_bytes
 
-MAP_NAME, PATH_NAME, MAP_PICTURE = "map.csv", "path.csv", "map.png"
-
-
-def files_of(flags: RunFlags, run: Path) -> list[Path]:
-    """The landmark files of a run, of the kinds that a command names."""
-    return landmark_files(run, **_wanted(flags))
-
-
-def _wanted(flags: RunFlags) -> dict[str, Any]:
-    return {"circles": flags.circles or not flags.lines, "lines": flags.lines, "stem": flags.stem}
-
-
-def read_runs(flags: RunFlags) -> list[Recording]:
-    """Read the rows of the runs that a command names."""
-    noise = flags.odometry_noise
-    return [read_recording(run, noise=noise, **_wanted(flags)) for run in flags.runs]
+MAP_PICTURE = "map.png"
 
 
 def recordings_of(flags: RunFlags) -> list[Recording]:
@@ -66,31 +48,6 @@ def recording_of(flags: RunFlags) -> Recording:
     """`recordings_of` the one run that a command names."""
     (recording,) = recordings_of(flags)
     return recording
-
-
-def camera_of_run(run: Path, camera: Path | Camera | None = None) -> Camera:
-    """Read the calibration that belongs to a run, a folder or a file in one.
-
-    By default it is ``<run>.cam`` in the folder, or the only ``.cam`` there. Raises `SlamError` if
-    there is none, `camera.CameraError` if it is ambiguous.
-    """
-    if camera is not None:
-        return camera if isinstance(camera, Camera) else read_camera(camera)
-    folder = run if run.is_dir() else run.parent
-    found = camera_in(folder)
-    if found is None:
-        raise SlamError(
-            f"{folder}: no calibration: expected a .cam file in it, or one by --camera; `camera "
-            "calibrate` makes one, `camera convert` converts one of another program"
-        )
-    return found
-
-
-def camera_xy_of(recording: Recording, run: Path, camera: Path | None = None) -> FloatArray:
-    """(2,) the camera's centre in the robot frame (m); zero if no line needs it."""
-    if not len(recording.lines):
-        return NO_CAMERA
-    return np.array(camera_of_run(run, camera).centre[:2])
 
 
 def default_output(run: Path, name: str = "") -> Path:

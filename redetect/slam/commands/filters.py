@@ -8,22 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from redetect import __version__
-from redetect.array_types import FloatArray
-from redetect.bounds import demand
-from redetect.landmarks import map_file, squared_mahalanobis, wrap_angle
-from redetect.slam.association.registration import localise_globally
+from redetect.bounds import demand_fields
+from redetect.landmarks import map_file
 from redetect.slam.commands import files
+from redetect.slam.distances import map_distance, path_distance
 from redetect.slam.errors import SlamError
+from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-from redetect.slam.filters.frames import Associator, FilterRun, run_filter
-from redetect.slam.filters.localizer import Localizer
+from redetect.slam.filters.localizer import localize_run
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
-from redetect.slam.recording import Recording
-from redetect.slam.settings import PLACE, PLACE_SIGMA
+from redetect.slam.recording import Recording, camera_xy_of
 from redetect.storage import demand_free, write_bytes
 
 ERROR_PICTURE = "errors.png"
@@ -38,13 +35,13 @@ _Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
 
 def perform(command: Localize | Ekf) -> int:
     """Execute the command; returns the exit code."""
-    demand(command, SlamError, start=PLACE)
+    demand_fields(command, SlamError)
     name = type(command).__name__.lower()
     output = command.output or files.default_output(command.run, name)
-    names = [files.PATH_NAME, f"{name}.json", files.MAP_PICTURE]
+    names = [map_file.PATH_NAME, f"{name}.json", files.MAP_PICTURE]
     names += [ERROR_PICTURE] * (command.reference is not None)
     if isinstance(command, Ekf):
-        names += [files.MAP_NAME, map_file.covariance_file(Path(files.MAP_NAME)).name]
+        names += [map_file.MAP_NAME, map_file.covariance_file(Path(map_file.MAP_NAME)).name]
     demand_free([output / name for name in names], overwrite=command.force)
     recording = files.recording_of(command)
     began = time.perf_counter()
@@ -67,7 +64,7 @@ def perform(command: Localize | Ekf) -> int:
 
     output.mkdir(parents=True, exist_ok=True)
     head = [f"slam {name} {__version__}: {source}"]
-    map_file.write_path(output / files.PATH_NAME, run.path, head, overwrite=command.force)
+    map_file.write_path(output / map_file.PATH_NAME, run.path, head, overwrite=command.force)
     content: dict[str, Any] = {
         "version": __version__,
         "settings": files.flags_of(command),
@@ -92,7 +89,7 @@ def perform(command: Localize | Ekf) -> int:
         drawn = draw_errors(run.path, reference.poses, title=title, interactive=shown)
         write_bytes(output / ERROR_PICTURE, drawn, overwrite=command.force)
     if isinstance(command, Ekf):
-        map_file.write_map(output / files.MAP_NAME, landmark_map, head, overwrite=command.force)
+        map_file.write_map(output / map_file.MAP_NAME, landmark_map, head, overwrite=command.force)
     return 0
 
 
@@ -104,39 +101,23 @@ def _localized(command: Localize, recording: Recording) -> _Result:
         if landmark_map.joint_covariance is None:
             name = map_file.covariance_file(command.map).name
             said.append(f"errors of the map are assumed independent: no {name}")
-    return localized_run_of(command, recording, landmark_map), landmark_map, said
-
-
-def localized_run_of(
-    command: Localize, recording: Recording, landmark_map: map_file.LandmarkMap
-) -> FilterRun:
-    """Localise a run's rows in a map, as a command asks.
-
-    Raises `SlamError` if no row shows a landmark of the map, or a flag is out of its range.
-    """
-    demand(command, SlamError, start=PLACE, start_sigma=PLACE_SIGMA)
-    start, covariance = np.array(command.start), np.diag(np.square(command.start_sigma))
-    if command.lost:
-        start, covariance = _global_start(command, recording, landmark_map)
-    localizer = Localizer(
+    run = localize_run(
+        recording,
         landmark_map,
-        start,
-        covariance,
-        files.camera_xy_of(recording, command.run, command.camera),
-        common_tilt_variance=recording.common_tilt_variance,
-        # Considering the map's errors makes the filter slow to converge to it, which does little
-        # harm with known pairs, but loses track if pairs have to be found.
-        exact=command.association != "known",
+        Associator(command.association, command.gate_probability),
+        start=command.known_start,
+        start_sigma=command.start_sigma,
+        camera_xy=camera_xy_of(recording, command.run, command.camera),
+        names=(str(command.run), str(command.map)),
     )
-    associator = Associator(command.association, command.gate_probability)
-    run = run_filter(recording, localizer, associator)
-    if not run.count.discs and not run.count.lines:
-        expected = "identifiers of the same run, or --association joint"
-        if command.association != "known":
-            expected = "some near one, seen from the pose at --start"
-        lost = f"{command.run}: no row shows a landmark of {command.map}"
-        raise SlamError(f"{lost}: expected {expected}")
-    return run
+    if (found := run.located) is not None:
+        x, y, heading = found.pose
+        print(
+            f"located at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: "
+            f"{found.agreeing} of {found.discs} discs of the first {found.frames} frames are in "
+            "the map"
+        )
+    return run, landmark_map, said
 
 
 def lost_lines(run: FilterRun, recording: Recording) -> list[str]:
@@ -155,28 +136,8 @@ def lost_lines(run: FilterRun, recording: Recording) -> list[str]:
     ]
 
 
-def _global_start(
-    command: Localize, recording: Recording, landmark_map: map_file.LandmarkMap
-) -> tuple[FloatArray, FloatArray]:
-    """The pose at the start and its covariance, from the discs of the first frames."""
-    if any(command.start) or any(command.start_sigma):
-        raise SlamError("--lost and --start: expected one of them")
-    found = localise_globally(recording, landmark_map.discs.xy)
-    if found is None:
-        raise SlamError(
-            f"{command.run}: the discs of the first frames have no certain place in {command.map}: "
-            "expected five or more that fit no other place as well; or give the pose by --start"
-        )
-    x, y, heading = found.pose
-    print(
-        f"located at {x:.2f}, {y:.2f} m, heading {np.degrees(heading):.1f} deg: {found.agreeing} "
-        f"of {found.discs} discs of the first {found.frames} frames are in the map"
-    )
-    return found.pose, found.covariance
-
-
 def _mapped(command: Ekf, recording: Recording) -> _Result:
-    camera_xy = files.camera_xy_of(recording, command.run, command.camera)
+    camera_xy = camera_xy_of(recording, command.run, command.camera)
     ekf = EkfSlam(
         command.start, camera_xy=camera_xy, common_tilt_variance=recording.common_tilt_variance
     )
@@ -193,52 +154,6 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     if waiting := len(ekf.line_slots) - lines:
         said.append(f"                  {waiting} more lines, seen with too little parallax")
     return run, landmark_map, said
-
-
-def path_distance(path: map_file.Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
-    """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
-
-    Rms, median and largest distance of positions (m) and headings (rad), and those of the last
-    pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
-    """
-    other = np.asarray(reference, dtype=np.float64)
-    if len(other) != len(path.poses):
-        raise SlamError(f"{name}{len(other)} poses: expected {len(path.poses)}, as in this run")
-    position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
-    heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
-    return {
-        f"{name}_{figure}_{unit}": float(value)
-        for name, unit, distance in (("position", "m", position), ("heading", "rad", heading))
-        for figure, value in (
-            ("rms", math.sqrt(float(np.mean(distance**2)))),
-            ("median", np.median(distance)),
-            ("max", np.max(distance)),
-            ("last", distance[-1]),
-        )
-    }
-
-
-def map_distance(
-    landmark_map: map_file.LandmarkMap, reference: map_file.LandmarkMap
-) -> dict[str, float]:
-    """Distance of landmarks from those of another map with the same identifiers."""
-    offsets, covariances = [], []
-    kinds = (landmark_map.discs, reference.discs), (landmark_map.lines, reference.lines)
-    for some, others in kinds:
-        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
-        offsets.append(some.xy[own] - others.xy[other])
-        covariances.append(some.covariance[own])
-    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
-    if not len(offset):
-        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
-    distance = np.hypot(*offset.T)
-    return {
-        "landmarks": float(len(distance)),
-        "rms_m": math.sqrt(float(np.mean(distance**2))),
-        "median_m": float(np.median(distance)),
-        "max_m": float(np.max(distance)),
-        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
-    }
 
 
 def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any]:

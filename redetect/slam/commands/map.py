@@ -12,8 +12,8 @@ import numpy as np
 
 from camera import write_camera
 from redetect import __version__
-from redetect.bounds import ABOVE_0, demand
-from redetect.landmarks.map_file import covariance_file, write_map, write_path
+from redetect.bounds import demand_fields
+from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping import run_map
@@ -23,8 +23,7 @@ from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_li
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import Recording, first_poses, joined
-from redetect.slam.settings import PLACE
+from redetect.slam.recording import camera_of_run, first_poses, joined
 from redetect.storage import demand_free, write_bytes
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
@@ -39,28 +38,37 @@ _MOST_FACTOR = 2.5
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
     output = command.output or files.default_output(command.run)
-    joint_name = covariance_file(Path(files.MAP_NAME)).name
+    joint_name = map_file.covariance_file(Path(map_file.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
-    paths = several if command.more else [files.PATH_NAME]
-    names = [files.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
+    paths = several if command.more else [map_file.PATH_NAME]
+    names = [map_file.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
     names += [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = files.recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
-    mapped = mapped_run_of(command, recording)
+    demand_fields(command, SlamError)
+    needs_camera = command.calibrate or len(recording.lines) > 0
+    mapped = map_run(
+        recording,
+        camera_of_run(command.run, command.camera) if needs_camera else None,
+        Weighting.of(command),
+        start=command.start,
+        solver=command.solver,
+        name=", ".join(map(str, command.runs)),
+    )
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {__version__}: {name}"]
     final, path = mapped.landmarks_to_write(), mapped.path
-    write_map(output / files.MAP_NAME, final, head, overwrite=command.force)
+    map_file.write_map(output / map_file.MAP_NAME, final, head, overwrite=command.force)
     if final.joint_covariance is None:
         # The file of an earlier map must not stay beside this one.
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
-        write_path(output / own, path.part(first, end), head, overwrite=command.force)
+        map_file.write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
     results = _results(mapped, check, command)
     files.write_json(output / TABLE_NAME, results, overwrite=command.force)
@@ -78,29 +86,6 @@ def perform(command: Map) -> int:
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
     print(f"{output}: {', '.join(names)}")
     return 0
-
-
-def mapped_run_of(command: Map, recording: Recording) -> MappedRun:
-    """The map of a run's rows, as a command asks."""
-    demand(command, SlamError, start=PLACE, loss_scale=ABOVE_0)
-    camera = None
-    if command.calibrate or len(recording.lines):
-        camera = files.camera_of_run(command.run, command.camera)
-    weighting = Weighting(
-        loss=command.loss,
-        loss_scale=command.loss_scale,
-        calibrate=command.calibrate,
-        place=command.place,
-        row_errors=command.row_errors,
-    )
-    return map_run(
-        recording,
-        camera,
-        weighting,
-        start=command.start,
-        solver=command.solver,
-        name=", ".join(map(str, command.runs)),
-    )
 
 
 def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str]:

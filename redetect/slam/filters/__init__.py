@@ -1,5 +1,5 @@
 """Filters: localisation in a known map (`localizer`), EKF-SLAM (`ekf_slam`).
 
-Both process a recording frame by frame; `frames` has the measurement models, and pairs rows without
+Both process a recording frame by frame; `base` has the measurement models, and pairs rows without
 identifiers with landmarks.
 """

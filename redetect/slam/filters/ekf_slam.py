@@ -28,9 +28,9 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks
 from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
-from redetect.slam.filters import frames
+from redetect.slam.filters import base
 from redetect.slam.models import common_tilt_jacobian, move, tilt_jacobian
-from redetect.slam.recording import LineRows, Recording
+from redetect.slam.recording import NO_CAMERA, LineRows, Recording
 
 #: Largest relative uncertainty of the distance of lines in the map, since users of their x and y
 #: assume that bearings are linear in these.
@@ -49,7 +49,7 @@ _CHUNK = 64
 _MOST_DISCS = 300
 
 
-class EkfSlam(frames.Filter):
+class EkfSlam(base.Filter):
     """The filter.
 
     Parameters
@@ -67,7 +67,7 @@ class EkfSlam(frames.Filter):
         self,
         start: ArrayLike = (0.0, 0.0, 0.0),
         start_covariance: ArrayLike | None = None,
-        camera_xy: ArrayLike = frames.NO_CAMERA,
+        camera_xy: ArrayLike = NO_CAMERA,
         *,
         common_tilt_variance: float = 0.0,
         tilt_sigma_rad: float = 0.0,
@@ -88,7 +88,7 @@ class EkfSlam(frames.Filter):
         by_numbers[:, :, 3] = np.stack([x, y, np.ones(len(x))], axis=1)
         return points, by_numbers
 
-    def measure(self, rows: frames.FrameRows) -> None:
+    def measure(self, rows: base.FrameRows) -> None:
         """Update with the rows of the frame: known landmarks first, then new ones.
 
         Rows of several lines are ignored unless all of them are in the state then.
@@ -108,8 +108,8 @@ class EkfSlam(frames.Filter):
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks with known positions, with their covariances."""
-        of_discs = frames.numbers_from([*self.disc_slots.values()], 2)
-        of_lines = frames.numbers_from([*self.line_slots.values()], self.line_size)
+        of_discs = base.numbers_from([*self.disc_slots.values()], 2)
+        of_lines = base.numbers_from([*self.line_slots.values()], self.line_size)
         inverse = of_lines[:, 3]
         sigma = np.sqrt(self._covariance[inverse, inverse])
         placed = sigma < LARGEST_RANGE_SIGMA * self._state[inverse]
@@ -145,7 +145,7 @@ class EkfSlam(frames.Filter):
         for slots, size, dropped in sizes:
             for number in dropped:
                 del slots[number]
-            kept.append(frames.numbers_from([*slots.values()], size).ravel())
+            kept.append(base.numbers_from([*slots.values()], size).ravel())
         index = np.concatenate(kept)
         at = len(self._moving)
         for slots, size, _ in sizes:
@@ -155,12 +155,12 @@ class EkfSlam(frames.Filter):
         self._state, self._linearised = self._state[index], self._linearised[index]
         self._covariance = np.asfortranarray(self.block(index))
 
-    def _update(self, rows: frames.FrameRows) -> None:
+    def _update(self, rows: base.FrameRows) -> None:
         """Use rows whose landmarks are in the state."""
         if not len(rows.circles) and not len(rows.lines):
             return
         before, tilt = self._state.copy(), self._covariance[self._tilt, self._tilt].copy()
-        inverse = frames.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
+        inverse = base.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
@@ -224,20 +224,20 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
 
 
 def run_ekf(
-    recording: Recording, ekf: EkfSlam, associator: frames.Associator | None = None
-) -> frames.FilterRun:
+    recording: Recording, ekf: EkfSlam, associator: base.Associator | None = None
+) -> base.FilterRun:
     """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
     If identities have to be found, discs far from all others are new ones, numbered from 1. Lines
     may be anywhere on a ray at first: `SlamError` is raised if their rows have no identifiers.
     """
-    pairing = associator or frames.Associator()
+    pairing = associator or base.Associator()
     if pairing.method != "known" and len(recording.lines):
         raise SlamError(
             f"association {pairing.method} with lines: EKF-SLAM finds identities of discs only: "
             "expected known association, or a run without lines"
         )
-    return frames.run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
+    return base.run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
 
 
 def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -256,7 +256,7 @@ def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> 
     poses = np.empty((len(recording) + 1, 3))
     poses[0] = start
     ekf, seen = EkfSlam(poses[0]), dict[int, int]()
-    for k, rows in enumerate(frames.frames_of(recording)):
+    for k, rows in enumerate(base.frames_of(recording)):
         if k in lost:
             ekf, seen = EkfSlam(move(poses[k], recording.steps[k])), {}
         else:

@@ -12,12 +12,24 @@ assumed to be independent of each other.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from redetect.landmarks.map_file import LandmarkMap
-from redetect.slam.filters.frames import NO_CAMERA, POSE_SIZE, Filter, FrameRows
+from redetect.slam.association.registration import localise_globally
+from redetect.slam.errors import SlamError
+from redetect.slam.filters.base import (
+    POSE_SIZE,
+    Associator,
+    Filter,
+    FilterRun,
+    FrameRows,
+    run_filter,
+)
+from redetect.slam.recording import NO_CAMERA, Recording
 
 
 class Localizer(Filter):
@@ -74,3 +86,48 @@ class Localizer(Filter):
         self._state[:POSE_SIZE] += factor[:POSE_SIZE] @ last
         corrected = self._covariance[:POSE_SIZE] - factor[:POSE_SIZE] @ factor.T
         self._covariance[:POSE_SIZE], self._covariance[:, :POSE_SIZE] = corrected, corrected.T
+
+
+def localize_run(
+    recording: Recording,
+    landmark_map: LandmarkMap,
+    associator: Associator | None = None,
+    *,
+    start: ArrayLike | None = (0.0, 0.0, 0.0),
+    start_sigma: ArrayLike = (0.0, 0.0, 0.0),
+    camera_xy: ArrayLike = NO_CAMERA,
+    names: tuple[str, str] = ("run", "map"),
+) -> FilterRun:
+    """Localise a run in a map, with rows paired by their identifiers unless said otherwise.
+
+    Takes the pose at the `start` in the map (m, m, rad) with its standard deviations, both (3,),
+    the camera's centre (2,) in the robot frame (m), and names of run and map for messages. An
+    unknown start, None, is estimated from the discs of the first frames, whatever their
+    identifiers. Raises `SlamError` if that has no certain place, or no row shows a landmark.
+    """
+    pairing, covariance, found = associator or Associator(), np.diag(np.square(start_sigma)), None
+    if start is None:
+        found = localise_globally(recording, landmark_map.discs.xy)
+        if found is None:
+            raise SlamError(
+                f"{names[0]}: the discs of the first frames have no certain place in {names[1]}: "
+                "expected five or more that fit no other place as well; or give the pose by --start"
+            )
+        start, covariance = found.pose, found.covariance
+    localizer = Localizer(
+        landmark_map,
+        start,
+        covariance,
+        camera_xy,
+        common_tilt_variance=recording.common_tilt_variance,
+        # Considering the map's errors makes the filter slow to converge to it, which does little
+        # harm with known pairs, but loses track if pairs have to be found.
+        exact=pairing.method != "known",
+    )
+    run = run_filter(recording, localizer, pairing)
+    if not run.count.discs and not run.count.lines:
+        expected = "identifiers of the same run, or --association joint"
+        if pairing.method != "known":
+            expected = "some near one, seen from the pose at --start"
+        raise SlamError(f"{names[0]}: no row shows a landmark of {names[1]}: expected {expected}")
+    return replace(run, located=found)

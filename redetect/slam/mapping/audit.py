@@ -10,6 +10,7 @@ explains rows better.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -19,6 +20,7 @@ from scipy.special import chdtri
 
 from camera import Camera
 from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import CircleLandmark, Row
 from redetect.least_squares.solver import factor, whitening
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
@@ -214,3 +216,15 @@ def _explained(recording: Recording, fit: _Fit, rows: IntArray, score: FloatArra
         chi_squared=_misfit(recording, fit, rows, number),
         mended_chi_squared=float(mended),
     )
+
+
+def audited_rows(rows: Iterable[Row], audit: Audit, apply: str) -> Iterator[Row]:
+    """Rows of a file, contradicting ones corrected or dropped, all others unchanged."""
+    new_id = {int(k): group.new_id for group in audit.groups for k in group.rows}
+    disc = -1
+    for row in rows:
+        disc += isinstance(row.record, CircleLandmark)
+        if not isinstance(row.record, CircleLandmark) or disc not in new_id:
+            yield row
+        elif apply == "mend":
+            yield row.with_record(replace(row.record, ids=(new_id[disc],)))

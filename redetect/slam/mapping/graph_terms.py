@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -45,6 +45,11 @@ class Weighting(Bounded, error=SlamError):
     # the row that the calibrated camera would have written is compared with the actual one, to
     # which that covariance belongs.
     row_errors: RowErrors = "recorded"
+
+    @classmethod
+    def of(cls, flags: object) -> Weighting:
+        """As flags of the same names state it."""
+        return cls(**{each.name: getattr(flags, each.name) for each in fields(cls)})
 
     @property
     def unknown_mounting(self) -> list[int]:

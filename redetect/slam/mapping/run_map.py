@@ -39,6 +39,8 @@ _PLAUSIBLE_FACTOR = 2.5
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
 Solver = Literal["separable", "gtsam"]
+Descent = Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]
+_coarsely: Descent = partial(solve, tolerance=_COARSE)
 
 #: The joint covariance of more landmarks than this is not written: it would be gigabytes.
 MOST_LANDMARKS_TOGETHER = 5000
@@ -215,44 +217,41 @@ def map_run(
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
-    begin = _in_place(recording, graph, first_sight(graph, start), name)
-    descend: Callable[[Graph, Estimate, Weighting], Minimum[Estimate]] = solve_gtsam
-    if solver != "gtsam":
-        # A robust loss converges slowly at the end, since reweighting is not Newton's method.
-        descend = partial(solve, tolerance=1e-10 if wanted.loss == "none" else 1e-7)
-    trail: list[Minimum[Estimate]] = []
-
-    def keep(solution: Minimum[Estimate]) -> Estimate:
-        trail.append(solution)
-        return solution.at
-
-    more = len(recording.lines) > 0
-    only_start = more or wanted != Weighting() or solver != "separable"
-    estimate = keep(_plain(recording, graph, begin, _COARSE if only_start else 1e-10, name))
+    begin = _parts_registered(recording, graph, first_sight(graph, start), name)
+    has_lines = len(recording.lines) > 0
+    plain_only = not has_lines and wanted == Weighting() and solver == "separable"
+    # First odometry and discs, then with lines.
+    minima = [_fitted_to_discs(recording, graph, begin, 1e-10 if plain_only else _COARSE, name)]
+    estimate = minima[-1].at
     placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
-    if more:
+    if has_lines:
         placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
         if not len(placed.ids) and not len(graph.disc_ids):
             raise SlamError(
                 f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its "
                 "own: there is nothing to map"
             )
-        graph, estimate = _with_lines(graph, recording, estimate, placed, keep)
-    if only_start:
-        fixed = replace(wanted, calibrate=False)
-        for weighting in _on_the_way(fixed):
-            estimate = keep(solve(graph, estimate, weighting, tolerance=_COARSE))
-        estimate = keep(descend(graph, estimate, fixed))
-    as_calibrated = trail[-1].costs[-1]
+        graph, estimate, with_them = _with_lines(graph, recording, estimate, placed)
+        minima += with_them
+    # From there the wanted loss, and last the mounting.
+    final: Descent = solve_gtsam
+    if solver != "gtsam":
+        # A robust loss converges slowly at the end, since reweighting is not Newton's method.
+        final = partial(solve, tolerance=1e-10 if wanted.loss == "none" else 1e-7)
+    fixed = replace(wanted, calibrate=False)
+    stages = [(_coarsely, weighting) for weighting in _on_the_way(fixed)] + [(final, fixed)]
     if wanted.calibrate:
-        estimate = keep(descend(graph, estimate, wanted))
+        stages.append((final, wanted))
+    for descend, weighting in () if plain_only else stages:
+        minima.append(descend(graph, estimate, weighting))
+        estimate = minima[-1].at
     covariance, mounting = marginals(graph, estimate, wanted), None
     if camera and estimate.mounting is not None and covariance.mounting is not None:
         mounting = Mounting(
             change=mounting_change(camera, estimate.mounting),
             covariance=covariance.mounting,
             robot_from_camera=estimate.mounting,
-            gain=as_calibrated - trail[-1].costs[-1],
+            gain=minima[-2].costs[-1] - minima[-1].costs[-1],
         )
     return MappedRun(
         prefixes=("start", *recording.prefixes),
@@ -263,13 +262,13 @@ def map_run(
         covariance=covariance,
         table=chi_squared(graph, estimate, wanted, len(recording.lost)),
         left_out=_left_out(recording, graph, placed),
-        cost=trail[-1].costs[-1],
-        steps=sum(len(solution.costs) - 1 for solution in trail),
+        cost=minima[-1].costs[-1],
+        steps=sum(len(minimum.costs) - 1 for minimum in minima),
         mounting=mounting,
     )
 
 
-def _plain(
+def _fitted_to_discs(
     recording: Recording, graph: Graph, begin: Estimate, tolerance: float, name: str
 ) -> Minimum[Estimate]:
     """Least squares of odometry and discs.
@@ -287,14 +286,14 @@ def _plain(
         return minima[0]
     with suppress(SlamError):
         poses = filtered_poses(recording, begin.poses[0])
-        again = _in_place(recording, graph, first_sight(graph, poses=poses), name)
+        again = _parts_registered(recording, graph, first_sight(graph, poses=poses), name)
         minima.append(solve(graph, again, Weighting(), tolerance=tolerance))
     if not minima:
         raise error
     return min(minima, key=lambda minimum: minimum.costs[-1])
 
 
-def _in_place(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
+def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name: str) -> Estimate:
     """An initial estimate with the parts between lost steps registered by their common discs.
 
     Each part is mapped separately. The first stays; the next is always the part with most discs in
@@ -341,23 +340,21 @@ def _in_place(recording: Recording, graph: Graph, begin: Estimate, name: str) ->
 
 
 def _with_lines(
-    graph: Graph,
-    recording: Recording,
-    estimate: Estimate,
-    placed: InitialLines,
-    keep: Callable[[Minimum[Estimate]], Estimate],
-) -> tuple[Graph, Estimate]:
-    """The problem with the lines whose positions stay determined when everything is fitted."""
-    ids, xy = placed.ids, placed.xy
+    graph: Graph, recording: Recording, estimate: Estimate, placed: InitialLines
+) -> tuple[Graph, Estimate, list[Minimum[Estimate]]]:
+    """The problem with the lines whose positions stay determined when everything is fitted.
+
+    Also its estimate, and the minima on the way there.
+    """
+    ids, xy, good = placed.ids, placed.xy, np.zeros(len(placed.ids), dtype=np.bool_)
+    minima: list[Minimum[Estimate]] = []
     while True:
-        graph = with_lines(graph, recording.lines, ids)
-        estimate = replace(estimate, line_xy=xy)
-        if len(ids) == 0:
-            return graph, estimate
-        estimate = keep(solve(graph, estimate, Weighting(loss="huber"), tolerance=_COARSE))
+        graph, estimate = with_lines(graph, recording.lines, ids), replace(estimate, line_xy=xy)
+        if np.all(good) or not len(ids):
+            return graph, estimate, minima
+        minima.append(_coarsely(graph, estimate, Weighting(loss="huber")))
+        estimate = minima[-1].at
         good = well_placed(graph, estimate)
-        if np.all(good):
-            return graph, estimate
         ids, xy = ids[good], estimate.line_xy[good]
 
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.commands.compare import comparison_of
 from detect.comparison.compare import compare_frames as compare
+from detect.comparison.compare import compare_run
 from detect.errors import CompareError, DetectError
-from detect.options import Compare, CompareOptions
+from detect.options import CompareOptions
 from detect.sources.image_files import image_name
 from redetect.landmarks import CircleLandmark, Frame, Step, read_frames, write_frames
 from tests.detect.comparison.formatting import format_text
@@ -293,25 +293,25 @@ def test_runs_are_compared_by_their_files(tmp_path: Path) -> None:
     text = (tmp_path / "map.circles").read_bytes()
     (tmp_path / "map.circles").write_bytes(text.replace(b"\n", b"\r\n"))
     write_frames(tmp_path / "detected.circles", DETECTED)
-    found = comparison_of(Compare(tmp_path))
+    found = compare_run(tmp_path)
     assert (found.matched, found.missed, found.extra) == (4, 1, 1)
     assert found.reference_name == str(tmp_path / "map.circles")
     sides = tmp_path / "detected.circles", tmp_path / "map.circles"
-    swapped = comparison_of(Compare(tmp_path, reference=sides[0], detected=sides[1]))
+    swapped = compare_run(tmp_path, reference=sides[0], detected=sides[1])
     assert (swapped.matched, swapped.missed, swapped.extra) == (4, 1, 1)
-    strict = comparison_of(Compare(tmp_path, matching=CompareOptions(gate_m=0.001)))
+    strict = compare_run(tmp_path, options=CompareOptions(gate_m=0.001))
     assert strict.matched == 2
     write_frames(tmp_path / "no.lines", [])
     for files in ((sides[1], tmp_path / "no.lines"), (tmp_path / "no.lines", sides[1])):
         with pytest.raises(CompareError, match=r"circles: its rows are circles: expected lines"):
-            comparison_of(Compare(tmp_path, True, *files))
+            compare_run(tmp_path, "lines", *files)
     write_frames(tmp_path / "other.circles", [frame("f.0000"), frame("f.0001")])
     for other in (tmp_path / "other.circles", tmp_path / "no.lines"):
         with pytest.raises(CompareError, match=r"^no image is in both .*map.circles and "):
-            comparison_of(Compare(tmp_path, detected=other))
+            compare_run(tmp_path, detected=other)
     (tmp_path / "detected.circles").unlink()
     with pytest.raises(DetectError, match=r"detected\.circles: no such landmark file"):
-        comparison_of(Compare(tmp_path))
+        compare_run(tmp_path)
 
 
 DISCS = st.lists(

@@ -18,6 +18,7 @@ from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import (
     ClockModel,
     ClockSegment,
+    ClockStatus,
     read_clock,
     read_ptpd,
 )
@@ -32,7 +33,7 @@ from redetect.groundtruth.trajectories.streams import (
 from redetect.landmarks import wrap_angle
 from tests.groundtruth.fusion.simulated import Clocks, headings_only, joined, simulate
 
-SEGMENT = ClockSegment(10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, turned_rad=5.0, status="ok")
+SEGMENT = ClockSegment(10.0, 20.0, 15.0, 0.5, 1.001, 0.0, 1e-3, 1e-4, turned_rad=5.0)
 
 
 @pytest.mark.parametrize(("offset", "drift"), [(-0.97, -0.0095), (0.0, 0.0), (0.98, 0.0097)])
@@ -211,7 +212,9 @@ def test_cuts_are_where_the_pauses_are() -> None:
 
 def test_clock_files_come_back(tmp_path: Path) -> None:
 
-    untold = replace(SEGMENT, from_s=30.0, to_s=40.0, status="no turns", sigma_rate=math.inf)
+    untold = replace(
+        SEGMENT, from_s=30.0, to_s=40.0, status=ClockStatus.NO_TURNS, sigma_rate=math.inf
+    )
     path = tmp_path / "clock.json"
     write_json(path, {"segments": [asdict(SEGMENT), asdict(untold)]})
     assert read_clock(path).segments == (SEGMENT, untold)

@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.commands.lasers import perform
-from redetect.groundtruth.commands.options import Lasers
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.alignment import STEPS, align_scanners
 from redetect.groundtruth.lasers.scanners import (
@@ -23,6 +22,7 @@ from redetect.groundtruth.lasers.scanners import (
     with_measured_noise,
 )
 from redetect.groundtruth.lasers.walls import still_scan
+from redetect.groundtruth.options import Lasers
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
 from redetect.plane import between

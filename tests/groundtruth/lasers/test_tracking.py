@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.commands.laser import perform, seen_through
-from redetect.groundtruth.commands.options import Laser
+from redetect.groundtruth.commands.laser import perform
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     ScanSets,
@@ -24,12 +23,7 @@ from redetect.groundtruth.lasers.acquisition import (
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.lasers.tracking import (
-    COASTING,
-    LOST,
-    OK,
-    REACQUIRED,
-    UNDETERMINED,
-    UNRESOLVED,
+    SetStatus,
     combined_poses,
     track_by_lasers,
     track_without_suspects,
@@ -42,6 +36,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     explain_set,
     new_points,
 )
+from redetect.groundtruth.options import Laser
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import wrap_angle
@@ -280,11 +275,11 @@ def test_a_track_through_a_loss(recorded: ScanSets, tables: FixedScanners) -> No
     t = track.times_s
     gap = (t > 2.02) & (t < 2.98)
     there = ((t > 0.1) & (t < 1.98)) | ((t > 3.1) & (t < 4.95))
-    good = np.isin(track.status, (OK, REACQUIRED))
-    assert np.isin(track.status[gap], (LOST, COASTING)).all()
+    good = track.is_determined
+    assert np.isin(track.status[gap], (SetStatus.LOST, SetStatus.COASTING)).all()
     assert np.isnan(track.poses[gap]).all()
     assert good[there].mean() > 0.98
-    assert int((track.status == REACQUIRED).sum()) == 2
+    assert int((track.status == SetStatus.REACQUIRED).sum()) == 2
     assert len(track.fronts) == 2
     error = errors(t[good], track.poses[good])
     assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.005
@@ -302,7 +297,7 @@ def test_scans_of_slow_scanners_are_moved_on_along_the_arc(
     """They are up to a fifth of a second apart, in which the robot drives and turns."""
     scans = record(scanners, circle, (0.0, 6.0), FRONTED, 5, rate_hz=rate_hz)
     track = track_by_lasers(sets_of_scans(scans), tables, Robot(FRONTED, 1.0, 1.0))
-    good = np.isin(track.status, (OK, REACQUIRED))
+    good = track.is_determined
     assert good.mean() > 0.95
     assert len(track.fronts) == 1
     error = errors(track.times_s[good], track.poses[good])
@@ -314,7 +309,7 @@ def test_scans_of_slow_scanners_are_moved_on_along_the_arc(
 def test_combined_poses(recorded: ScanSets, tables: FixedScanners) -> None:
     track = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     one, six = combined_poses(track, 1), combined_poses(track, 6)
-    good = np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
+    good = track.is_determined | (track.status == SetStatus.UNDETERMINED_DIRECTION)
     assert len(one) == good.sum()
     assert one.poses == pytest.approx(track.poses[good])
     assert len(one) / 6 <= len(six) < len(one) / 6 + 10
@@ -346,7 +341,7 @@ def test_the_front_of_a_plain_box_shows_when_it_drives(
 ) -> None:
     sets = sets_of_scans(record(scanners, circle, (0.0, 3.0), PLAIN, 12))
     track = track_by_lasers(sets, tables, Robot(PLAIN, 1.0, 1.0))
-    good = np.isin(track.status, (OK, REACQUIRED))
+    good = track.is_determined
     assert good.mean() > 0.95
     error = errors(track.times_s[good], track.poses[good])
     assert np.degrees(np.abs(error[:, 2]).max()) < 5.0
@@ -354,7 +349,7 @@ def test_the_front_of_a_plain_box_shows_when_it_drives(
 
     still = sets_of_scans(record(scanners, lambda t: circle(1.0), (0.0, 1.0), PLAIN, 13))
     standing = track_by_lasers(still, tables, Robot(PLAIN, 1.0, 1.0))
-    assert (standing.status == UNRESOLVED).mean() > 0.9
+    assert (standing.status == SetStatus.FRONT_UNKNOWN).mean() > 0.9
     assert len(combined_poses(standing)) == 0
 
 
@@ -372,10 +367,10 @@ def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
     assert np.hypot(track.corrections[:, 0], track.corrections[:, 1]).max() < 0.002
     without, left_out = track_without_suspects(recorded, moved, Robot(FRONTED, 1.0, 1.0), wrong)
     assert list(left_out) == ["fixed2"]
-    good = np.isin(without.status, (OK, REACQUIRED))
+    good = without.is_determined
     error = errors(without.times_s[good], without.poses[good])
     assert np.hypot(error[:, 0], error[:, 1]).mean() < 0.006
-    good = np.isin(off.status, (OK, REACQUIRED))
+    good = off.is_determined
     error = errors(off.times_s[good], off.poses[good])
     assert np.hypot(error[:, 0], error[:, 1]).max() < 0.1
     assert np.nanmean(off.covariances[good, 0, 0]) > 1.5 * np.nanmean(track.covariances[:, 0, 0])
@@ -394,7 +389,7 @@ def test_a_passer_by_is_marked_and_the_effect_bounded(
 
     sets = sets_of_scans(record(scanners, circle, (0.0, 2.0), FRONTED, 14, passing))
     track = track_by_lasers(sets, tables, Robot(FRONTED, 1.0, 1.0))
-    good = np.isin(track.status, (OK, REACQUIRED, UNDETERMINED))
+    good = track.is_determined | (track.status == SetStatus.UNDETERMINED_DIRECTION)
     near = np.abs(track.times_s - 1.0) < 0.2
     far = np.abs(track.times_s - 1.0) > 0.6
     assert good[near].mean() > 0.8
@@ -465,11 +460,11 @@ def test_an_outline_of_a_wrong_size_is_moved_to_the_readings(
 ) -> None:
     exact = track_by_lasers(recorded, tables, Robot(FRONTED, 1.0, 1.0))
     assert exact.outline_moved_m == 0.0
-    assert seen_through(exact) < 0.05
+    assert exact.seen_through < 0.05
     wrong = track_by_lasers(recorded, tables, Robot(scale * FRONTED, 1.0, 1.0))
     # Its sides are 0.3 m and its ends 0.35 m from its middle.
     assert wrong.outline_moved_m == pytest.approx(0.325 * (1.0 - scale), abs=0.006)
-    assert seen_through(wrong) < 0.08
+    assert wrong.seen_through < 0.08
     assert np.array_equal(np.isfinite(exact.poses), np.isfinite(wrong.poses))
     assert np.nanmedian(np.hypot(*(exact.poses - wrong.poses)[:, :2].T)) < 0.005
 
@@ -483,7 +478,7 @@ def test_errors_of_single_sides_of_an_outline_are_in_the_covariance(
         drawn = FRONTED + np.random.default_rng(seed).normal(0.0, 0.012, FRONTED.shape)
         track = track_by_lasers(recorded, tables, Robot(drawn, 1.0, 1.0))
         assert track.outline_sigma_m > 0.002
-        good = np.isin(track.status, (OK, REACQUIRED))
+        good = track.is_determined
         error, inverse = errors(track.times_s, track.poses)[good], np.linalg.inv(track.covariances)
         squares.append(float(np.mean(np.einsum("ni,nij,nj->n", error, inverse[good], error))) / 3.0)
     assert np.mean(squares) < 2.5

@@ -128,9 +128,9 @@ def test_the_minimum_and_the_covariances_are_scipys() -> None:
     assert adjusted.cost == pytest.approx(2.0 * solved.cost, rel=1e-9)
     best = bundle.moved(solved.x)
     for mine, theirs in (
-        (bundle.world_from_camera, best.world_from_camera),
-        (bundle.world_from_body, best.world_from_body),
-        (bundle.body_from_part, best.body_from_part),
+        (bundle.chain.world_from_camera, best.chain.world_from_camera),
+        (bundle.chain.world_from_body, best.chain.world_from_body),
+        (bundle.chain.body_from_part, best.chain.body_from_part),
     ):
         np.testing.assert_allclose(se3.log(se3.inverse(theirs) @ mine), 0.0, atol=3e-7)
     jacobian = dense_jacobian(bundle)
@@ -157,7 +157,7 @@ def test_a_wrong_view_is_left_out_and_the_rest_is_as_without_it() -> None:
     np.testing.assert_array_equal(adjusted.used, ~wrong)
     without = adjust_bundle(replace(bundle.only(~wrong), view=bundle.view[~wrong]))
     np.testing.assert_allclose(
-        adjusted.bundle.body_from_part, without.bundle.body_from_part, atol=1e-8
+        adjusted.bundle.chain.body_from_part, without.bundle.chain.body_from_part, atol=1e-8
     )
     assert adjusted.cost == pytest.approx(without.cost, rel=1e-9)
 
@@ -193,6 +193,6 @@ def test_what_is_not_determined_is_refused() -> None:
     with pytest.raises(GeometryError, match="16 residuals for 90 unknowns: too little was seen"):
         adjust_bundle(few)
     behind = replace(bundle, poses=bundle.poses.copy())
-    behind.world_from_body[0, :3, 3] += [0.0, 0.0, 50.0]
+    behind.chain.world_from_body[0, :3, 3] += [0.0, 0.0, 50.0]
     with pytest.raises(GeometryError, match="behind its camera or outside its lens"):
         adjust_bundle(behind)

@@ -21,7 +21,12 @@ from redetect.groundtruth.markers.session import (
     read_marker_frames,
     rig_views,
 )
-from redetect.groundtruth.markers.track import excess_of, report_entry, track_by_markers
+from redetect.groundtruth.markers.track import (
+    PoseStatus,
+    excess_of,
+    report_entry,
+    track_by_markers,
+)
 from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerCorner
@@ -123,8 +128,8 @@ def test_every_time_is_accounted_for() -> None:
     frames[1] = replace(frames[1], markers=())
     network = replace(NETWORK, cameras=(lens(500.0),) * 4)
     track = track_by_markers(group_by_time(frames, 0.005), rig, network, PoseSettings())
-    assert track.counts["unseen"] == 1
-    assert track.counts["resolved"] >= 2
+    assert track.counts[PoseStatus.UNSEEN] == 1
+    assert track.counts[PoseStatus.RESOLVED] >= 2
     assert sum(track.counts.values()) == 12
     for tracked, truth in zip(track.times, poses):
         entry = report_entry(tracked, network)

@@ -20,17 +20,18 @@ from camera.calibration.calibrate import (
     aspect_of,
     calibrate,
     calibrate_freely,
+    calibrated_camera,
 )
 from camera.calibration.consensus import view_rms
-from camera.calibration.floor import write_picture
 from camera.calibration.images import calibration_files, calibration_images
-from camera.calibration.model import COUNT, INTRINSICS, CalibrationSettings
+from camera.calibration.model import INTRINSICS, CalibrationSettings
 from camera.calibration.pictures import drawn_corners, pictures
 from camera.camfile import format_camera
-from camera.errors import CalibrationError, CameraError
-from camera.model import PARAMETERS, Camera
+from camera.commands.floor import write_picture
+from camera.errors import CalibrationError
+from camera.model import Camera
 from camera.options import Calibrate
-from camera.uncertainty import UNPOSED, projection_sigma, with_covariance, with_intrinsics
+from camera.uncertainty import projection_sigma
 from redetect import __version__
 from redetect.array_types import GreyImage
 from redetect.json_text import json_text
@@ -80,7 +81,7 @@ def perform(options: Calibrate) -> int:
     views, size = find_views(images(), board)
     calibrated = calibrate_freely if options.free_aspect else calibrate
     calibration = calibrated(views, board, size, settings)
-    camera = camera_of(calibration)
+    camera = calibrated_camera(calibration)
     print(describe(calibration, camera))
     print(
         "no pose: sensor2World is the identity; `camera floor` finds it from a picture of the "
@@ -186,21 +187,6 @@ def find_views(
         print(f"{', '.join(names)}: {reason}", file=sys.stderr)
     print(f"{board}: found in {len(views)} of {count} pictures of {size[0]} x {size[1]}")
     return views, size
-
-
-def camera_of(calibration: Calibration) -> Camera:
-    """The calibrated camera with the covariance of its lens, without a pose."""
-    size = {"width": calibration.points.width, "height": calibration.points.height}
-    covariance = np.zeros((PARAMETERS, PARAMETERS))
-    covariance[:COUNT, :COUNT] = calibration.adjusted.covariance
-    try:
-        camera = with_intrinsics(UNPOSED, calibration.intrinsics, **size)
-        return with_covariance(camera, covariance)
-    except CameraError as error:
-        raise CalibrationError(
-            f"the calibration is not a possible camera: {error}; take pictures that cover the "
-            "image's corners, or use fewer --coefficients"
-        ) from None
 
 
 def describe(calibration: Calibration, camera: Camera) -> str:

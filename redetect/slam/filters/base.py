@@ -1,4 +1,4 @@
-"""A recording frame by frame, as input of the filters: innovations, pairing, the loop over a run.
+"""The base of both filters: innovations, pairing of rows with landmarks, the loop over a run.
 
 Rows without identifiers are paired with landmarks of the filter's state, discs and lines
 separately, frame by frame, by `redetect.slam.association.compatibility`.
@@ -26,6 +26,7 @@ from redetect.slam.association.compatibility import (
     compatible,
     individual_distances,
 )
+from redetect.slam.association.registration import GlobalPose
 from redetect.slam.errors import SlamError
 from redetect.slam.models import (
     common_tilt_jacobian,
@@ -36,7 +37,6 @@ from redetect.slam.models import (
 )
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 
-NO_CAMERA = np.zeros(2)
 POSE_SIZE = 3
 _POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
 #: A row shows a new disc if its distance from all known discs is this many times the gate.
@@ -109,6 +109,7 @@ class FilterRun:
     count: RowCount
     disc_ids: IntArray  # (n,): the disc of each row, from the file or association; -1 for none
     line_ids: tuple[tuple[int, ...], ...]  # the lines of each row; empty for none
+    located: GlobalPose | None = None  # where the start is in the map, if it was unknown
 
 
 def frames_of(recording: Recording) -> Iterator[FrameRows]:

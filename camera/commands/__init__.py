@@ -1,0 +1,1 @@
+"""The commands of the program `camera`, but `level`, which needs detection."""
