@@ -38,9 +38,8 @@ from redetect.storage import demand_place
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
-#: If the camera is at an estimated height, this share of frames with discs still has some, and the
-#: height that is estimated again is the same within this many sigmas.
-_STILL_SEEN, _MOST_SIGMAS = 0.9, 3.0
+_STILL_SEEN = 0.9  #: Share of frames with discs that still has some at the estimated height.
+_MOST_SIGMAS = 3.0  #: Largest deviation of the height that is estimated from there, sigmas.
 #: Number of neighbouring frames that see the same discs.
 _TOGETHER = 5.0
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
