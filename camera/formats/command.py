@@ -56,6 +56,9 @@ def perform(options: Convert) -> int:
             f"{options.target}: not written, since {converted.deviation_px:.3g} px is above "
             f"--limit-px {options.limit_px:g}: choose another --model or format, or raise the limit"
         )
+    if isinstance(camera, Camera) and camera.seen_share < 1.0:
+        unseen = 100.0 * (1.0 - camera.seen_share)
+        print(f"{unseen:.1f} % of the image, past the distortion's fold, see nothing")
     if isinstance(camera, Camera) and not isinstance(source, Camera) and options.pose_from is None:
         print(
             "no pose: sensor2World is the identity; give --pose-from, or let `camera floor` find it"
@@ -107,14 +110,10 @@ def format_of_text(path: Path, text: str) -> Format:
         return "cam"
     if path.suffix.lower() == ".txt":
         return "colmap"
-    if text.lstrip().startswith("<"):
-        raise ConversionError(
-            f"{path}: is XML: expected YAML; OpenCV writes it where the file's name ends in .yml"
-        )
-    if text.startswith("%YAML:") or "!!opencv-matrix" in text:
+    if text.startswith("%YAML:") or "!!opencv-matrix" in text or text.lstrip().startswith("<"):
         return "opencv"
     content = yaml_files.parse_yaml(text, str(path))
-    if any(isinstance(value, dict) and "intrinsics" in value for value in content.values()):
+    if yaml_files.kalibr_cameras(content):
         return "kalibr"
     if "distortion_model" in content:
         return "ros"
