@@ -50,9 +50,10 @@ _ROUNDING_NOISE = 0.3
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 #: Number of rows from which an image's noise is estimated.
 _NOISE_ROWS = 16
-#: Lowest gradient of an edge that votes, and the same in images full of edges, grey levels per
-#: pixel; the same in noise deviations, as a share of `noise_floor`; lowest step at a rim.
-_FAINT_EDGE, _EDGE, _EDGE_NOISE, _LEAST_STEP = 2.0, 4.0, 0.4, 5.0
+#: Lowest gradient of an edge that votes, and in images full of edges, grey levels per pixel.
+_FAINT_EDGE, _EDGE = 2.0, 4.0
+_EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.
+_LEAST_STEP = 5.0  #: Lowest step at a rim, grey levels.
 
 
 #: A camera in the form that kernels take.

@@ -15,9 +15,9 @@ _DARK, _LIGHT = 2, 253
 #: The mask's absolute coefficients add up to 16, so no response is larger.
 _MOST_RESPONSE = 16 * 255
 
-#: Largest range of the grey values of a margin: noise and compression artefacts; least step to the
-#: column next to it, grey levels, and the share of that column's pixels with such a step.
-_MOST_RANGE, _LEAST_STEP, _LEAST_SHARE = 24, 8, 0.5
+_MOST_RANGE = 24  #: Of a margin's grey values: noise and compression artefacts.
+_LEAST_STEP = 8  #: From a margin to the column next to it, grey levels.
+_LEAST_SHARE = 0.5  #: Of that column's pixels, with such a step.
 #: Widths of margins are multiples of this (columns), so that few tables are needed.
 _COLUMNS = 8
 #: If a larger share of the width is blank, it is a blank scene, not a margin.

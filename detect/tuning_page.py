@@ -44,8 +44,8 @@ from redetect.storage import demand_free, write_bytes
 SETTINGS_NAME, LABELS_NAME = "tuned.json", "labels.circles"
 #: Longest request: some hundred settings, and labels of every frame.
 _LONGEST_BYTES = 1 << 22
-#: Number of points of an outline, and semi-axes of an ellipse in standard deviations.
-_OUTLINE, _SIGMAS = 32, 3.0
+_OUTLINE = 32  #: Number of points of an outline.
+_SIGMAS = 3.0  #: Semi-axes of an ellipse in standard deviations.
 _LABELS_HEAD = "Discs with identifiers given by hand, on the page of `detect tune --serve`."
 
 

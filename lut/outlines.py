@@ -26,8 +26,8 @@ from redetect.messages import OneLineError
 
 #: Least share of an outline's samples inside the image.
 MIN_SHARE_INSIDE = 0.5
-#: Samples of each outline that the centres of a group share, and columns that it covers.
-GROUP_SAMPLES, GROUP_COLUMNS = 10, 16
+GROUP_SAMPLES = 10  #: Samples of each outline that the centres of a group share.
+GROUP_COLUMNS = 16  #: Columns that a group covers.
 
 
 class TableError(OneLineError, ValueError):

@@ -17,8 +17,8 @@ from camera import Camera
 from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
 from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
-#: Width of a cell, radii, and its least length ahead, pixels.
-_CELL_RADII, _CELL_PX = 0.25, 0.8
+_CELL_RADII = 0.25  #: Width of a cell, radii.
+_CELL_PX = 0.8  #: Its least length ahead, pixels.
 #: Resolution of the lookup from distance ahead to row of cells, steps per radius.
 _STEPS_PER_RADIUS = 16.0
 #: If every disc is this wide (pixels), columns are added in pairs; if it is this high, every second

@@ -31,10 +31,10 @@ _MOST_COUNTED = 1000
 # Spacing of neighbouring circles, in `square_m`; in an asymmetric grid, that across.
 _NEIGHBOURS_SQUARES: dict[str, float] = {"circles": 1.0, "asymmetric-circles": 2.0**0.5}
 _COUNTED = {"checkerboard": "inner corners", "charuco": "squares"}  # else circles
-#: Left blank by printers, and for the line of text at the bottom (m).
-_MARGIN_M, _TEXT_M = 0.004, 0.012
-# Length of the printed ruler, and the least width of a page (m).
-_RULER_M, _LEAST_WIDTH_M = 0.1, 0.2
+_MARGIN_M = 0.004  # Left blank by printers.
+_TEXT_M = 0.012  # Left for the line of text at the bottom.
+_RULER_M = 0.1  # Length of the printed ruler.
+_LEAST_WIDTH_M = 0.2  # Of a page.
 _M_PER_INCH = 0.0254
 _INK: Any = {"facecolor": "black", "edgecolor": "none", "linewidth": 0.0}
 

@@ -24,8 +24,8 @@ _ALONG, _LONGEST_PX = 0.4, 16.0
 _WIDEST_PX, _NARROWEST_PX = 3.0, 1.2
 # By blur and the width of the gradient filter, the marker's edge reaches this far into the margin.
 _REACH_PX = 1.5
-# Largest distance from the predicted position, in squares; correlation with the printed pattern.
-_FARTHEST, _LEAST_AGREEMENT = 0.25, 0.85
+_FARTHEST = 0.25  # From the predicted position, in squares.
+_LEAST_AGREEMENT = 0.85  # Correlation with the printed pattern.
 _ITERATIONS, _STILL_PX = 40, 1e-4
 # Number of neighbours from which a missing corner is predicted.
 _NEIGHBOURS = 12

@@ -271,9 +271,9 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
     if (source.model == "fisheye") != (model == "fisheye"):
         return None
     count = COEFFICIENTS[model]
-    padded = (*source.distortion, *(0.0,) * count)[:count]
-    if any(source.distortion[count:]) or any(padded[number:]):
+    if any(source.distortion[min(count, number) :]):
         return None
+    padded = (*source.distortion, *(0.0,) * count)[:count]
     return replace(source, model=model, distortion=padded)
 
 

@@ -172,8 +172,7 @@ def write_parquet(stream: BinaryIO, table: TableName, rows: Sequence[Row], sourc
         arrays = [pa.array(column, field.type) for column, field in zip(columns, fields)]
     except UnicodeEncodeError:
         raise DetectError(
-            f"{source}: its name, or that of an image, is not valid Unicode: Parquet cannot "
-            "store it"
+            f"{source}: its name, or that of an image, is not valid Unicode, as Parquet needs it"
         ) from None
     pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), stream)
 

@@ -25,9 +25,8 @@ from detect.sources.opening import open_run
 from detect.terminal import progress_bar, report_failures
 from redetect.storage import demand_place
 
-#: If the camera is at an estimated height, this share of frames with discs still has some, and the
-#: height that is estimated again is the same within this many sigmas.
-_STILL_SEEN, _MOST_SIGMAS = 0.9, 3.0
+_STILL_SEEN = 0.9  #: Share of frames with discs that still has some at the estimated height.
+_MOST_SIGMAS = 3.0  #: Largest deviation of the height that is estimated from there, sigmas.
 
 
 def perform(options: Level) -> int:

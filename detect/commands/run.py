@@ -37,8 +37,8 @@ from redetect.array_types import GreyImage
 from redetect.landmarks.files import read_head
 from redetect.messages import counted
 
-#: Least number of images with a tilt, and least lean, for the radius to be estimated with it.
-_FEWEST_TILTS, _LEAST_LEAN_RAD = 4, math.radians(1.0)
+_FEWEST_TILTS = 4  #: Images that have to show the camera's lean for it to count in the radius.
+_LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
 def perform(command: DetectorFlags) -> int:

@@ -114,10 +114,8 @@ def perform(options: Tune) -> int:
     for record in records:
         if record["knee"]:
             values = " ".join(f"{name}={record[name]}" for name in varied)
-            print(
-                f"knee: {values}: recall {record['recall']:.3f}, "
-                f"precision {record['precision']:.3f}"
-            )
+            rates = f"recall {record['recall']:.3f}, precision {record['precision']:.3f}"
+            print(f"knee: {values}: {rates}")
     failures = sorted({failure for _, failed in trials for failure in failed})
     return report_failures(len(failures), failures)
 

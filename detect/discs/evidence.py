@@ -9,10 +9,10 @@ from redetect.array_types import BoolArray, FloatArray
 
 #: Log-odds from which a disc is sure; doubtful discs are compared with the sure ones.
 SURE = 2.5
-#: A disc with less than this share of the others' contrast is pale; penalty for each factor of e,
-#: log-odds; least number of sure discs to compare with; lowest grey value used in a ratio.
-_PALE, _PER_FACTOR = 0.5, 4.0
-_LEAST_OTHERS, _DARKEST = 2, 5.0
+_PALE = 0.5  #: A disc with less than this share of the others' contrast is pale.
+_PER_FACTOR = 4.0  #: Penalty for each factor of e, log-odds.
+_LEAST_OTHERS = 2  #: Least number of sure discs to compare with.
+_DARKEST = 5.0  #: Lowest grey value used in a ratio.
 
 
 def paleness_penalty(contrast: FloatArray, floor_grey: FloatArray, sure: BoolArray) -> FloatArray:

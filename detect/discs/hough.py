@@ -30,10 +30,11 @@ from redetect.compiled import kernel
 
 #: Added to the mean votes at a distance, so that a few votes among empty cells score low.
 _BACKGROUND = 0.3
-#: Lowest score of a candidate, and of a clear one. Limits: doubtful candidates of an image,
-#: candidates that are compared with their neighbours, peaks.
-_LEAST_SCORE, _CLEAR_SCORE = 1.7, 3.0
-_MOST_DOUBTFUL, _MOST_COMPARED, _MOST_PEAKS = 200, 600, 4000
+_LEAST_SCORE = 1.7  #: Of a candidate.
+_CLEAR_SCORE = 3.0  #: Of a clear one.
+_MOST_DOUBTFUL = 200  #: Doubtful candidates of an image.
+_MOST_COMPARED = 600  #: Candidates that are compared with their neighbours, unless all are clear.
+_MOST_PEAKS = 4000
 #: Least distance from a better candidate, radii; less than 2, for discs may touch.
 _APART = 0.6
 #: The Sobel kernel scales a gradient per pixel by this.

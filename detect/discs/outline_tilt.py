@@ -35,8 +35,8 @@ LEAST_DIRECTIONS = 24
 LEAST_AXIS_PX = 1.2
 #: Least contrast, grey levels.
 LEAST_CONTRAST = 8.0
-#: Standard deviation of a rim point, pixels, and number of neighbours with a common error.
-POINT_SIGMA_PX, TOGETHER = 0.25, 4.0
+POINT_SIGMA_PX = 0.25  #: Standard deviation of a rim point, pixels.
+TOGETHER = 4.0  #: Number of neighbours with a common error.
 #: Standard deviation of a single disc's tilt, and of the floor's below all discs of a frame.
 DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 

@@ -27,21 +27,21 @@ if TYPE_CHECKING:
 #: Pixels that the fit of a whole disc uses, and those of the fit by parts.
 WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
 EDGE_ALONE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
-#: Relative standard deviations of radii: prior of a whole disc's fit; mean radius of all discs
-#: against the nominal one; one disc against the mean, prior and maximum.
-RADIUS_SIGMA, _CALIBRATED_SIGMA = 0.08, 0.02
-_USUAL_SCATTER, _MOST_SCATTER = 0.01, 0.03
-#: Steps of the robust mean of radii, and the number of radii from which it starts at their median.
-_SIZE_STEPS, _LEAST_OTHERS = 4, 3
+#: Relative standard deviations of radii:
+RADIUS_SIGMA = 0.08  #: Prior of a whole disc's fit.
+_CALIBRATED_SIGMA = 0.02  #: Mean radius of all discs against the nominal one.
+_USUAL_SCATTER, _MOST_SCATTER = 0.01, 0.03  #: One disc against the mean: prior and maximum.
+_SIZE_STEPS = 4  #: Of the robust mean of radii.
+_LEAST_OTHERS = 3  #: Number of radii from which it starts at their median.
 #: Share of the variance that a fit explains if there is nothing but a disc and noise.
 _WELL_EXPLAINED = 0.97
-#: Share of the rim from which it is complete; share of the variance that the fit of the whole disc
-#: has to explain with a complete rim, and with less of it.
-_WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.8, 0.9, 0.97
+_WHOLE_RIM = 0.8  #: Share of the rim from which it is complete.
+#: Share of the variance that a whole disc's fit has to explain with a complete rim, and with less.
+_EXPLAINS_WHOLE, _EXPLAINS_PART = 0.9, 0.97
 #: The fit of a whole disc is final if it explains this share of the variance.
 _EXPLAINS_ALL = 0.99
-#: If the blur reaches this share of a patch's bound, the fit is repeated in a wider patch.
-_AT_BOUND, _MOST_REFITS = 0.98, 2
+_AT_BOUND = 0.98  #: If the blur reaches this share of a patch's bound, the fit is repeated,
+_MOST_REFITS = 2  #: in a wider patch, up to so many times.
 #: Stages of fits: whole discs, up to as often; then parts of discs; then again with a better size.
 _PARTS, _LAST = _MOST_REFITS + 1, _MOST_REFITS + 2
 #: Initial blur, pixels.

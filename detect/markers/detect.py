@@ -43,11 +43,14 @@ _HOPELESS_BLUR_CELLS = 0.75
 _FIRST_LOOK_SLACK = 0.1
 #: If the edges of a marker and its fit disagree by more than this (mean normalised squared
 #: difference, including the edges' systematic error), the marker is not flat, or distorted by an
-#: uncalibrated lens. The measured edges are then used, in this number of parts.
-_MOST_DISAGREEMENT, _EDGE_SYSTEMATIC_PX, _PARTS = 6.0, 0.02, 8
-#: Smaller markers are assumed flat. Edges with a blur above this share of the border are not used:
-#: they are biased by the brightness of the cells inside, or beyond the quiet zone.
-_LEAST_BENT_PX, _SHARP_BLURS = 40.0, 0.14
+#: uncalibrated lens: the measured edges are then used.
+_MOST_DISAGREEMENT = 6.0
+_EDGE_SYSTEMATIC_PX = 0.02
+_PARTS = 8  #: Of each of these edges.
+_LEAST_BENT_PX = 40.0  #: Smaller markers are assumed flat.
+#: Edges with a blur above this share of the border are not used: they are biased by the brightness
+#: of the cells inside, or beyond the quiet zone.
+_SHARP_BLURS = 0.14
 #: Steps from or to grey levels beyond these are clipped, which shifts the edges.
 _UNCLIPPED = (3.0, 250.0)
 #: Systematic error without optical blur, and the blur's variance (px^2) at which it vanishes.

@@ -33,8 +33,8 @@ SIGMA = "\N{GREEK SMALL LETTER SIGMA}"
 _WIDE = 7.6
 _MOST_DOTS = 4000
 
-#: Semi-axes of the map's ellipses, in standard deviations, and their number of points.
-_SIGMAS, _CORNERS = 3.0, 32
+_SIGMAS = 3.0  #: Semi-axes of the map's ellipses, in standard deviations.
+_CORNERS = 32  #: Their number of points.
 #: Matplotlib cannot scale axes to any number.
 _FARTHEST_M = 1e12
 #: Variance on the floor above which discs of different frames are not paired.

@@ -207,9 +207,8 @@ def tilt_of_lines(prefix: str, lines: LineDetections) -> FrameTilt | None:
     if tilt is None:
         return None
     (cpp, cpr), (_, crr) = tilt.covariance.tolist()
-    return tilt_as_written(
-        FrameTilt(prefix, tilt.pitch_rad, tilt.roll_rad, cpp, cpr, crr, tilt.lines)
-    )
+    found = FrameTilt(prefix, tilt.pitch_rad, tilt.roll_rad, cpp, cpr, crr, tilt.lines)
+    return tilt_as_written(found)
 
 
 def rows_of_frames(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameRows]:

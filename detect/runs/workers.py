@@ -55,8 +55,8 @@ _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
 _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
-#: Time after which processes are killed, and interval of checks for an interrupt.
-_GRACE_S, _PATIENCE_S = 1.0, 0.2
+_GRACE_S = 1.0  #: Time after which processes are killed.
+_PATIENCE_S = 0.2  #: Interval of checks for an interrupt.
 #: The lock that a process holds while it compiles kernels, until the end of that task.
 _compiling: list[RLock] = []
 

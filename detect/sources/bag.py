@@ -30,12 +30,13 @@ from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray, GreyImage
 from redetect.messages import OneLineError, excerpt, imported_for, one_line
+from redetect.plane import rotation
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-#: Longest excerpts of other packages' messages, and of topics and types in a bag, characters.
-_LONGEST_CAUSE, LONGEST_NAME = 200, 60
+_LONGEST_CAUSE = 200  #: Of an excerpt from another package's message, characters.
+LONGEST_NAME = 60  #: Of one from a topic or type in a bag.
 
 #: Channels of each encoding; they have 16 bits if the encoding's name says so, else 8.
 _CHANNELS = {
@@ -285,10 +286,9 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
                 ignored = np.count_nonzero(pose.covariance) == 3 and diagonal.min() >= 0.0
                 grown = np.diag(diagonal) if ignored else np.zeros((3, 3))
             if not np.any(grown):
-                cos, sin = np.cos(pose.theta), np.sin(pose.theta)
-                by_rate = (pose.time_s - before.time_s) * np.array(
-                    [[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]
-                )
+                by_rate = np.eye(3)
+                by_rate[:2, :2] = rotation(pose.theta)
+                by_rate *= pose.time_s - before.time_s
                 grown = by_rate @ twist @ by_rate.T
             total = carried(total, before, pose) + grown
         yield replace(pose, covariance=total)

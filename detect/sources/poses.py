@@ -36,9 +36,9 @@ _LOST: dict[str, Any] = dict(zip(STEP_NUMBERS[3:], (1e6, 0.0, 1e6, 0.0, 0.0, 100
 #: Maps (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
-# A step's covariance is invalid if its smallest eigenvalue is below this share of its largest, or
-# of the rounding errors of the pose's own.
-_INDEFINITE, _ROUNDING = 1e-8, 1e-12
+# A step's covariance is invalid if its smallest eigenvalue is below one of these shares:
+_INDEFINITE = 1e-8  # of its largest
+_ROUNDING = 1e-12  # of the pose's own covariance: rounding errors
 # Tolerance of the length of a trajectory's quaternions.
 _UNIT = 1e-2
 # Times are written with six digits: the last image may seem to be later than the last pose.
