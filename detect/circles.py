@@ -77,8 +77,8 @@ class CircleDetections(ByContent):
 
     def where(self, chosen: BoolArray) -> CircleDetections:
         """The discs that a boolean mask selects."""
-        own = {name: each[chosen] for name, each in vars(self).items() if name != "levelled_by"}
-        return replace(self, **own)
+        arrays = {name: each[chosen] for name, each in vars(self).items() if name != "levelled_by"}
+        return replace(self, **arrays)
 
 
 def detect_circles(
@@ -130,14 +130,14 @@ def _by_rims(
     scene = scene_of(image, camera, table, settings)
     discs, log_odds = judged_discs(scene, table, settings)
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
-    seen_at = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
+    centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
-    in_sight = ((seen_at >= 0.0) & (seen_at < [camera.width, camera.height])).all(axis=1)
-    order = np.flatnonzero(in_sight)
-    order = order[np.lexsort((seen_at[order, 0], seen_at[order, 1]))]
+    inside = ((centre_px >= 0.0) & (centre_px < [camera.width, camera.height])).all(axis=1)
+    order = np.flatnonzero(inside)
+    order = order[np.lexsort((centre_px[order, 0], centre_px[order, 1]))]
     floor_xy = floor_xy[order]
     return CircleDetections(
-        pixels=seen_at[order].astype(np.int64) + np.array([left, 0]),
+        pixels=centre_px[order].astype(np.int64) + np.array([left, 0]),
         floor_xy=floor_xy,
         covariance=refined_covariance(
             camera, floor_xy, fitted[order], settings.systematic_px, settings.tilt_sigma_rad

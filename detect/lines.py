@@ -66,8 +66,8 @@ class LineDetections(ByContent):
 
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""
-        own = self.lines
-        numbers = np.column_stack([own.ends, own.alpha_rad, own.beta_rad, own.sigma_rad])
+        lines = self.lines
+        numbers = np.column_stack([lines.ends, lines.alpha_rad, lines.beta_rad, lines.sigma_rad])
         return tuple(
             LineLandmark(xtop, ytop, xbottom, ybottom, alpha, beta, 0.0, sigma, (-1,))
             for xtop, ytop, xbottom, ybottom, alpha, beta, sigma in numbers.tolist()

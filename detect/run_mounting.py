@@ -62,7 +62,7 @@ class Mounting:
 
 
 def mounting_of_run(
-    height_m: float, verticals: FrameTilts, apart_rad: FloatArray
+    height_m: float, verticals: FrameTilts, relative_pitch_rad: FloatArray
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
@@ -73,12 +73,12 @@ def mounting_of_run(
     run = tilt_of_run(verticals)
     if run is None:
         return None
-    known = np.isfinite(apart_rad).all(axis=1)
+    known = np.isfinite(relative_pitch_rad).all(axis=1)
     raised_m = sigma_m = math.nan
     count = int(np.count_nonzero(known))
     if count >= LEAST_FRAMES:
         # Pitch from outlines is nearly linear in the height; frames share the slope.
-        lower, same, higher = apart_rad[known].T
+        lower, same, higher = relative_pitch_rad[known].T
         slope = float(np.median(higher - lower)) / (HEIGHT_STEPS[2] - HEIGHT_STEPS[0])
         bend = float(np.median(higher + lower - 2.0 * same)) / HEIGHT_STEPS[2] ** 2
         off = float(np.median(same))

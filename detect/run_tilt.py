@@ -42,12 +42,12 @@ _SEARCH = {"gtol": 1e-2}
 COMMON_RAD = math.radians(0.15)
 #: The same if the calibration is exact in lens and height; standard deviation of the difference
 #: between the constants of outlines and verticals then, and otherwise (rad; `_share_exact`).
-_EXACT_RAD, _EXACT_APART_RAD, _APART_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
+_EXACT_RAD, _EXACT_OFFSET_RAD, _OFFSET_RAD = (math.radians(x) for x in (0.01, 0.1, 1.0))
 #: Derivative of the outlines' pitch (rad) by the camera's height, relative to that height.
 OUTLINE_PITCH_PER_HEIGHT = 0.45
 #: Where hardly any verticals are visible: standard deviation of the lean, and of the error common
 #: to the pitch of all outlines (mainly the height's), with and without a calibration's covariance.
-_UNSURE_STATED_RAD, _UNSURE_RAD = math.radians(0.5), _APART_RAD
+_UNSURE_STATED_RAD, _UNSURE_RAD = math.radians(0.5), _OFFSET_RAD
 #: Correlated share of the variance of a frame's error (a scene stays visible), and its correlation.
 LASTING_SHARE, LASTING = 0.5, 0.9
 #: Share of frames with an outlier of the tilt, and its standard deviation (rad): a consensus of
@@ -141,10 +141,10 @@ def tilt_of_run(
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
     found = _learned(series)
-    apart = [one.apart for one in found]
-    exact = _share_exact(apart)
+    offsets = [one.offset for one in found]
+    exact = _share_exact(offsets)
     # If the calibration has a covariance, that covers the verticals and the height.
-    between = np.nan_to_num(apart) if common_variance is None else np.zeros(2)
+    between = np.nan_to_num(offsets) if common_variance is None else np.zeros(2)
     lean, lean_variance = np.array([(one.lean, one.lean_variance) for one in found]).T
     tilt, of_deviation = _tilts(series, found)
     # Weight of the constant in a frame's tilt: zero for a well measured frame.
@@ -227,7 +227,7 @@ class _Axis(NamedTuple):
     memory: float  # correlation of deviations from frame to frame
     verticals_scale: float
     outlines_scale: float
-    apart: float = math.nan  # the outlines' constant minus the verticals'
+    offset: float = math.nan  # the outlines' constant minus the verticals'
     lean_variance: float = math.nan
 
 
@@ -251,7 +251,7 @@ class _Series(NamedTuple):
                 axis.outlines_scale**2 * self.outlines_variance,
             ]
         )
-        values = np.stack([self.verticals, self.outlines - axis.apart])
+        values = np.stack([self.verticals, self.outlines - axis.offset])
         information = np.where(np.isfinite(values), 1.0 / variance, 0.0)
         total = information.sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -308,9 +308,9 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
                 math.exp(-math.exp(-frames) / _FRAMES),
                 math.exp(unknowns[0]),
                 math.exp(outlines),
-                apart + _UNIT_RAD * to_apart,
+                offset + _UNIT_RAD * to_offset,
             )
-            for (lean, apart), (to_lean, spread, frames, outlines, to_apart) in zip(
+            for (lean, offset), (to_lean, spread, frames, outlines, to_offset) in zip(
                 middle, unknowns[1:].reshape(len(series), -1), strict=True
             )
         ]
@@ -339,19 +339,19 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
     return learned
 
 
-def _share_exact(apart: Sequence[float]) -> float:
+def _share_exact(offsets: Sequence[float]) -> float:
     """Probability that the calibration is exact, given the differences of the constants.
 
     A wrong lens or height moves the constant of the outlines away from that of the verticals. If
     they agree, the calibration is most likely exact, but they may also agree by chance.
     """
-    if not np.isfinite(apart).all():
+    if not np.isfinite(offsets).all():
         return 0.0
     log_odds = sum(
-        math.log(_APART_RAD / _EXACT_APART_RAD)
-        - 0.5 * (x / _EXACT_APART_RAD) ** 2
-        + 0.5 * (x / _APART_RAD) ** 2
-        for x in apart
+        math.log(_OFFSET_RAD / _EXACT_OFFSET_RAD)
+        - 0.5 * (x / _EXACT_OFFSET_RAD) ** 2
+        + 0.5 * (x / _OFFSET_RAD) ** 2
+        for x in offsets
     )
     return 1.0 / (1.0 + math.exp(min(-log_odds, 700.0)))
 

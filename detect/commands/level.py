@@ -50,7 +50,7 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
     """The mounting of a run's camera, compared with the given one."""
     height_m = float(camera.centre[2])
     plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
-    tilts, apart, failures = [], [], []
+    tilts, relative_pitch_rad, failures = [], [], []
     pitch_weights = camera_pitch_weights(camera)
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
@@ -63,11 +63,11 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
             outlines = [tilt_of_outlines(*of_image, share * height_m) for share in HEIGHT_STEPS]
             tilts.append(found.tilt)
             level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
-            apart.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))
+            relative_pitch_rad.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))
     report_failures(len(failures), failures)
     if not tilts:
         raise DetectError(f"{run.folder}: none of its images could be processed")
-    mounting = mounting_of_run(height_m, frame_tilts(tilts), np.array(apart))
+    mounting = mounting_of_run(height_m, frame_tilts(tilts), np.array(relative_pitch_rad))
     if mounting is None:
         raise DetectError(
             f"{run.folder}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "

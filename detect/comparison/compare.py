@@ -206,8 +206,8 @@ def compare_frames(
     away = first.xy - (np.zeros(2) if projection is None else projection.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     pairs = DiscPairs(first.xy, second.xy - first.xy, second.xy - alike_xy, second.covariance, away)
-    apart = [] if projection is None else [apart_px(match) for match in matches]
-    image_px = np.concatenate([np.zeros(0), *apart])
+    errors_px = [] if projection is None else [error_px(match) for match in matches]
+    image_px = np.concatenate([np.zeros(0), *errors_px])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.linalg.norm(pairs.offset, axis=1)
     farthest_m = np.linalg.norm(second.xy, axis=1).max(initial=0.0)
@@ -241,7 +241,7 @@ def _at_whole_pixels(matches: Iterable[FrameMatch]) -> bool:
 def _image_cost(matches: Iterable[FrameMatch]) -> float:
     """Sum of squared distances of matched discs in the images, in gates, and unmatched rows."""
     costs = [
-        len(m.missed) + np.fmin((apart_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
+        len(m.missed) + np.fmin((error_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
     ]
     return float(np.sum(costs))
 
@@ -446,8 +446,8 @@ def pair_discs(
     if projection is not None and options.gate_m is None:
         first_px, second_px = projection.reference_px(first.xy), projection.detected_px(second.xy)
         gate = projection.gates(first.xy)
-        apart = (second_px[None] - first_px[:, None]) / gate[:, None]
-        cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
+        offset = (second_px[None] - first_px[:, None]) / gate[:, None]
+        cost = np.where(np.isfinite(offset).all(axis=-1), (offset**2).sum(axis=-1), np.inf)
         return associate(np.minimum(cost, 2.0), cost <= 1.0)
     gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
     return associate_positions(first.xy, second.xy, gate_m=gate_m)
@@ -467,7 +467,7 @@ def pair_lines(
     return associate(difference**2, np.abs(difference) <= gate)
 
 
-def apart_px(match: FrameMatch) -> FloatArray:
+def error_px(match: FrameMatch) -> FloatArray:
     """(M,) distances of matched discs in the image; NaN if one is not visible."""
     projection = match.projection
     assert projection is not None

@@ -283,7 +283,7 @@ def _place(at: tuple[float, float], scene: _Examined) -> str:
     if min(u, v, camera.width - 1 - u, camera.height - 1 - v) < settings.border_px:
         return f"{words}: no centre of a disc is looked for there, it is too near to the border."
     votes, judgement = scene.judgement
-    near = np.hypot(*(judgement.seen_from - [x, y]).T) < settings.radius_m
+    near = np.hypot(*(judgement.traced_from - [x, y]).T) < settings.radius_m
     if not near.any():
         return f"{words}: no edges there vote for a disc of {settings.radius_m:g} m."
     return f"{words}: edges there have {votes[near].max():.1f} times the usual votes for a disc."

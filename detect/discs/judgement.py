@@ -86,7 +86,7 @@ class JudgedCandidates(NamedTuple):
     radius: FloatArray  #: (N,) radius of that circle, metres
     #: (N, 2) centre of the rim, metres; of the candidate if the rim was not traced
     floor_xy: FloatArray
-    seen_from: FloatArray  #: (N, 2) point from which the rim was traced, metres
+    traced_from: FloatArray  #: (N, 2) point from which the rim was traced, metres
     #: (N, 2) difference between the centres found from the two starts, metres
     doubt: FloatArray
     step: FloatArray  #: (N,) of the grey value at the rim, inside minus outside
@@ -130,7 +130,7 @@ def judge(
     """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
-    seen_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
+    traced_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
     step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     fate, value = np.full(n, Fate.FEW_STEPS, np.int8), np.zeros(n)
     agreeing, radius = np.zeros(n), np.zeros(n)
@@ -147,37 +147,37 @@ def judge(
         fate[i], value[i] = Fate.GLANCE, network_log_odds(inputs, scales, score, networks.glance)
         if value[i] < _LEAST_GLANCE:
             continue
-        seen = profiles(image, camera_numbers, x, y, nominal)
-        rim = follow_rim(image, camera_numbers, seen, sign * contrast)
+        radial = profiles(image, camera_numbers, x, y, nominal)
+        rim = follow_rim(image, camera_numbers, radial, sign * contrast)
         fate[i], value[i] = Fate.NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
         fate[i] = Fate.SAME_RIM
         if _is_known(judged[:count], rim, sign, nominal):
             continue
-        seen = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, noted = _look(seen, rim, score[0], sign, networks.look)
+        radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
+        odds, rim_features = _rim_odds(radial, rim, score[0], sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
-            again = follow_rim(image, camera_numbers, seen, rim.step)
+            again = follow_rim(image, camera_numbers, radial, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
-                seen_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, noted_again = _look(seen_again, again, score[0], sign, networks.look)
+                radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
+                more, features_again = _rim_odds(radial_again, again, score[0], sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
-                    rim, odds, noted, seen = again, more, noted_again, seen_again
+                    rim, odds, rim_features, radial = again, more, features_again, radial_again
         fate[i], value[i], log_odds[i], step[i] = Fate.JUDGED, odds, odds, rim.step
         agreeing[i], radius[i] = rim.agreeing, rim.radius
         for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
-            features[i, k] = noted[k]
-        quality[i], floor_grey[i] = _quality(seen.grey)
+            features[i, k] = rim_features[k]
+        quality[i], floor_grey[i] = _quality(radial.grey)
         place[i, 0], place[i, 1] = rim.x, rim.y
-        seen_from[i, 0], seen_from[i, 1] = x, y
+        traced_from[i, 0], traced_from[i, 1] = x, y
         judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
         count += 1
     return JudgedCandidates(
-        fate, value, candidates.sign, features, agreeing, radius, place, seen_from, doubt, step,
+        fate, value, candidates.sign, features, agreeing, radius, place, traced_from, doubt, step,
         floor_grey, quality, log_odds,
     )  # fmt: skip
 
@@ -283,21 +283,21 @@ def _quality(grey: FloatArray) -> tuple[float, float]:
 
 
 @kernel()
-def _look(
-    seen: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
+def _rim_odds(
+    radial: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
 ) -> tuple[float, FloatArray]:
     """Log-odds that a rim, seen from its centre, is a disc's; and its features.
 
     Each feature is bounded, so that no single one decides.
     """
-    noted = np.empty(len(FEATURES))
-    off = abs(math.log(min(max(rim.radius / seen.radius, 0.3), 3.0) / RIM_RADIUS))
-    noted[0] = rim.agreeing
-    noted[1] = min(rim.runs, 4)
-    noted[2] = rim.scatter
-    noted[3] = off
-    noted[4] = 10.0 * off * off
-    noted[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
-    noted[6] = min(score, 12.0)
-    inputs, scales = network_inputs(pairs_of_steps(seen.grey), seen.pixels_per_radius, sign)
-    return network_log_odds(inputs, scales, noted, network), noted
+    features = np.empty(len(FEATURES))
+    off = abs(math.log(min(max(rim.radius / radial.radius, 0.3), 3.0) / RIM_RADIUS))
+    features[0] = rim.agreeing
+    features[1] = min(rim.runs, 4)
+    features[2] = rim.scatter
+    features[3] = off
+    features[4] = 10.0 * off * off
+    features[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
+    features[6] = min(score, 12.0)
+    inputs, scales = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign)
+    return network_log_odds(inputs, scales, features, network), features

@@ -83,19 +83,19 @@ def _tilts_of_discs(
     point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
     for k in range(len(floor_xy)):
         x, y = floor_xy[k, 0], floor_xy[k, 1]
-        seen = profiles(image, numbers, x, y, radius)
-        if not seen.pixels_per_radius.min() >= LEAST_AXIS_PX:
+        radial = profiles(image, numbers, x, y, radius)
+        if not radial.pixels_per_radius.min() >= LEAST_AXIS_PX:
             continue
-        contrast = _contrast(seen.grey)
+        contrast = _contrast(radial.grey)
         if not abs(contrast) >= LEAST_CONTRAST:
             continue
-        distance, _ = rim_points(seen, contrast)
+        distance, _ = rim_points(radial, contrast)
         count = 0
         for m in range(DIRECTIONS):
             count += not math.isnan(distance[m])
             point_xy[m, 0] = radius * distance[m] * COS[m]
             point_xy[m, 1] = radius * distance[m] * SIN[m]
-            px_per_m[m] = seen.pixels_per_radius[m] / radius
+            px_per_m[m] = radial.pixels_per_radius[m] / radius
         if count < LEAST_DIRECTIONS:
             continue
         # If the camera is higher than calibrated, discs are larger than they seem.

@@ -100,7 +100,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
                 if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
                     nominal = Size(scene.radius, RADIUS_SIGMA * scene.radius)
                     # Assigning the row takes two seconds to compile.
-                    radii[k, 0], radii[k, 1] = _radius_seen(fit, nominal)
+                    radii[k, 0], radii[k, 1] = _radius_without_prior(fit, nominal)
             parts, known = whole.copy(), radii.copy()
         elif stage == _LAST:
             known = radii  # those of partly hidden discs included
@@ -115,7 +115,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
                 whole[k] = fit
             elif stage == _PARTS:
                 parts[k] = fit
-                radii[k, 0], radii[k, 1] = _radius_seen(fit, size)
+                radii[k, 0], radii[k, 1] = _radius_without_prior(fit, size)
             else:
                 last[k] = fit
     floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
@@ -168,7 +168,7 @@ def _start_of(
 
 
 @kernel(inline="always")
-def _radius_seen(fit: Fit, expected: Size) -> tuple[float, float]:
+def _radius_without_prior(fit: Fit, expected: Size) -> tuple[float, float]:
     """Radius of a fitted disc, metres, and its inverse variance, both with the prior removed."""
     information = fit.radius_information
     if not information > 0.0:
@@ -217,9 +217,9 @@ def _place_by_rim(scene: Scene, discs: JudgedCandidates, k: int, fit: Fit, size:
 
 @kernel(inline="always")
 def _rim_of(scene: Scene, discs: JudgedCandidates, k: int, radius: float) -> Rim:
-    x, y = discs.seen_from[k, 0], discs.seen_from[k, 1]
-    seen = profiles(scene.image, scene.camera_numbers, x, y, radius)
-    return follow_rim(scene.image, scene.camera_numbers, seen, discs.step[k])
+    x, y = discs.traced_from[k, 0], discs.traced_from[k, 1]
+    radial = profiles(scene.image, scene.camera_numbers, x, y, radius)
+    return follow_rim(scene.image, scene.camera_numbers, radial, discs.step[k])
 
 
 @kernel()

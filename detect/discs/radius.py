@@ -87,6 +87,6 @@ def ratio_of_radii(
     """
     table = build_vote_table(camera, vote_shape(settings))
     scenes = (scene_of(image, camera, table, settings) for image in images)
-    seen = [judged_discs(scene, table, settings) for scene in scenes]
-    radii = np.concatenate([np.empty(0), *(discs.radius for discs, _ in seen)])
+    judged = [judged_discs(scene, table, settings) for scene in scenes]
+    radii = np.concatenate([np.empty(0), *(discs.radius for discs, _ in judged)])
     return float(np.median(radii)) / settings.radius_m if len(radii) >= LEAST_DISCS else None

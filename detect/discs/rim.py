@@ -143,7 +143,7 @@ def profiles(
 
 
 @kernel()
-def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
+def rim_points(radial: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
     """Find where the grey value changes most from the disc's to the floor's in each direction.
 
     Returns (DIRECTIONS,) distances from the centre, nominal radii, NaN if no step reaches
@@ -156,13 +156,13 @@ def rim_points(seen: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]
     for k in range(DIRECTIONS):
         distance[k] = math.nan
         # The step is taken over two pixels, and at least over a sixth of the radius.
-        reach = max(2, round(1.0 / (seen.pixels_per_radius[k] * per_step)))
+        reach = max(2, round(1.0 / (radial.pixels_per_radius[k] * per_step)))
         reach = min(reach, STEPS // 4)
         best = -1
         for m in range(STEPS):
             change[m] = -math.inf
             if reach <= m < STEPS - reach:
-                value = sign * (seen.grey[k, m - reach] - seen.grey[k, m + reach])
+                value = sign * (radial.grey[k, m - reach] - radial.grey[k, m + reach])
                 if value == value:
                     change[m] = value
                     if best < 0 or value > change[best]:
@@ -327,14 +327,14 @@ def best_circle(
 
 @kernel()
 def follow_rim(
-    image: GreyImage, camera_numbers: FloatArray, seen: Profiles, contrast: float
+    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: float
 ) -> Rim:
-    """Trace the rim of a candidate, `seen` from about its centre; `agreeing` is 0 without a circle.
+    """Trace the rim in profiles from about a candidate's centre; `agreeing` is 0 without a circle.
 
     `contrast` is approximately that of the disc to the floor, grey levels.
     """
-    x, y, radius, scale = seen.x, seen.y, seen.radius, seen.pixels_per_radius
-    distance, step = rim_points(seen, contrast)
+    x, y, radius, scale = radial.x, radial.y, radial.radius, radial.pixels_per_radius
+    distance, step = rim_points(radial, contrast)
     at_x, at_y = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     weight, tolerance = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     log_px = 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
-from detect.comparison.compare import apart_px, match_frame, numbers
+from detect.comparison.compare import error_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
 from detect.discs.explanation import DiscExplanation, Stage
 from detect.lines import LineDetections
@@ -185,7 +185,7 @@ def _draw_discs(canvas: _Canvas, match: FrameMatch, compared: bool) -> None:
     drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
     drawn += [
-        (row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in zip(match.matched, apart_px(match))
+        (row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in zip(match.matched, error_px(match))
     ]
     radii = (settings.inner_radius_m, settings.radius_m, settings.outer_radius_m)
     rims = []

@@ -236,7 +236,7 @@ def repeated(rows: Sequence[ImageRows]) -> Repeatability | None:
     Discs are paired within five standard deviations, unless these are too large to identify them.
     The step's error, common to the pairs of two frames, is estimated. None without pairs or steps.
     """
-    left, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
+    row_residuals, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
     frames = [each.circles for each in rows]
     still = not summed_steps(frame.step for frame in frames if frame is not None).any()
     for one, other in () if still else pairwise(frames):
@@ -260,13 +260,13 @@ def repeated(rows: Sequence[ImageRows]) -> Repeatability | None:
         covariance = block_diag(*of_rows[i, j]) if len(i) else np.zeros((0, 0))
         weight = np.linalg.inv(covariance + jacobian @ of_step @ jacobian.T)
         squared += float(residual @ weight @ residual)
-        left.append(covariance @ weight @ residual)
+        row_residuals.append(covariance @ weight @ residual)
         stated.append(np.diag(covariance @ weight @ covariance))
-    apart, variance = np.concatenate(left), np.concatenate(stated)
-    if not len(apart):
+    residuals, variance = np.concatenate(row_residuals), np.concatenate(stated)
+    if not len(residuals):
         return None
-    rms_m, stated_m = np.sqrt([2.0 * np.mean(apart**2), 2.0 * variance.mean()]).tolist()
-    return Repeatability(len(apart) // 2, rms_m, stated_m, squared / len(apart))
+    rms_m, stated_m = np.sqrt([2.0 * np.mean(residuals**2), 2.0 * variance.mean()]).tolist()
+    return Repeatability(len(residuals) // 2, rms_m, stated_m, squared / len(residuals))
 
 
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatArray, FloatArray]:

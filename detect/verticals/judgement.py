@@ -87,15 +87,15 @@ def fit_and_judge(
 
     If only the doubtful tracks of an earlier pass were tracked again, only these are fitted.
     """
-    own = numbers.judgement
-    least = own.least_points, own.least_evidence / strip.row_aspect
+    limits = numbers.judgement
+    least = limits.least_points, limits.least_evidence / strip.row_aspect
     if before is None:
         fits = fit_lines(image, strip, tracks, filters, least, 0)
     else:
         kept = np.flatnonzero(~before.doubtful)
         new = fit_lines(image, strip, tracks, filters, least, len(kept))
-        fits = LineFits(*(np.concatenate([old[kept], own]) for old, own in zip(before.fits, new)))
-    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, own)
+        fits = LineFits(*map(np.concatenate, zip((old[kept] for old in before.fits), new)))
+    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, limits)
     tilt, agrees = agree_on_tilt(lines, numbers.tilt)
     fate[accepted[~agrees]] = Fate.NOT_VERTICAL
     consensus = tilt if tilt.lines > 0 else None

@@ -325,19 +325,19 @@ def newton_step(
     used = 0
     g_a = g_b = h_aa = h_ab = h_bb = m_aa = m_ab = m_bb = 0.0
     for i in range(len(row)):
-        seen, slope, bend, off = _see(image, row[i], column[i], weights, half)
-        if seen:
+        inside, slope, bend, off = _filtered(image, row[i], column[i], weights, half)
+        if inside:
             used += 1
             by_a, by_b = to_a[i], to_b[i]
-            own = slope + off * bend
-            g_a += own * by_a
-            g_b += own * by_b
+            gradient = slope + off * bend
+            g_a += gradient * by_a
+            g_b += gradient * by_b
             h_aa += bend * by_a * by_a
             h_ab += bend * by_a * by_b
             h_bb += bend * by_b * by_b
-            m_aa += own * own * by_a * by_a
-            m_ab += own * own * by_a * by_b
-            m_bb += own * own * by_b * by_b
+            m_aa += gradient * gradient * by_a * by_a
+            m_ab += gradient * gradient * by_a * by_b
+            m_bb += gradient * gradient * by_b * by_b
     determinant = h_aa * h_bb - h_ab * h_ab
     if used < 5 or not (sign * h_aa < 0.0 and determinant > 1e-12 * h_aa * h_bb):
         return NewtonStep(np.nan, np.nan, np.nan, np.nan, np.nan)
@@ -363,8 +363,8 @@ def _contrasts(
     row, column, half = crossings.row, crossings.column, heights.shape[2] // 2
     rows, fine, coarse = 0, 0.0, 0.0
     for i in range(len(row)):
-        seen, one, other, _ = _see(image, row[i], column[i], heights, half)
-        if seen:
+        inside, one, other, _ = _filtered(image, row[i], column[i], heights, half)
+        if inside:
             rows += 1
             fine += one
             coarse += other
@@ -373,7 +373,7 @@ def _contrasts(
 
 # Sums in any order are vectorised; inlined, so that each kernel has its own fixed order.
 @kernel(fastmath={"contract", "reassoc"}, forceinline=True)
-def _see(
+def _filtered(
     image: GreyImage, v: int, u: float, weights: Float32Array, half: int
 ) -> tuple[bool, float, float, float]:
     """Whether the window at a position is inside the image; the values of two filters there.

@@ -82,8 +82,8 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     anchor = np.where(table.usable, np.floor(table.anchor_row + 0.5), 0.0).astype(np.intp)
 
     row = anchor + np.arange(-reach, reach + 1)[:, None]
-    seen = (row >= table.first_row) & (row <= table.last_row)
-    x = np.where(seen, table.column[np.where(seen, row, 0), np.arange(width)], 0.0)
+    on_vertical = (row >= table.first_row) & (row <= table.last_row)
+    x = np.where(on_vertical, table.column[np.where(on_vertical, row, 0), np.arange(width)], 0.0)
     j = np.minimum(x.astype(np.int32), max(width - 2, 0))
 
     evaluated = slice(s, 2 * reach + 1 - s, spacing)
@@ -93,18 +93,18 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     below = np.clip(table.last_row - middle + s + 1, 0, 2 * s + 1)
     above = np.clip(table.first_row - middle + s, 0, 2 * s + 1)
     on_it = np.maximum(share[below] - share[above], 0.0)
-    spacing_px = [_typical_spacing(x[i], seen[i]) for i in range(*evaluated.indices(len(x)))]
+    spacing_px = [_typical_spacing(x[i], on_vertical[i]) for i in range(*evaluated.indices(len(x)))]
     across = np.array([weights_across(settings.sigma_across_px, px) for px in spacing_px])
     r = across.shape[2] // 2
-    visible = seen[evaluated] & (x[evaluated] >= r) & (x[evaluated] < width - 1 - r)
+    visible = on_vertical[evaluated] & (x[evaluated] >= r) & (x[evaluated] < width - 1 - r)
     border = settings.border_rows
     allowed = visible & (middle >= border) & (middle <= height - 1 - border)
     long_enough = settings.least_points(table.row_aspect) >= _CROSSED * spacing
     return StartBand(
         row=np.where(allowed, middle, -1).astype(np.int32),
-        pixel=np.where(seen, row * width + j, 0).astype(np.int32),
-        left=np.where(seen, 1.0 - (x - j), 0.0).astype(np.float32),
-        right=np.where(seen, x - j, 0.0).astype(np.float32),
+        pixel=np.where(on_vertical, row * width + j, 0).astype(np.int32),
+        left=np.where(on_vertical, 1.0 - (x - j), 0.0).astype(np.float32),
+        right=np.where(on_vertical, x - j, 0.0).astype(np.float32),
         scale=np.divide(1.0, on_it, out=np.zeros_like(on_it), where=on_it > 0.0).astype(np.float32),
         across=padded(across),
         along=padded(along),
@@ -114,9 +114,9 @@ def start_band(table: VerticalTable, settings: LineSettings) -> StartBand:
     )
 
 
-def _typical_spacing(x: FloatArray, seen: BoolArray) -> float:
+def _typical_spacing(x: FloatArray, on_vertical: BoolArray) -> float:
     """Median distance of neighbouring verticals in a row, pixels; 1 if there are none."""
-    both = seen[1:] & seen[:-1]
+    both = on_vertical[1:] & on_vertical[:-1]
     return float(np.median(np.abs(np.diff(x)[both]))) if both.any() else 1.0
 
 
