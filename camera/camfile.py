@@ -20,6 +20,7 @@ import numpy as np
 
 from camera.errors import CameraError
 from camera.model import PARAMETERS, Camera, Pose
+from redetect.bounds import NUMBER
 from redetect.messages import excerpt
 from redetect.storage import write_bytes
 from redetect.storage.bounded import read_text
@@ -30,8 +31,6 @@ LARGEST_FILE_BYTES = 1 << 20
 
 _TOKEN = re.compile(r"[{}\[\]:]|[^\s,{}\[\]:#]+")
 _LINE_END = re.compile(r"\r\n|\r|\n")
-# Python's float also reads "1_000", "infinity" and digits of other scripts.
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 _LENS = {"scale_x": "scaleX", "scale_y": "scaleY", "offset_x": "offsetX", "offset_y": "offsetY"}
 
@@ -190,7 +189,7 @@ def _numbers(value: list[tuple[str, int]], key: str, count: int, name: str) -> l
     for token, line in value:
         if token in "{}[]":
             continue
-        if not _NUMBER.fullmatch(token) or math.isinf(float(token)):
+        if not re.fullmatch(NUMBER, token) or math.isinf(float(token)):
             expected = "expected a number that fits a double"
             raise CameraError(f"{name}:{line}: {key} has {excerpt(token)}: {expected}")
         numbers.append(float(token))

@@ -51,7 +51,8 @@ _QUALITY, _RESPONSE = "--quality-threshold", "--response-threshold"
 _RENAMED = {
     "circles": {"--threshold": _QUALITY},
     "explain": {"--threshold": _QUALITY},
-    "lines": {"--threshold": _RESPONSE},
+    # In the other commands, --tilt is the tilt for which discs are corrected.
+    "lines": {"--threshold": _RESPONSE, "--tilt": "--tilt-output"},
     "all": {"--circles.threshold": _QUALITY, "--lines.threshold": _RESPONSE},
 }
 

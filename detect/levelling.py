@@ -4,7 +4,7 @@ The robot tilts about the origin of its frame on the floor, by pitch and roll. I
 calibrated for a level robot: a disc seen at p is on the ray c + s (p - c). Levelled by R, that ray
 meets the floor at
 
-    q = R (c + s (p - c)),    s = -(R c)_z / (R (p - c))_z    (`detect.seen.level_seen`).
+    q = R (c + s (p - c)),    s = -(R c)_z / (R (p - c))_z    (`detect.projection.level_positions`).
 
 The covariance of q is J diag(C_p, C_tilt) J^T, J = dq / d(p, pitch, roll).
 
@@ -29,7 +29,7 @@ from camera import Camera
 from camera.model import inverse_2x2
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
 from detect.circles import CircleDetections, refined_covariance
-from detect.seen import level_seen
+from detect.projection import level_positions
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames
 
@@ -60,8 +60,8 @@ def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> C
     floor_xy = camera.floor_from_pixel(pixels)
     jacobian = camera.floor_jacobian(pixels) @ inverse_2x2(leaning.floor_jacobian(pixels))
     covariance = jacobian @ found.covariance @ jacobian.swapaxes(1, 2)
-    seen = replace(found, floor_xy=floor_xy, covariance=covariance)
-    return seen.where(np.asarray(np.isfinite(floor_xy).all(axis=-1)))
+    level = replace(found, floor_xy=floor_xy, covariance=covariance)
+    return level.where(np.asarray(np.isfinite(floor_xy).all(axis=-1)))
 
 
 def tilt_arrays(tilts: Sequence[FrameTilt]) -> tuple[FloatArray, FloatArray]:
@@ -85,7 +85,7 @@ def level_discs(
     ray does not meet the floor, numbers are NaN and the mask is false.
     """
     steps = _STEP * np.vstack([np.zeros(4), np.eye(4), -np.eye(4)])[:, None]
-    level_xy, *ends = level_seen(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
+    level_xy, *ends = level_positions(camera, floor_xy + steps[..., :2], tilt + steps[..., 2:])
     jacobian = np.stack([ends[k] - ends[k + 4] for k in range(4)], axis=-1) / (2.0 * _STEP)
     of_all = np.zeros((len(floor_xy), 4, 4))
     of_all[:, :2, :2] = covariance
@@ -112,7 +112,7 @@ def common_covariance(
     jacobian = floor_by_parameters(camera, floor_xy)
     if np.any(by_verticals):
         steps = _STEP * np.vstack([np.eye(2), -np.eye(2)])
-        p, r, minus_p, minus_r = level_seen(camera, floor_xy, steps[:, None])
+        p, r, minus_p, minus_r = level_positions(camera, floor_xy, steps[:, None])
         by_tilt = np.stack([p - minus_p, r - minus_r], axis=-1) / (2.0 * _STEP)
         by_tilt = np.where(np.reshape(by_verticals, (-1, 1, 1)), by_tilt, 0.0)
         jacobian = jacobian + by_tilt @ _tilt_by_parameters(camera)

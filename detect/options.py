@@ -122,8 +122,9 @@ class Circles(DetectorFlags):
     """
 
     preset: DetectorPreset = "default"
-    #: Tilts of the frames (written by `detect lines`), for which positions are corrected; `none`:
-    #: images are not examined for how much the robot tilts.
+    #: Tilt for which discs are corrected: that of the frames in a file (from `detect lines`), or
+    #: `none`. By default they are not corrected either, but some images are examined for how much
+    #: the robot tilts, which covariances include.
     tilt: MaybePath = None
     #: Estimate the radius of the discs from some images first; the same as --radius-m auto.
     find_radius: bool = False
@@ -151,7 +152,7 @@ class Lines(DetectorFlags):
 
     preset: DetectorPreset = "default"
     #: The tilt file to write; by default the output's name with the extension .tilt.
-    tilt: MaybePath = None
+    tilt_output: MaybePath = None
     #: A .lines file whose IDs are transferred where the match is unambiguous.
     ids_from: MaybePath = None
     #: Folder for images with lines and their standard deviations drawn in, after detection.

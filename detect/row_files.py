@@ -11,8 +11,8 @@ from types import MappingProxyType
 from camera import Camera
 from detect.errors import DetectError
 from detect.options import RowFiles
+from detect.projection import DiscProjection
 from detect.runs.plan import FramesByImage, tilts_by_image
-from detect.seen import Sight
 from detect.settings import CircleSettings
 from detect.settings_files import word_value
 from detect.sources.image_files import image_name
@@ -37,7 +37,7 @@ def circle_settings_of(head: FileHead) -> CircleSettings:
 
 
 @dataclass(frozen=True)
-class SeenRows:
+class ImageRows:
     """Rows of one image: None for kinds without a file, or whose file lacks the image."""
 
     circles: Frame | None = None
@@ -71,15 +71,15 @@ class RunRows:
         """The settings with which discs were detected."""
         return circle_settings_of(self.heads.get("circles", FileHead()))
 
-    def of(self, prefix: str) -> SeenRows:
+    def of(self, prefix: str) -> ImageRows:
         """The rows of an image, by the prefix of its STEP."""
         frames = {kind: source.get(prefix) for kind, source in self._frames.items()}
-        return SeenRows(**frames, tilt=self._tilts.get(image_name(prefix)))
+        return ImageRows(**frames, tilt=self._tilts.get(image_name(prefix)))
 
-    def sight(self, camera: Camera) -> Sight:
+    def projection(self, camera: Camera) -> DiscProjection:
         """The projection of discs into the images of a camera."""
         level = "circles" in self.reference and read_head(self.reference["circles"]).level
-        return Sight.by(camera, self.circle_settings, level)
+        return DiscProjection(camera, self.circle_settings, level)
 
 
 def open_rows(run: ImageRun, options: RowFiles) -> RunRows:

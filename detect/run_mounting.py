@@ -17,8 +17,8 @@ from camera.calibration.model import COUNT
 from camera.model import PARAMETERS
 from camera.rotations import left_jacobian
 from camera.uncertainty import covariance_of, with_covariance
+from detect.projection import leaning_camera, level_matrix
 from detect.run_tilt import COMMON_RAD, FrameTilts, tilt_of_run
-from detect.seen import leaning_camera, level_matrix
 from detect.settings import LEAST_FRAMES
 from redetect.array_types import FloatArray
 

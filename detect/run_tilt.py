@@ -132,12 +132,10 @@ def tilt_of_run(
     Errors of the camera's height change its own pitch in outlines (`camera_pitch_weights`).
     """
     if np.count_nonzero(verticals.known) < LEAST_FRAMES:
+        if outlines is None:
+            return None
         unsure = _UNSURE_RAD if common_variance is None else _UNSURE_STATED_RAD
-        return (
-            None
-            if outlines is None
-            else _tilt_by_outlines(verticals, outlines, unsure, pitch_weights)
-        )
+        return _tilt_by_outlines(verticals, outlines, unsure, pitch_weights)
     if outlines is None or np.count_nonzero(outlines.known & verticals.known) < LEAST_FRAMES:
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)

@@ -27,9 +27,9 @@ from urllib.parse import parse_qs
 from detect.discs.explanation import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
+from detect.projection import circle_on_floor
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import circle_on_floor
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
 from detect.sources.interface import Run, RunFrame, read_image

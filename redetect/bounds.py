@@ -55,6 +55,11 @@ class Bounds:
             return False
 
 
+#: A number in a text, stricter than `float`, which also reads nan, infinity, 1_000 and digits of
+#: other scripts. Possessive, so that a long word that is no number is not tried again and again.
+NUMBER = r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
+
+
 def number_in(word: str) -> float:
     """The number that a word of a file is; a ValueError if it is none."""
     return float(word.replace("_", "?"))  # in Python, 1_000 is a number

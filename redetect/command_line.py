@@ -211,10 +211,8 @@ def _with_values_of(values: Any, kind: Any) -> Any:
     """The values of a dataclass's instance in one of its subclasses without expert flags."""
     if not issubclass(kind, type(values)) or kind is type(values):
         return values
-    hints, own = (
-        get_type_hints(kind),
-        {each.name: getattr(values, each.name) for each in fields(kind)},
-    )
+    hints = get_type_hints(kind)
+    own = {each.name: getattr(values, each.name) for each in fields(kind)}
     nested = {name: hints[name] for name, value in own.items() if is_dataclass(value)}
     return kind(**own | {name: _with_values_of(own[name], inner) for name, inner in nested.items()})
 

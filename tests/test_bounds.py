@@ -18,7 +18,7 @@ ROOMS = ("camera", "detect", "lut", "redetect")
 NO_SETTINGS = frozenset(
     {
         "DiscShape", "FileHead", "FrameRows", "Known",
-        "RowCount", "RowFiles", "RunSummary", "SeenRows", "VoteShape", "_Rows",
+        "RowCount", "RowFiles", "RunSummary", "ImageRows", "VoteShape", "_Rows",
     }
 )  # fmt: skip
 

@@ -34,6 +34,9 @@ def perform(options: Convert) -> int:
             f"{options.target}: not written, since {converted.deviation_px:.3g} px is above "
             f"--limit-px {options.limit_px:g}: choose another --model or format, or raise the limit"
         )
+    if isinstance(camera, Camera) and camera.seen_share < 1.0:
+        unseen = 100.0 * (1.0 - camera.seen_share)
+        print(f"{unseen:.1f} % of the image, past the distortion's fold, see nothing")
     if isinstance(camera, Camera) and not isinstance(source, Camera) and options.pose_from is None:
         print(
             "no pose: sensor2World is the identity; give --pose-from, or let `camera floor` find it"

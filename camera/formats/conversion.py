@@ -15,6 +15,7 @@ from camera.calibration.model import FreeLens, is_possible, project_points
 from camera.errors import CameraError, ConversionError
 from camera.formats.models import COEFFICIENTS, P1, ForeignCamera, Model, projected
 from camera.model import Camera
+from camera.model_checks import LEAST_SEEN_SHARE
 from camera.uncertainty import UNPOSED, intrinsics_of, with_intrinsics
 from redetect.array_types import FloatArray
 
@@ -170,7 +171,7 @@ def convert_to_foreign(
     Raises
     ------
     ConversionError
-        If the source does not see all of its image, or the fit fails.
+        If the source sees less than half of its image, or the fit fails.
     """
     number = COEFFICIENTS[model] if free is None else free
     factor = _FACTORS[rows]
@@ -279,7 +280,8 @@ def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | N
 def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """(N, 2) pixels of the target, denser towards the border, where models part; and their rays.
 
-    Rays are undistorted normalised coordinates of what the source sees there.
+    Rays are undistorted normalised coordinates of what the source sees there. Pixels that see
+    nothing, as in corners past a fold of the distortion, are left out.
     """
     bend = [0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, n)) for n in size]
     axes = [0.5 * b + 0.5 * np.linspace(0.0, 1.0, len(b)) for b in bend]
@@ -289,15 +291,23 @@ def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatAr
     # Line v of the even lines is line 2 v of all.
     in_source = pixels / [1.0, _FACTORS[rows]]
     rays = source.undistort(in_source)
-    if not np.all(np.isfinite(rays)):
-        u, v = in_source[int(np.argmax(~np.isfinite(rays[:, 0])))]
-        raise ConversionError(f"the source sees nothing at pixel ({u:.6g}, {v:.6g})")
-    return pixels, rays
+    seen = np.isfinite(rays[:, 0])
+    area = np.outer(*(np.gradient(axis) for axis in reversed(axes))).ravel()
+    share = area[seen].sum() / area.sum()
+    if share < LEAST_SEEN_SHARE:
+        raise ConversionError(
+            f"{100.0 * share:.0f} % of the image see anything, expected "
+            f"{100.0 * LEAST_SEEN_SHARE:.0f}: the distortion folds inside the image, or the lens "
+            "sees 90 degrees and more off its axis"
+        )
+    return pixels[seen], rays[seen]
 
 
 def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Converted:
     pixels, rays = check
     away = np.linalg.norm(camera.distort(rays) - pixels, axis=1)
-    away = np.where(np.isfinite(away), away, np.inf)
+    # If the source folds inside the image, the models differ in how close to the fold they see.
+    folds = len(pixels) < np.prod(_CHECK_GRID)
+    away = np.where(np.isfinite(away), away, 0.0 if folds and np.isfinite(away).any() else np.inf)
     worst = int(np.argmax(away))
     return Converted(camera, float(away[worst]), (float(pixels[worst, 0]), float(pixels[worst, 1])))

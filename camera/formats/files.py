@@ -60,14 +60,10 @@ def format_of_text(path: Path, text: str) -> Format:
         return "cam"
     if path.suffix.lower() == ".txt":
         return "colmap"
-    if text.lstrip().startswith("<"):
-        raise ConversionError(
-            f"{path}: is XML: expected YAML; OpenCV writes it where the file's name ends in .yml"
-        )
-    if text.startswith("%YAML:") or "!!opencv-matrix" in text:
+    if text.startswith("%YAML:") or "!!opencv-matrix" in text or text.lstrip().startswith("<"):
         return "opencv"
     content = yaml_files.parse_yaml(text, str(path))
-    if any(isinstance(value, dict) and "intrinsics" in value for value in content.values()):
+    if yaml_files.kalibr_cameras(content):
         return "kalibr"
     if "distortion_model" in content:
         return "ros"

@@ -42,7 +42,7 @@ _LARGEST_SIDE_PX = 65536
 # Number of steps from the image's centre in which the inverse is found.
 _WALK = 24
 _NEWTON_STEPS = 20
-_ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
+_ROUNDING_PX, _CONVERGED_PX, _NEAR_PX = 1e-12, 1e-7, 1.0
 
 
 @dataclass(frozen=True)
@@ -106,30 +106,29 @@ class ForeignCamera:
     def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) undistorted normalised coordinates of (N, 2) pixels.
 
-        Newton's method, continued outwards from the centre to avoid branches past a fold.
+        NaN past a fold of the distortion, and 90 degrees and more off the lens's axis. Newton's
+        method, continued outwards from the centre to avoid branches past a fold.
         """
         centre = np.array([self.cx, self.cy])
-        xy = np.zeros_like(pixels)
+        xy, there = np.zeros_like(pixels), np.ones(len(pixels), np.bool_)
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
-                for _ in range(_NEWTON_STEPS if share == 1.0 else 2):
+                target = centre + share * (pixels - centre)
+                last = share == 1.0
+                for _ in range(_NEWTON_STEPS if last else 2):
                     seen = self._seen(xy)
-                    error = centre + share * (pixels - centre) - seen.pixels
-                    xy = xy + (inverse_2x2(seen.by_place) @ error[..., None])[..., 0]
-                    if np.abs(error).max() < _ROUNDING_PX:
+                    xy = (
+                        xy
+                        + (inverse_2x2(seen.by_place) @ (target - seen.pixels)[..., None])[..., 0]
+                    )
+                    if np.abs(target - seen.pixels).max() < _ROUNDING_PX:
                         break
-            seen = self._seen(xy)
-            off = np.abs(seen.pixels - pixels).max(axis=-1)
-            determinant = np.linalg.det(seen.by_place)
-        bad = ~(off < _CONVERGED_PX) | ~(determinant > 0.0)
-        if bad.any():
-            u, v = pixels[int(np.argmax(bad))]
-            raise ConversionError(
-                f"pixel ({u:.6g}, {v:.6g}) sees nothing by the {self.model} model: its distortion "
-                "folds inside the image, or the lens sees 90 degrees and more off its axis; such a "
-                "camera can't be converted as a whole"
-            )
-        return np.asarray(xy)
+                seen = self._seen(xy)
+                off = np.abs(seen.pixels - target).max(axis=-1)
+                there &= (off < (_CONVERGED_PX if last else _NEAR_PX)) & (
+                    np.linalg.det(seen.by_place) > 0.0
+                )
+        return np.where(there[:, None], xy, np.nan)
 
     def _seen(self, normalised: FloatArray) -> Projected:
         parameters = np.array([*self.pinhole, *self.distortion])

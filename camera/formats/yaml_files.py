@@ -1,4 +1,4 @@
-"""Calibrations in YAML: OpenCV's, ROS's camera_info and Kalibr's camchain.
+"""Calibrations in YAML: OpenCV's (also in XML), ROS's camera_info, Kalibr's camchain and EuRoC's.
 
 YAML is read safely: plain values only, bounded, without aliases. OpenCV's own dialect begins with
 ``%YAML:1.0`` and tags its matrices; both are understood.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml  # type: ignore[import-untyped, unused-ignore]
@@ -38,13 +39,20 @@ ROS_NAMES: dict[Model, str] = {
 _ROS_MODELS: dict[str, Model] = {name: model for model, name in ROS_NAMES.items()} | {
     "fisheye": "fisheye"
 }
-_KALIBR_MODELS: dict[str, Model] = {"radtan": "radtan", "equi": "fisheye", "equidistant": "fisheye"}
+_KALIBR_MODELS: dict[str, Model] = {
+    "radtan": "radtan",
+    "radial-tangential": "radtan",
+    "equi": "fisheye",
+    "equidistant": "fisheye",
+}
 _KALIBR_COEFFICIENTS = 4
 _LONGEST_LIST = 100
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """The first document of a YAML text, which must be a mapping."""
+    """The first document of a YAML text, which must be a mapping; or OpenCV's XML."""
+    if text.lstrip().startswith("<"):
+        return _parse_xml(text, name)
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         def compose_node(self, parent: Any, index: Any) -> Any:
@@ -81,6 +89,23 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
         for key, value in content.items()
         if isinstance(key, str) or (isinstance(key, int) and abs(key) < _MOST_CAMERAS)
     }
+
+
+def _parse_xml(text: str, name: str) -> dict[str, Any]:
+    """The values of an XML text of OpenCV's FileStorage."""
+    if "<!" in text:
+        raise ConversionError(f"{name}: XML with declarations or comments: expected plain values")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ConversionError(f"{name}:{error.position[0]}: {error}: expected XML") from None
+    content: dict[str, Any] = {}
+    for element in root:
+        data, value = element.findtext("data"), (element.text or "").strip()
+        whole = value.isascii() and value.isdecimal() and len(value) < _LONGEST_LIST
+        single = int(value) if whole else value
+        content[element.tag] = single if data is None else {"data": data.split()}
+    return content
 
 
 def numbers(value: Any, key: str, name: str) -> list[float]:
@@ -297,9 +322,7 @@ def format_ros(camera: ForeignCamera) -> str:
 
 def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> ForeignCamera:
     """A camera of the text of a camchain; `camera_name` selects it, such as ``cam0``."""
-    content = parse_yaml(text, name)
-    cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
-    cameras = {key: value for key, value in cameras.items() if "intrinsics" in value}
+    cameras = kalibr_cameras(parse_yaml(text, name))
     camera_name = name_of_one(list(cameras), camera_name, name, "camera (cam0 with intrinsics)")
     entry: dict[str, Any] = cameras[camera_name]
     where = f"{name}: {one_line(camera_name, _LONGEST_LIST)}"
@@ -309,7 +332,8 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
         )
     model = entry.get("distortion_model", "none")
     label = model if isinstance(model, str) else excerpt(model)
-    d = numbers(entry.get("distortion_coeffs", []), "distortion_coeffs", where)
+    coefficients = entry.get("distortion_coeffs", entry.get("distortion_coefficients", []))
+    d = numbers(coefficients, "distortion_coeffs", where)
     if label == "none" and not any(d):
         label, d = "radtan", [0.0] * _KALIBR_COEFFICIENTS
     if label not in _KALIBR_MODELS:
@@ -327,6 +351,14 @@ def parse_kalibr(text: str, name: str = "<text>", camera_name: str = "") -> Fore
     width, height = (whole(side, "resolution", where) for side in resolution)
     fx, fy, cx, cy = intrinsics
     return foreign(where, _KALIBR_MODELS[label], width, height, (fx, fy, cx, cy), d)
+
+
+def kalibr_cameras(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The cameras of a camchain by name; the sensor.yaml of EuRoC's data set is one, cam0."""
+    if "intrinsics" in content:
+        return {"cam0": content}
+    cameras = {key: value for key, value in content.items() if isinstance(value, dict)}
+    return {key: value for key, value in cameras.items() if "intrinsics" in value}
 
 
 def format_kalibr(camera: ForeignCamera) -> str:

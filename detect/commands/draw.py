@@ -75,25 +75,25 @@ def draw_run(
     frames have none.
     """
     drawn, blank, failures = 0, 0, list[str]()
-    sight = rows.sight(run.camera) if isinstance(run, Run) else None
+    projection = rows.projection(run.camera) if isinstance(run, Run) else None
     with progress_bar("pictures", run.frames.expected) as advance:
         for frame in run.frames:
             try:
-                image = read_image(frame, None if sight is None else sight.camera)
+                image = read_image(frame, None if projection is None else projection.camera)
             except FrameError as error:
                 failures.append(str(error))
             else:
                 prefix = frame.step.prefix
                 name = picture_name(prefix)
-                seen = rows.of(prefix)
-                picture = draw_rows(image, sight, seen, rows.circle_settings, name)
+                image_rows = rows.of(prefix)
+                picture = draw_rows(image, projection, image_rows, name)
                 if plan is not None:
                     picture = _with_rejected(picture, image, frame, plan)
                 if folder is not None:
                     write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
                 if video is not None:
                     video(picture)
-                drawn, blank = drawn + 1, blank + (not processed(seen))
+                drawn, blank = drawn + 1, blank + (not processed(image_rows))
             advance()
     return drawn, blank, failures
 

@@ -57,15 +57,11 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
         for frame in run.frames:
             advance()
             (found,) = detect_batch([FrameTask(frame)], plan)
-            if found.error is not None or found.seen is None or found.image is None:
+            if found.error is not None or found.unlevelled is None or found.image is None:
                 failures.append(str(found.error))
                 continue
-            outlines = [
-                tilt_of_outlines(
-                    found.image, camera, found.seen.floor_xy, radius_m, share * height_m
-                )
-                for share in HEIGHT_STEPS
-            ]
+            of_image = found.image, camera, found.unlevelled.floor_xy, radius_m
+            outlines = [tilt_of_outlines(*of_image, share * height_m) for share in HEIGHT_STEPS]
             tilts.append(found.tilt)
             level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
             apart.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))

@@ -14,6 +14,7 @@ from camera import Camera
 from detect.drawing import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
+from detect.projection import leaning_camera
 from detect.row_files import KINDS, RunRows
 from detect.runs.hints import hints, some_images
 from detect.runs.outputs import frames_tilt_place, lean_sentence
@@ -28,7 +29,6 @@ from detect.runs.plan import (
 )
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
-from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
@@ -98,7 +98,7 @@ def _circles(command: Circles, run: Run) -> Job:
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
     plan = FramePlan(run.camera, lines=command.detector)
-    places = {"lines": output, "tilt": command.tilt or output.with_suffix(".tilt")}
+    places = {"lines": output, "tilt": command.tilt_output or output.with_suffix(".tilt")}
     return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
 
 

@@ -21,11 +21,11 @@ from detect.comparison.compare import compare_frames, rows_beside
 from detect.comparison.result import DiscComparison
 from detect.errors import DetectError
 from detect.options import Tune
+from detect.projection import DiscProjection
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
 from detect.runs.stream import with_first_look
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
-from detect.seen import Sight
 from detect.settings import UNREFINED, CircleSettings
 from detect.settings_files import read_settings, word_value
 from detect.sources.interface import Run, RunFrame
@@ -86,7 +86,7 @@ def perform(options: Tune) -> int:
         compare_frames,
         [rows for _, rows in pairs],
         options=options.matching,
-        sight=Sight.by(run.camera, base, read_head(path).level),
+        projection=DiscProjection(run.camera, base, read_head(path).level),
         unlisted=rows_beside(path, "unlisted"),
     )
     count = len(grid) * len(pairs)

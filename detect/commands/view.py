@@ -13,8 +13,8 @@ import numpy as np
 from detect.drawing.frame import draw_rows
 from detect.errors import DetectError, FrameError
 from detect.options import View
-from detect.row_files import SeenRows, open_rows
-from detect.seen import circle_on_floor, summed_steps
+from detect.projection import circle_on_floor, summed_steps
+from detect.row_files import ImageRows, open_rows
 from detect.sources.interface import read_image
 from detect.sources.opening import demand_recording, open_run
 from detect.sources.poses import SomeFrames
@@ -41,7 +41,7 @@ def perform(options: View) -> int:
     if options.output is not None:
         demand_place(options.output, overwrite=options.force)
     frames = SomeFrames(run.frames, every=options.every)
-    sight, settings = source.sight(run.camera), source.circle_settings
+    projection = source.projection(run.camera)
     poses, known = _poses(options, [frame.step for frame in run.frames])
     recording = rr.RecordingStream("detect view", recording_id=f"detect-{run.name}")
     failures: list[str] = []
@@ -69,14 +69,14 @@ def perform(options: View) -> int:
                     kind = "timestamp" if frame.time_s >= _EARLIEST_DATE_S else "duration"
                     recording.set_time("time", **{kind: frame.time_s})
                 rows = source.of(frame.step.prefix)
-                _log_world(rr, recording, rows, poses[position + 1], settings.radius_m)
+                _log_world(rr, recording, rows, poses[position + 1], projection.settings.radius_m)
                 try:
                     image = read_image(frame, run.camera)
                 except FrameError as error:
                     failures.append(str(error))
                     recording.log("camera/image", rr.Clear(recursive=False))
                 else:
-                    picture = draw_rows(image, sight, rows, settings, frame.step.prefix)
+                    picture = draw_rows(image, projection, rows, frame.step.prefix)
                     coloured = np.ascontiguousarray(picture[:, :, ::-1])
                     recording.log("camera/image", rr.Image(coloured).compress(jpeg_quality=85))
                 advance()
@@ -107,7 +107,7 @@ def _poses(options: View, steps: list[Step]) -> tuple[FloatArray, dict[str, Floa
     return poses, {"discs": known.discs.xy, "verticals": known.lines.xy}
 
 
-def _log_world(rr: Any, recording: Any, rows: SeenRows, pose: FloatArray, radius_m: float) -> None:
+def _log_world(rr: Any, recording: Any, rows: ImageRows, pose: FloatArray, radius_m: float) -> None:
     x, y, theta = pose.tolist()
     # As a quaternion: with an axis, Rerun 0.23 needs a newer NumPy than it requires.
     turn = [0.0, 0.0, np.sin(0.5 * theta), np.cos(0.5 * theta)]

@@ -34,8 +34,8 @@ from detect.comparison.result import (
 )
 from detect.errors import CompareError, DetectError
 from detect.options import CompareOptions
+from detect.projection import LEAST_GATE_PX, DiscProjection
 from detect.row_files import circle_settings_of
-from detect.seen import LEAST_GATE_PX, Sight
 from detect.sources.image_files import image_name
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
@@ -89,15 +89,15 @@ def compare_run(
     ):
         if not path.exists():
             raise DetectError(f"{path}: no such landmark file: {advice}")
-    sight = None
+    projection = None
     if kind == "circles":
         camera = camera_in(run) if camera is None else camera
         camera = read_camera(camera) if isinstance(camera, Path) else camera
         settings, level = circle_settings_of(read_head(detected)), read_head(reference).level
-        sight = None if camera is None else Sight.by(camera, settings, level)
+        projection = None if camera is None else DiscProjection(camera, settings, level)
     rows, names = read_kind(kind, detected), (str(reference), str(detected))
     return compare_with_file(
-        kind, reference, rows, options, sight=sight, unlisted=unlisted, names=names
+        kind, reference, rows, options, projection=projection, unlisted=unlisted, names=names
     )
 
 
@@ -107,7 +107,7 @@ def compare_with_file(
     detected: Iterable[Frame],
     options: CompareOptions | None = None,
     *,
-    sight: Sight | None = None,
+    projection: DiscProjection | None = None,
     unlisted: Path | None = None,
     names: tuple[str, str],
 ) -> Comparison:
@@ -125,9 +125,14 @@ def compare_with_file(
     uncounted = beside if unlisted is None else list(read_frames(unlisted))
     if kind == "lines":
         return compare_line_frames(wanted, detected, options, unlisted=uncounted, names=names)
-    alike = rows_beside(reference, "lookalikes")
     return compare_frames(
-        wanted, detected, options, sight=sight, unlisted=uncounted, lookalikes=alike, names=names
+        wanted,
+        detected,
+        options,
+        projection=projection,
+        unlisted=uncounted,
+        lookalikes=rows_beside(reference, "lookalikes"),
+        names=names,
     )
 
 
@@ -152,7 +157,7 @@ def compare_frames(
     detected: Iterable[Frame],
     options: CompareOptions | None = None,
     *,
-    sight: Sight | None = None,
+    projection: DiscProjection | None = None,
     unlisted: Iterable[Frame] | None = None,
     lookalikes: Iterable[Frame] | None = None,
     names: tuple[str, str] = ("reference", "detected"),
@@ -163,8 +168,8 @@ def compare_frames(
     ----------
     reference, detected : iterable of Frame
     options : CompareOptions, optional
-    sight : Sight, optional
-        Maps rows into the images; without it, they are compared on the floor.
+    projection : DiscProjection, optional
+        Projects rows into the images; without it, they are compared on the floor.
     unlisted : iterable of Frame, optional
         Discs that may be detected but need not be: rows matching them are neither right nor wrong.
     lookalikes : iterable of Frame, optional
@@ -178,29 +183,30 @@ def compare_frames(
         If an image has two frames.
     """
     options = options or CompareOptions()
-    in_image = sight is not None and options.gate_m is None
+    in_image = projection is not None and options.gate_m is None
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
     match = partial(match_runs, "circles", wanted, found, options, names, unlisted=unlisted)
-    run = match(sight)
-    if sight is not None and not sight.reference_level:
+    run = match(projection)
+    if projection is not None and not projection.reference_level:
         # A file need not state that its rows are level: then the matches in the images decide.
-        level_sight = replace(sight, reference_level=True)
-        as_level = match(level_sight)
+        with_level = replace(projection, reference_level=True)
+        as_level = match(with_level)
         if _image_cost(as_level.frames) < _image_cost(run.frames):
-            run, sight = as_level, level_sight
+            run, projection = as_level, with_level
     run = replace(run, on_lookalikes=_on_lookalikes(run.frames, lookalikes, options))
     matches = run.frames
     first, second, _, extra = sides = tuple(
         circle_arrays([row for match in matches for row in getattr(match, side)])
         for side in ("wanted", "matched", "missed", "extra")
     )
-    alike_xy = np.concatenate([np.zeros((0, 2)), *(_alike_xy(m.wanted, m.view) for m in matches)])
-    away = first.xy - (np.zeros(2) if sight is None else sight.camera.centre[:2])
+    levelled = [_levelled_xy(match.wanted, match.projection) for match in matches]
+    alike_xy = np.concatenate([np.zeros((0, 2)), *levelled])
+    away = first.xy - (np.zeros(2) if projection is None else projection.camera.centre[:2])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
     pairs = DiscPairs(first.xy, second.xy - first.xy, second.xy - alike_xy, second.covariance, away)
-    apart = [] if sight is None else [apart_px(match) for match in matches]
+    apart = [] if projection is None else [apart_px(match) for match in matches]
     image_px = np.concatenate([np.zeros(0), *apart])
     image_px = image_px[np.isfinite(image_px)]
     error_m = np.linalg.norm(pairs.offset, axis=1)
@@ -217,7 +223,7 @@ def compare_frames(
         image_95_px=quantile(image_px, 0.95),
         reference_levelled=sum(wanted[m.name].levelled_by is not None for m in matches),
         detected_levelled=sum(found[m.name].levelled_by is not None for m in matches),
-        reference_level=sight is not None and sight.reference_level,
+        reference_level=projection is not None and projection.reference_level,
         reference_whole_pixels=_at_whole_pixels(matches),
         pairs=pairs,
     )
@@ -225,8 +231,10 @@ def compare_frames(
 
 def _at_whole_pixels(matches: Iterable[FrameMatch]) -> bool:
     """Whether all matched reference rows are at whole pixels, like those of the data set."""
-    seen = [m.view.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.view]
-    px = np.concatenate([np.zeros((0, 2)), *seen])
+    of_frames = [
+        m.projection.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.projection
+    ]
+    px = np.concatenate([np.zeros((0, 2)), *of_frames])
     return len(px) > 0 and bool(np.abs(px - np.rint(px)).max() < _WHOLE_PX)
 
 
@@ -238,10 +246,10 @@ def _image_cost(matches: Iterable[FrameMatch]) -> float:
     return float(np.sum(costs))
 
 
-def _alike_xy(reference: Sequence[CircleLandmark], view: Sight | None) -> FloatArray:
+def _levelled_xy(rows: Sequence[CircleLandmark], projection: DiscProjection | None) -> FloatArray:
     """(M, 2) floor positions of reference discs, levelled as the detected ones are."""
-    xy = circle_arrays(reference).xy
-    return xy if view is None else view.levelled_alike(xy)
+    xy = circle_arrays(rows).xy
+    return xy if projection is None else projection.levelled_as_detected(xy)
 
 
 def compare_line_frames(
@@ -312,7 +320,7 @@ def _on_lookalikes(
         return None
     known = {image_name(frame.step.prefix): frame.circles for frame in lookalikes}
     return sum(
-        len(pair_discs(known[m.name], m.extra, options, m.view).first)
+        len(pair_discs(known[m.name], m.extra, options, m.projection).first)
         for m in matches
         if m.name in known
     )
@@ -335,7 +343,7 @@ def match_runs(
     detected: Mapping[str, Frame],
     options: CompareOptions,
     names: tuple[str, str],
-    sight: Sight | None = None,
+    projection: DiscProjection | None = None,
     unlisted: Iterable[Frame] | None = None,
 ) -> RunMatch:
     """Match the rows of two runs, image by image; look-alikes are not known.
@@ -347,8 +355,8 @@ def match_runs(
     matches = []
     for name in images:
         frames = reference[name], detected[name]
-        view = None if sight is None else sight.of(*frames)
-        matches.append(match_frame(kind, name, (*frames, known.get(name)), options, view))
+        of_frame = None if projection is None else projection.for_frame(*frames)
+        matches.append(match_frame(kind, name, *frames, options, of_frame, known.get(name)))
     counts: dict[str, int] = {
         name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
@@ -376,30 +384,31 @@ def match_runs(
 def match_frame(
     kind: Kind,
     name: str,
-    frames: tuple[Frame | None, Frame | None, Frame | None],
+    reference: Frame | None,
+    detected: Frame | None,
     options: CompareOptions,
-    view: Sight | None = None,
+    projection: DiscProjection | None = None,
+    unlisted: Frame | None = None,
 ) -> FrameMatch:
-    """Match the discs or the lines of one image one to one.
+    """Match the discs or the lines of one image one to one; a frame that is None has no rows.
 
-    `frames` are those of the reference, of the detected and of the unlisted rows; None means no
-    rows. Detected rows that match an unlisted disc or line (or a reference row without ID, if these
+    Detected rows that match an unlisted disc or line (or a reference row without ID, if these
     do not count), and no reference row that counts, are set aside.
     """
     pair_up: Callable[..., Association] = partial(pair_lines, options=options)
     if kind == "circles":
-        pair_up = partial(pair_discs, options=options, view=view)
-    counted, detected, uncounted = ([*getattr(frame, kind, ())] for frame in frames)
+        pair_up = partial(pair_discs, options=options, projection=projection)
+    frames = reference, detected, unlisted
+    counted, found, uncounted = ([*getattr(frame, kind, ())] for frame in frames)
     if kind == "lines":
-        for rows in (counted, detected, uncounted):
+        for rows in (counted, found, uncounted):
             rows.sort(key=_line_order)
     if options.only_identified:
         uncounted += [row for row in counted if not row.identified]
         counted = [row for row in counted if row.identified]
-    pairs = pair_up(counted, detected)
+    pairs = pair_up(counted, found)
     first, left = ([counted[i] for i in side] for side in (pairs.first, pairs.first_alone))
-    second = [detected[j] for j in pairs.second]
-    alone = [detected[j] for j in pairs.second_alone]
+    second, alone = ([found[j] for j in side] for side in (pairs.second, pairs.second_alone))
     aside = pair_up(uncounted, alone)
     if kind == "lines":
         reach = numbers(second, "sigma") * options.sigmas
@@ -407,11 +416,12 @@ def match_frame(
         errors = np.degrees(np.abs(wrap_angle(numbers(second, "alpha") - numbers(first, "alpha"))))
     else:
         joined = np.zeros(len(left), dtype=np.bool_)
-        errors = np.linalg.norm(circle_arrays(second).xy - _alike_xy(first, view), axis=1)
+        first_xy = _levelled_xy(first, projection)
+        errors = np.linalg.norm(circle_arrays(second).xy - first_xy, axis=1)
     return FrameMatch(
         name,
-        view,
-        detected,
+        projection,
+        found,
         wanted=first,
         matched=second,
         joined=[row for row, with_another in zip(left, joined) if with_another],
@@ -426,17 +436,17 @@ def pair_discs(
     reference: Sequence[CircleLandmark],
     detected: Sequence[CircleLandmark],
     options: CompareOptions,
-    view: Sight | None = None,
+    projection: DiscProjection | None = None,
 ) -> Association:
     """Pair discs of one frame one to one: as many as possible, with least squared distances.
 
-    They are paired in the image if there is a view, unless the options demand the floor.
+    They are paired in the image if there is a projection, unless the options demand the floor.
     """
     first, second = circle_arrays(reference), circle_arrays(detected)
-    if view is not None and options.gate_m is None:
-        seen, again = view.reference_px(first.xy), view.detected_px(second.xy)
-        gate = view.gates(first.xy)
-        apart = (again[None] - seen[:, None]) / gate[:, None]
+    if projection is not None and options.gate_m is None:
+        first_px, second_px = projection.reference_px(first.xy), projection.detected_px(second.xy)
+        gate = projection.gates(first.xy)
+        apart = (second_px[None] - first_px[:, None]) / gate[:, None]
         cost = np.where(np.isfinite(apart).all(axis=-1), (apart**2).sum(axis=-1), np.inf)
         return associate(np.minimum(cost, 2.0), cost <= 1.0)
     gate_m = FLOOR_GATE_M if options.gate_m is None else options.gate_m
@@ -459,10 +469,11 @@ def pair_lines(
 
 def apart_px(match: FrameMatch) -> FloatArray:
     """(M,) distances of matched discs in the image; NaN if one is not visible."""
-    view = match.view
-    assert view is not None
+    projection = match.projection
+    assert projection is not None
     first, second = (circle_arrays(rows).xy for rows in (match.wanted, match.matched))
-    return np.asarray(np.linalg.norm(view.detected_px(second) - view.reference_px(first), axis=1))
+    between = projection.detected_px(second) - projection.reference_px(first)
+    return np.asarray(np.linalg.norm(between, axis=1))
 
 
 def numbers(rows: Sequence[Any], name: str) -> FloatArray:

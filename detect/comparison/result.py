@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from detect.options import CompareOptions
-from detect.seen import Sight
+from detect.projection import DiscProjection
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text, plain
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
@@ -29,7 +29,7 @@ class FrameMatch(NamedTuple):
     """Matching rows of one frame, all discs or all lines."""
 
     name: str  # of the image
-    view: Sight | None  # maps discs into it; None: compared on the floor
+    projection: DiscProjection | None  # into it; None: compared on the floor
     detected: Sequence[Any]  # all detected rows
     wanted: list[Any]  # matched reference rows, and the detected row of each:
     matched: list[Any]  # no row is in two pairs

@@ -156,7 +156,7 @@ def explain_discs(
     at : (float, float), optional
         Pixel (u, v) of something that should have been found; only candidates near it are listed.
     """
-    scene = _Scene(image, camera, replace(settings, refine=True))
+    scene = _Examined(image, camera, replace(settings, refine=True))
     candidates = list(_candidates(scene))
     place = ""
     if at is not None:
@@ -172,7 +172,7 @@ def explain_discs(
 def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:
     """A sentence on why the candidates in images (H, W) without discs were rejected."""
     settings = replace(settings, refine=True)
-    scenes = (_Scene(image, camera, settings) for image in images)
+    scenes = (_Examined(image, camera, settings) for image in images)
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
     if not stages:
@@ -192,7 +192,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _Examined:
     """An image and the detections in it."""
 
     image: GreyImage
@@ -224,7 +224,7 @@ class _Scene:
         return int((np.hypot(*(self.found.floor_xy - here).T) < self.settings.radius_m).sum())
 
 
-def _candidates(scene: _Scene) -> Iterator[Candidate]:
+def _candidates(scene: _Examined) -> Iterator[Candidate]:
     """The discs found, and the rejected candidates."""
     camera, settings, found = scene.camera, scene.settings, scene.found
     votes, judgement = scene.judgement
@@ -265,7 +265,7 @@ def _candidates(scene: _Scene) -> Iterator[Candidate]:
         yield Candidate(u, v, x, y, float(votes[k]), contrast, stage, value, limit)
 
 
-def _place(at: tuple[float, float], scene: _Scene) -> str:
+def _place(at: tuple[float, float], scene: _Examined) -> str:
     """What the detector sees at a pixel, in words."""
     camera, settings, (u, v) = scene.camera, scene.settings, at
     if not (0.0 <= u <= camera.width - 1 and 0.0 <= v <= camera.height - 1):
@@ -289,7 +289,7 @@ def _place(at: tuple[float, float], scene: _Scene) -> str:
     return f"{words}: edges there have {votes[near].max():.1f} times the usual votes for a disc."
 
 
-def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]:
+def _suggestions(scene: _Examined, at: tuple[float, float] | None) -> Iterator[str]:
     """Changes of settings that find more (at the given position)."""
     settings, here = scene.settings, scene.count(at)
     if at is not None and here:
@@ -327,7 +327,7 @@ def _suggestions(scene: _Scene, at: tuple[float, float] | None) -> Iterator[str]
         yield f"--evidence {lower.evidence:.1f} finds {more} {where}: look whether they are discs."
 
 
-def _radius_at(scene: _Scene, at: tuple[float, float]) -> float | None:
+def _radius_at(scene: _Examined, at: tuple[float, float]) -> float | None:
     """The radius at which the disc with the highest evidence is found at a pixel."""
     camera, settings = scene.camera, scene.settings
     here = camera.floor_from_pixel(at)

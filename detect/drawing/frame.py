@@ -24,9 +24,8 @@ from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
-from detect.row_files import KINDS, SeenRows
-from detect.seen import Sight, circle_on_floor
-from detect.settings import CircleSettings
+from detect.projection import DiscProjection, circle_on_floor
+from detect.row_files import KINDS, ImageRows
 from detect.verticals.judgement import FATES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
@@ -61,42 +60,40 @@ _CANDIDATE_COLOUR: Colour = (255, 150, 40)
 
 
 def draw_rows(
-    image: GreyImage, sight: Sight | None, rows: SeenRows, settings: CircleSettings, title: str = ""
+    image: GreyImage, projection: DiscProjection | None, rows: ImageRows, title: str = ""
 ) -> ByteArray:
     """Draw rows of a frame into its image (H, W), with a caption below it.
 
-    Without a calibrated camera only markers are drawn. The settings contain the radii of the discs'
-    outlines. The channels of the picture (S H + h, S W, 3) are in OpenCV's order, blue, green, red;
-    S is 2 for small images, to separate labels, otherwise 1.
+    Without a calibrated camera only markers are drawn. Channels of the picture (S H + h, S W, 3)
+    are in OpenCV's order, blue, green, red; S is 2 for small images, to separate labels, else 1.
     """
-    scale = 2 if image.shape[1] < _SMALL_PX else 1
-    canvas = canvas_of(image, None if sight is None else sight.camera)
-    canvas = np.repeat(np.repeat(canvas, scale, axis=0), scale, axis=1)
-    words, labels = [title] if title else [], list[Box]()
+    canvas = _Canvas(image, None if projection is None else projection.camera)
+    words = [title] if title else []
     if not processed(rows):
         words.append("not processed")
     options = CompareOptions()
-    if sight is not None and rows.lines is not None:
-        match = match_frame("lines", title, (rows.reference_lines, rows.lines, None), options)
+    if projection is not None and rows.lines is not None:
+        match = match_frame("lines", title, rows.reference_lines, rows.lines, options)
         compared = rows.reference_lines is not None
-        _draw_lines(canvas, sight.camera, match, compared, scale, labels)
+        _draw_lines(canvas, projection.camera, match, compared)
         words.append(_count("verticals", match, compared))
-    if sight is not None and rows.circles is not None:
-        discs = rows.reference_circles, rows.circles, rows.unlisted
-        match = match_frame("circles", title, discs, options, sight.of(*discs[:2]))
+    if projection is not None and rows.circles is not None:
+        discs = rows.reference_circles, rows.circles
+        of_frame = projection.for_frame(*discs)
+        match = match_frame("circles", title, *discs, options, of_frame, rows.unlisted)
         compared = rows.reference_circles is not None
-        _draw_discs(canvas, match, settings, compared, scale, labels)
+        _draw_discs(canvas, match, compared)
         words.append(_count("discs", match, compared))
     if rows.markers is not None:
-        _draw_markers(canvas, rows.markers.markers, scale)
+        _draw_markers(canvas, rows.markers.markers)
         words.append(f"{len(rows.markers.markers)} markers")
     if rows.tilt is not None:
         pitch, roll = np.degrees([rows.tilt.pitch, rows.tilt.roll])
         words.append(f"pitch {pitch:.2f} roll {roll:.2f} deg")
-    return with_legend(canvas, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38)
+    return with_legend(canvas.picture, [("   ".join(words), _WORDS_COLOUR)], image.shape[1], 0.38)
 
 
-def processed(rows: SeenRows) -> bool:
+def processed(rows: ImageRows) -> bool:
     """Whether any file of detected rows has the image."""
     return any(getattr(rows, kind) is not None for kind in KINDS)
 
@@ -104,6 +101,41 @@ def processed(rows: SeenRows) -> bool:
 def _scaled(points: FloatArray, scale: int) -> FloatArray:
     """Positions (..., 2) in an image as those in its enlarged picture."""
     return scale * (points + 0.5) - 0.5
+
+
+class _Canvas:
+    """The picture of an image, twice as large if that is small, and what is drawn into it."""
+
+    def __init__(self, image: GreyImage, camera: Camera | None) -> None:
+        self.scale = 2 if image.shape[1] < _SMALL_PX else 1
+        picture = canvas_of(image, camera)
+        self.picture = np.repeat(np.repeat(picture, self.scale, axis=0), self.scale, axis=1)
+        self.times = enlargement(self.picture)  # of text and marks
+        self._labels: list[Box] = []
+
+    def scaled(self, points: FloatArray) -> FloatArray:
+        """Positions (..., 2) in the image as those in the picture."""
+        return _scaled(points, self.scale)
+
+    def label(
+        self, text: str, places: Sequence[tuple[FloatArray, float]], colour: Colour, size: float
+    ) -> None:
+        """Draw a label at the first place where it is on no other, or a little below the last one.
+
+        A place is a point at half the label's height, and the share of its width to the left of it.
+        If none is free, the label is left out: further away, it would seem to be another one's.
+        """
+        extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * self.times, self.times)[0]
+        wide, high = np.array(extent) + 2.0 * self.times
+        corners = [place - np.array([share * wide, 0.5 * high]) for place, share in places]
+        corners += [corners[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
+        for least in corners:
+            most = np.add(least, (wide, high))
+            within = least[0] >= 0.0 and most[0] <= self.picture.shape[1]
+            if within and not any(np.all((least < b) & (a < most)) for a, b in self._labels):
+                self._labels.append((least, most))
+                draw_text(self.picture, text, (least[0], most[1] - self.times), colour, size)
+                return
 
 
 def line_curves(camera: Camera, ends: FloatArray) -> FloatArray:
@@ -142,20 +174,14 @@ def ends_of(rows: Sequence[LineLandmark]) -> FloatArray:
     return np.array(ends, dtype=np.float64).reshape(-1, 4)
 
 
-def _draw_discs(
-    canvas: ByteArray,
-    match: FrameMatch,
-    settings: CircleSettings,
-    compared: bool,
-    scale: int,
-    taken: list[Box],
-) -> None:
+def _draw_discs(canvas: _Canvas, match: FrameMatch, compared: bool) -> None:
     """Missed reference discs; detected ones with their two outlines and a label beside them."""
-    view = match.view
-    assert view is not None
+    projection = match.projection
+    assert projection is not None
+    settings = projection.settings
     rings = circle_on_floor(circle_arrays(match.missed).xy, settings.radius_m)
-    for edge in view.reference_px(rings):
-        draw_curve(canvas, _scaled(edge, scale), MISSED_COLOUR, closed=True)
+    for edge in projection.reference_px(rings):
+        draw_curve(canvas.picture, canvas.scaled(edge), MISSED_COLOUR, closed=True)
     drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
     drawn += [
@@ -165,56 +191,21 @@ def _draw_discs(
     rims = []
     for row, _, edge_colour in drawn:
         for radius_m, colour in zip(radii, (_OUTLINE_COLOUR, edge_colour, _OUTLINE_COLOUR)):
-            outline = view.detected_px(circle_on_floor((row.px, row.py), radius_m))
-            rims.append(_scaled(outline, scale))
-            draw_curve(canvas, rims[-1], colour, closed=True)
-    gap = np.array([3.0 * enlargement(canvas), 0.0])
+            outline = projection.detected_px(circle_on_floor((row.px, row.py), radius_m))
+            rims.append(canvas.scaled(outline))
+            draw_curve(canvas.picture, rims[-1], colour, closed=True)
+    gap = np.array([3.0 * canvas.times, 0.0])
     for (row, text, _), rim in zip(drawn, rims[2::3]):
         if np.all(np.abs(rim) < _FARTHEST_PX):
             (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
             middle = 0.5 * (top + bottom)
             beside = [(np.array([right, middle]) + gap, 0.0), (np.array([left, middle]) - gap, 1.0)]
-            _draw_label(canvas, f"{row.quality:.2f}{text}", beside, _TEXT_COLOUR, 0.35, taken)
+            canvas.label(f"{row.quality:.2f}{text}", beside, _TEXT_COLOUR, 0.35)
 
 
-def _draw_label(
-    canvas: ByteArray,
-    text: str,
-    places: Sequence[tuple[FloatArray, float]],
-    colour: Colour,
-    size: float,
-    taken: list[Box],
-) -> None:
-    """Draw a label at the first place where it is on no other, or a little below the last one.
-
-    A place is a point at half the label's height, and the share of its width to the left of it. If
-    none is free, the label is left out: further away, it would seem to be another one's. `taken`
-    are the corners of the labels drawn before; those of this one are added.
-    """
-    times = enlargement(canvas)
-    extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * times, times)[0]
-    wide, high = np.array(extent) + 2.0 * times
-    corners = [place - np.array([share * wide, 0.5 * high]) for place, share in places]
-    corners += [corners[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
-    for least in corners:
-        most = np.add(least, (wide, high))
-        within = least[0] >= 0.0 and most[0] <= canvas.shape[1]
-        if within and not any(np.all((least < b) & (a < most)) for a, b in taken):
-            taken.append((least, most))
-            draw_text(canvas, text, (least[0], most[1] - times), colour, size)
-            return
-
-
-def _draw_lines(
-    canvas: ByteArray,
-    camera: Camera,
-    match: FrameMatch,
-    compared: bool,
-    scale: int,
-    taken: list[Box],
-) -> None:
-    for curve in _scaled(line_curves(camera, ends_of(match.missed)), scale):
-        draw_curve(canvas, curve, MISSED_COLOUR)
+def _draw_lines(canvas: _Canvas, camera: Camera, match: FrameMatch, compared: bool) -> None:
+    for curve in canvas.scaled(line_curves(camera, ends_of(match.missed))):
+        draw_curve(canvas.picture, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
     for wanted, row in zip(match.wanted, match.matched):
@@ -222,31 +213,32 @@ def _draw_lines(
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))
     rows = [row for row, _, _ in drawn]
-    curves = _scaled(line_curves(camera, ends_of(rows)), scale)
-    bars = _scaled(sigma_bars(camera, ends_of(rows), numbers(rows, "sigma")), scale)
-    tick = enlargement(canvas) * np.array([[0.0, -2.0], [0.0, 2.0]])
+    curves = canvas.scaled(line_curves(camera, ends_of(rows)))
+    bars = canvas.scaled(sigma_bars(camera, ends_of(rows), numbers(rows, "sigma")))
+    tick = canvas.times * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
-        draw_curve(canvas, curve, colour)
+        draw_curve(canvas.picture, curve, colour)
         for points in (bar, bar[0] + tick, bar[1] + tick):
-            draw_curve(canvas, points, SIGMA_COLOUR)
+            draw_curve(canvas.picture, points, SIGMA_COLOUR)
         if text:
             below = curve[-1] + 2.5 * tick[1]
             places = [(below, 0.5), (below, 1.0), (below, 0.0)]
-            _draw_label(canvas, text, places, SIGMA_COLOUR, 0.3, taken)
+            canvas.label(text, places, SIGMA_COLOUR, 0.3)
 
 
-def _draw_markers(canvas: ByteArray, found: Sequence[MarkerLandmark], scale: int) -> None:
+def _draw_markers(canvas: _Canvas, found: Sequence[MarkerLandmark]) -> None:
     """Edges, a circle at the top left corner, and ellipses of 20 standard deviations."""
-    times = enlargement(canvas)
     circle = circle_on_floor((0.0, 0.0), 1.0, _POINTS)
     for row in found:
-        corners = _scaled(np.array([(c.u, c.v) for c in row.corners]), scale)
-        draw_curve(canvas, corners, LINE_COLOUR, closed=True)
+        corners = canvas.scaled(np.array([(c.u, c.v) for c in row.corners]))
+        draw_curve(canvas.picture, corners, LINE_COLOUR, closed=True)
         spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
-        for ellipse in ellipses(corners, spreads, scale * _SIGMAS, _POINTS):
-            draw_curve(canvas, ellipse, LINE_COLOUR, closed=True)
-        draw_curve(canvas, corners[0] + 3.0 * times * circle, MISSED_COLOUR, closed=True)
-        draw_text(canvas, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
+        for ellipse in ellipses(corners, spreads, canvas.scale * _SIGMAS, _POINTS):
+            draw_curve(canvas.picture, ellipse, LINE_COLOUR, closed=True)
+        draw_curve(
+            canvas.picture, corners[0] + 3.0 * canvas.times * circle, MISSED_COLOUR, closed=True
+        )
+        draw_text(canvas.picture, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:

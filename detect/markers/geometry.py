@@ -121,13 +121,8 @@ def largest_quadrangle(points: FloatArray) -> tuple[int, int, int, int]:
     return best
 
 
-def signed_area(corners: FloatArray) -> float:
-    """Area of a quadrangle (4, 2); positive if it is clockwise as seen in the image (v down)."""
-    return float(_areas(corners))
-
-
-def _areas(corners: FloatArray) -> FloatArray:
-    """(...,) areas of quadrangles (..., 4, 2)."""
+def signed_area(corners: FloatArray) -> FloatArray:
+    """(...,) areas of quadrangles (..., 4, 2); positive if clockwise in the image (v down)."""
     a, b = corners[..., 2, :] - corners[..., 0, :], corners[..., 3, :] - corners[..., 1, :]
     return np.asarray(0.5 * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]))
 
@@ -156,7 +151,7 @@ def count_same(first: FloatArray, others: FloatArray) -> int:
     """Number of quadrangles (N, 4, 2) with the same corners as the first, in any order."""
     apart = np.abs(first[:, None] - others[:, None]).max(axis=-1)
     farthest = apart.min(axis=2).max(axis=1)
-    largest = _SAME_PX + _SAME_WIDTHS * np.sqrt(np.abs(_areas(others)))
+    largest = _SAME_PX + _SAME_WIDTHS * np.sqrt(np.abs(signed_area(others)))
     return int(np.count_nonzero(farthest <= largest))
 
 

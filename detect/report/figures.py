@@ -14,8 +14,8 @@ from scipy.linalg import block_diag
 
 from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
 from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
-from detect.row_files import SeenRows
-from detect.seen import summed_steps
+from detect.projection import summed_steps
+from detect.row_files import ImageRows
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     CircleArrays,
@@ -150,10 +150,10 @@ def _spread(words: str, x: str, y: str, at: FloatArray, values: FloatArray) -> P
     return _part(words, content, 2.8)
 
 
-def tilt_figure(rows: Sequence[SeenRows]) -> Part:
+def tilt_figure(rows: Sequence[ImageRows]) -> Part:
     """Pitch and roll over the run, with bands of one standard deviation."""
     nothing = (np.nan,) * 4
-    tilts = [seen.tilt for seen in rows]
+    tilts = [each.tilt for each in rows]
     figures = [nothing if t is None else (t.pitch, t.cpp, t.roll, t.crr) for t in tilts]
     pitch, pitch_variance, roll, roll_variance = np.array(figures, dtype=np.float64).T
     with figure_file((_WIDE, 3.4), "svg") as (figure, content):
@@ -192,18 +192,18 @@ def _part(words: str, content: BytesIO, height: float) -> Part:
     return image_part(words, content.getvalue(), "svg+xml", 96.0 * _WIDE, 96.0 * height)
 
 
-def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
+def floor_map(rows: Sequence[ImageRows], unmatched: str = "") -> Part | None:
     """Map of the discs found and of the reference, along the path summed from the steps.
 
     Forward at the start is up, left is left. The caption ends with `unmatched`, on discs without a
     reference row. None if there are no discs; a note if some are too far away for a figure.
     """
-    seen = [(each.circles, each.reference_circles) for each in rows if each.circles is not None]
-    if not any(found.circles for found, _ in seen):
+    pairs = [(one.circles, one.reference_circles) for one in rows if one.circles is not None]
+    if not any(found.circles for found, _ in pairs):
         return None
-    poses = summed_steps(found.step for found, _ in seen)
+    poses = summed_steps(found.step for found, _ in pairs)
     outlines, true = [], [np.zeros((0, 2))]
-    for (found, reference), pose in zip(seen, poses[1:]):
+    for (found, reference), pose in zip(pairs, poses[1:]):
         discs = circle_arrays(found.circles)
         outlines.append(apply(pose, ellipses(discs.xy, discs.covariance, _SIGMAS, _CORNERS)))
         if reference is not None:
@@ -230,7 +230,7 @@ def floor_map(rows: Sequence[SeenRows], unmatched: str = "") -> Part | None:
     return _part(f"{words}each frame, {along}.{unmatched}", content, _WIDE)
 
 
-def repeated(rows: Sequence[SeenRows]) -> Repeatability | None:
+def repeated(rows: Sequence[ImageRows]) -> Repeatability | None:
     """How well discs in successive frames agree, the latter moved by the odometry's step.
 
     Discs are paired within five standard deviations, unless these are too large to identify them.

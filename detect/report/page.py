@@ -17,9 +17,9 @@ from detect.drawing.frame import draw_rows, processed
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
 from detect.options import RowFiles
+from detect.projection import DiscProjection, summed_steps
 from detect.report import figures
-from detect.row_files import RunRows, SeenRows, open_rows
-from detect.seen import Sight, summed_steps
+from detect.row_files import ImageRows, RunRows, open_rows
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from redetect import __version__
@@ -48,15 +48,15 @@ _NO_REFERENCE = "No reference rows: expected {} in the run folder, or a file nam
 class ReportInputs:
     """A run's rows, and their comparison with the reference.
 
-    `names` are the prefixes of the frames in order, `rows` the rows of each. `sight` is None
+    `names` are the prefixes of the frames in order, `rows` the rows of each. `projection` is None
     without a calibration, comparisons are None without reference rows.
     """
 
     run: ImageRun
     files: RunRows
     names: tuple[str, ...]
-    rows: tuple[SeenRows, ...]
-    sight: Sight | None
+    rows: tuple[ImageRows, ...]
+    projection: DiscProjection | None
     discs: DiscComparison | None
     lines: LineComparison | None
 
@@ -71,10 +71,10 @@ def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
     if not names:
         raise DetectError(f"{run.folder}: no frames: expected some of them")
     rows = tuple(files.of(name) for name in names)
-    sight = files.sight(run.camera) if isinstance(run, Run) else None
+    projection = files.projection(run.camera) if isinstance(run, Run) else None
 
     def compared(kind: Kind) -> Comparison | None:
-        both = [(getattr(seen, kind), getattr(seen, f"reference_{kind}")) for seen in rows]
+        both = [(getattr(each, kind), getattr(each, f"reference_{kind}")) for each in rows]
         if not any(detected and reference for detected, reference in both):
             return None
         reference = files.reference[kind]
@@ -82,24 +82,23 @@ def gather(run: ImageRun, options: RowFiles) -> ReportInputs:
             kind,
             reference,
             [detected for detected, _ in both if detected],
-            sight=sight,
+            projection=projection,
             names=(reference.name, files.detected[kind].name),
         )
 
     discs, lines = compared("circles"), compared("lines")
     assert isinstance(discs, DiscComparison | None)
     assert isinstance(lines, LineComparison | None)
-    return ReportInputs(run, files, names, rows, sight, discs, lines)
+    return ReportInputs(run, files, names, rows, projection, discs, lines)
 
 
 def frame_picture(inputs: ReportInputs, frame: RunFrame, words: str) -> Part:
     """The picture of a frame with its rows, or a note on why there is none."""
     try:
-        image = read_image(frame, None if inputs.sight is None else inputs.sight.camera)
+        image = read_image(frame, None if inputs.projection is None else inputs.projection.camera)
     except FrameError as error:
         return Part("note", f"{words}: {error}")
-    rows, settings = inputs.files.of(frame.step.prefix), inputs.files.circle_settings
-    picture = draw_rows(image, inputs.sight, rows, settings)
+    picture = draw_rows(image, inputs.projection, inputs.files.of(frame.step.prefix))
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     return image_part(words, encoded.tobytes(), "jpeg", picture.shape[1], picture.shape[0])
 
@@ -136,7 +135,7 @@ def _summary(inputs: ReportInputs, pictures: list[Part]) -> list[Part]:
     if done < len(inputs.rows):
         shown.append(("not processed", len(inputs.rows) - done))
     for kind in inputs.files.detected:
-        frames = [frame for seen in inputs.rows if (frame := getattr(seen, kind)) is not None]
+        frames = [frame for each in inputs.rows if (frame := getattr(each, kind)) is not None]
         count = len(frames) if kind == "tilt" else sum(len(getattr(f, kind)) for f in frames)
         shown.append((_NAMES[kind], count))
     results = [result for result in (inputs.discs, inputs.lines) if result is not None]
@@ -172,7 +171,7 @@ def _next_steps(inputs: ReportInputs) -> Iterator[str]:
             yield _NO_REFERENCE.format(f"map.{kind}", flag)
     if "tilt" in files.detected and without:
         yield f"{counted(len(without), 'frame')} without a tilt by verticals: see Tilt."
-    frames = [seen.circles for seen in inputs.rows if seen.circles is not None]
+    frames = [each.circles for each in inputs.rows if each.circles is not None]
     if not frames:
         return
     if not summed_steps(frame.step for frame in frames).any():
@@ -189,8 +188,8 @@ def _next_steps(inputs: ReportInputs) -> Iterator[str]:
 def _without_tilt(inputs: ReportInputs) -> list[str]:
     """The processed frames in which too few verticals agree for a tilt."""
     least = LineSettings.least_lines
-    rows = [(name, seen) for name, seen in zip(inputs.names, inputs.rows) if processed(seen)]
-    return [name for name, seen in rows if seen.tilt is None or seen.tilt.lines < least]
+    rows = [(name, each) for name, each in zip(inputs.names, inputs.rows) if processed(each)]
+    return [name for name, each in rows if each.tilt is None or each.tilt.lines < least]
 
 
 def _uncertainty(inputs: ReportInputs) -> list[Part]:
@@ -259,7 +258,7 @@ def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[st
 
     The first one has most discs. Without a reference to rank them, the others are some frames.
     """
-    done = {name: seen for name, seen in zip(inputs.names, inputs.rows) if processed(seen)}
+    done = {name: each for name, each in zip(inputs.names, inputs.rows) if processed(each)}
     named = {image_name(prefix): prefix for prefix in inputs.names}
     parts: list[Part] = []
     shown: dict[str, str] = {}
@@ -282,16 +281,16 @@ def _shown_frames(inputs: ReportInputs, worst: int) -> tuple[list[Part], dict[st
     return parts, shown
 
 
-def _sizes(seen: SeenRows) -> list[int]:
+def _sizes(rows: ImageRows) -> list[int]:
     """Numbers of discs, verticals and markers in a frame."""
     kinds = ("circles", "lines", "markers")
-    return [len(getattr(getattr(seen, kind), kind, ())) for kind in kinds]
+    return [len(getattr(getattr(rows, kind), kind, ())) for kind in kinds]
 
 
 def _tilt(inputs: ReportInputs) -> list[Part]:
     if "tilt" not in inputs.files.detected:
         return []
-    tilts = [seen.tilt for seen in inputs.rows if seen.tilt is not None]
+    tilts = [each.tilt for each in inputs.rows if each.tilt is not None]
     if not tilts:
         return [Part("note", "No frame has a tilt: too few verticals agreed.")]
     lines = np.median([t.lines for t in tilts])

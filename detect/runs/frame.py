@@ -24,6 +24,7 @@ from detect.discs.placing import place_discs
 from detect.errors import FrameError
 from detect.levelling import as_calibrated, common_covariance, levelled
 from detect.lines import LineDetections, carry_ids, detect_lines
+from detect.projection import leaning_camera
 from detect.run_tilt import smooth_axis
 from detect.runs.plan import (
     FramePlan,
@@ -36,7 +37,6 @@ from detect.runs.plan import (
     rows_of_failure,
     time_row,
 )
-from detect.seen import leaning_camera
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table, cached_vote_table
@@ -78,20 +78,20 @@ class FrameDetections:
     image: GreyImage | None = None  # (H, W); None if it cannot be read
     lines: LineDetections | None = None
     tilt: FrameTilt | None = None  # from the lines, if enough determine it, or prior data
-    seen: CircleDetections | None = None  # discs, assuming a level robot
+    unlevelled: CircleDetections | None = None  # discs, as if the robot was level
     discs: CircleDetections | None = None  # corrected for the tilt, if planned
     outline_tilt: FrameTilt | None = None  # from the discs, if a run is levelled by all frames
     markers: MarkerDetections | None = None
     error: str | None = None  # why the frame cannot be processed
 
 
-#: Inputs of the search for discs: the camera, including its lean, and its table.
-Search = tuple[Camera, VoteTable | DiscTable]
-
-
 @lru_cache(maxsize=16)
-def search_of(camera: Camera, circles: CircleSettings, lean: Lean | None) -> Search:
-    """Inputs of a camera's search for discs, made or loaded from the cache once per process."""
+def search_of(
+    camera: Camera, circles: CircleSettings, lean: Lean | None
+) -> tuple[Camera, VoteTable | DiscTable]:
+    """The camera, including its lean, and the table for its search for discs, made or loaded once
+    per process.
+    """
     leaning = camera if lean is None else leaning_camera(camera, lean)
     return leaning, disc_table(leaning, circles)
 
@@ -141,27 +141,13 @@ def _path(
 
         if plan.circles and camera:
             by_frame = found.tilt if plan.levelling == "frame" else None
-            settings = plan.circles
-            if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
-                settings = replace(settings, tilt_sigma_deg=0.0)
-            seen = _discs(image, camera, settings, search_of(camera, plan.circles, plan.lean))
-            if plan.lean is None and by_frame is not None and settings.refine:
-                lean = lean_of_frame(by_frame)
-                if lean is not None:
-                    leaning = _discs(image, camera, settings, search_of(camera, plan.circles, lean))
-                    if lean_finds_more(leaning.evidence.sum(), seen.evidence.sum()):
-                        seen = leaning
-            found.seen = seen
-            found.discs = seen if by_frame is None else levelled(seen, camera, by_frame)
-            if plan.levelling != "run" and settings.refine:  # levelling by the run does so later
-                discs, by_verticals = found.discs, by_frame is not None
-                covariance = discs.covariance + common_covariance(
-                    camera, discs.floor_xy, settings.calibration_px, by_verticals=by_verticals
-                )
-                found.discs = replace(discs, covariance=covariance)
-            if plan.levelling == "run":
-                tilt = tilt_of_outlines(image, camera, found.seen.floor_xy, settings.radius_m)
-                found.outline_tilt = tilt and replace(tilt, prefix=prefix)
+            found.unlevelled = found.discs = _search(image, plan, by_frame)
+            if plan.levelling == "run":  # levels them later
+                xy, radius_m = found.unlevelled.floor_xy, plan.circles.radius_m
+                if (tilt := tilt_of_outlines(image, camera, xy, radius_m)) is not None:
+                    found.outline_tilt = replace(tilt, prefix=prefix)
+            else:
+                found.discs = _levelled(found.unlevelled, camera, plan.circles, by_frame)
         yield
 
         if plan.markers:
@@ -172,13 +158,40 @@ def _path(
         found.error = reason_of(error, task)
 
 
-def _discs(
-    image: GreyImage, camera: Camera, settings: CircleSettings, search: Search
+def _search(image: GreyImage, plan: FramePlan, by_frame: FrameTilt | None) -> CircleDetections:
+    """The discs as a level robot sees them, searched with the lean of the run's camera; or with the
+    tilt of the frame, if they will be levelled by that and it finds more.
+    """
+    camera, settings = plan.camera, plan.circles
+    assert camera is not None
+    assert settings is not None
+    fitting = settings
+    if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
+        fitting = replace(settings, tilt_sigma_deg=0.0)
+
+    def with_lean(lean: Lean | None) -> CircleDetections:
+        leaning, table = search_of(camera, settings, lean)
+        found = detect_circles(image, leaning, table, fitting)
+        return found if leaning == camera else as_calibrated(found, leaning, camera)
+
+    found = with_lean(plan.lean)
+    if by_frame is None or plan.lean is not None or not settings.refine:
+        return found
+    lean = lean_of_frame(by_frame)
+    leaning = found if lean is None else with_lean(lean)
+    return leaning if lean_finds_more(leaning.evidence.sum(), found.evidence.sum()) else found
+
+
+def _levelled(
+    discs: CircleDetections, camera: Camera, settings: CircleSettings, by_frame: FrameTilt | None
 ) -> CircleDetections:
-    """Discs as the calibrated camera sees them, found with the camera's lean."""
-    leaning, table = search
-    found = detect_circles(image, leaning, table, settings)
-    return found if leaning == camera else as_calibrated(found, leaning, camera)
+    """Discs levelled by the tilt of their frame, if known, with the calibration's errors."""
+    discs = discs if by_frame is None else levelled(discs, camera, by_frame)
+    if not settings.refine:
+        return discs
+    xy, by_verticals = discs.floor_xy, by_frame is not None
+    common = common_covariance(camera, xy, settings.calibration_px, by_verticals=by_verticals)
+    return replace(discs, covariance=discs.covariance + common)
 
 
 def reason_of(error: Exception, task: FrameTask) -> str:
@@ -247,13 +260,13 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
         rows["tilt"] = f"{own}\n"
         if found.outline_tilt is not None:
             rows["tilt"] += f"{format_outline_tilt(found.outline_tilt)}\n"
-    if found.discs is not None and found.seen is not None:
+    if found.discs is not None and found.unlevelled is not None:
         level = found.discs.levelled_by
         note = "" if level is None else f"{format_levelling(level)}\n"
-        discs = _disc_rows(found.discs, found.seen, task.known)
+        discs = _disc_rows(found.discs, found.unlevelled, task.known)
         rows["circles"] = head + note + _text(discs)
         if plan.json:
-            seen = zip(discs, found.discs.pixels.tolist(), found.discs.evidence.tolist())
+            values = zip(discs, found.discs.pixels.tolist(), found.discs.evidence.tolist())
             records = [
                 {
                     "pixel": pixel,
@@ -263,7 +276,7 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
                     "evidence": evidence,
                     "covariance_m2": [row.cxx, row.cxy, row.cyy],
                 }
-                for row, pixel, evidence in seen
+                for row, pixel, evidence in values
             ]
             rows["json"] = json_record({"frame": step.prefix, "discs": records})
     if found.markers is not None:
@@ -276,7 +289,7 @@ def _text(rows: Iterable[Landmark]) -> str:
 
 
 def _disc_rows(
-    discs: CircleDetections, seen: CircleDetections, known: KnownOfFrame
+    discs: CircleDetections, unlevelled: CircleDetections, known: KnownOfFrame
 ) -> list[CircleLandmark]:
     """The rows, each with the IDs of a known row of the same disc, or of a map's disc, or -1."""
     unknown = np.full(len(discs), -1)
@@ -285,7 +298,7 @@ def _disc_rows(
         return list(rows)
     ids = [row.ids for row in rows]
     if known.discs:
-        alike = discs if known.discs_level else seen
+        alike = discs if known.discs_level else unlevelled
         named = ids_of_rows(alike.floor_xy, known.discs)
         by_pixel = dict(zip(map(tuple, alike.pixels.tolist()), named))
         ids = [by_pixel[u, v] or (-1,) for u, v in discs.pixels.tolist()]

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 from camera import Camera
 from detect.errors import DetectError, FrameError
+from detect.projection import leaning_camera
 from detect.runs.plan import Job, Known, RunSummary
-from detect.seen import leaning_camera
 from detect.settings import UNREFINED, CircleSettings
 from detect.sources.interface import Run, read_image
 from detect.sources.poses import SomeFrames
@@ -43,8 +43,8 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
 def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     """Reasons why hardly anything was found, and what to try."""
     plan, camera, found = job.plan, job.plan.camera, summary.found
-    seen = summary.frames - summary.failed
-    if not seen:
+    processed = summary.frames - summary.failed
+    if not processed:
         return  # the reasons are listed frame by frame
     if job.known != Known() and not summary.known:
         yield (
@@ -52,7 +52,7 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
             "were they made from other images?"
         )
     others = summary.rejected["no matching pattern"]
-    if plan.markers and not found["markers"] and others >= seen:
+    if plan.markers and not found["markers"] and others >= processed:
         yield (
             f"{others} squares look like markers, but not of the dictionary "
             f"{plan.markers.dictionary}: is it the right one (--dictionary)?"
@@ -84,11 +84,12 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
     leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
-    given, few = list[str](), found["discs"] < _FEW_DISCS * seen and seen >= _FEWEST_FRAMES
+    on_discs: list[str] = []
+    few = processed >= _FEWEST_FRAMES and found["discs"] < _FEW_DISCS * processed
     if few or not found["discs"]:
-        given = list(_hints_on_discs(run, leaning, settings, summary))
-    yield from given
-    if not given and found["discs"] >= seen >= _FEWEST_FRAMES:
+        on_discs = list(_hints_on_discs(run, leaning, settings, summary))
+    yield from on_discs
+    if not on_discs and found["discs"] >= processed >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii
 
         ratio = ratio_of_radii(list(some_images(run, _COMPARED_IMAGES)), leaning, settings)
@@ -109,23 +110,22 @@ def _hints_on_discs(
     from detect.discs.radius import find_radius
 
     images, number = list(some_images(run)), summary.found["discs"]
-    seen = summary.frames - summary.failed
+    processed = summary.frames - summary.failed
     if not images:  # by chance, all of these failed
         return
     in_images = f"in {len(images)} of the images"
-    discs = (
-        f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in {counted(seen, 'frame')}. "
-    )
+    frames = counted(processed, "frame")
+    discs = f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in {frames}. "
     if not number:
         discs += f"{why_none(images, camera, settings)} "
-    if seen < _FEWEST_FRAMES:
+    if processed < _FEWEST_FRAMES:
         yield discs + (
             "If discs are visible, try --radius-m auto, which estimates their radius, and check "
             "the calibration against the images (`detect draw`)."
         )
         return
     likely = find_radius(images, camera, replace(settings, polarity="any"))
-    if likely and likely.discs <= _MANY * len(images) * number / seen:
+    if likely and likely.discs <= _MANY * len(images) * number / processed:
         likely = None  # not worth mentioning
     if likely and abs(math.log(likely.radius_m / settings.radius_m)) > _OTHER_RADIUS:
         yield discs + (
@@ -135,9 +135,9 @@ def _hints_on_discs(
             "another height or pitch, or the calibration is not its own (`detect draw` shows "
             "outlines)."
         )
-    elif likely and settings.polarity != "any" and number < seen:
+    elif likely and settings.polarity != "any" and number < processed:
         yield discs + f"--polarity any finds {likely.discs} {in_images}."
-    elif _MANY * number < seen:
+    elif _MANY * number < processed:
         yield discs + (
             f"Other radii find no more {in_images}: is the calibration that of this camera "
             "(`detect draw` shows outlines; are its rows full or half?), are discs visible?"

@@ -106,8 +106,8 @@ def level_run(
         tilts = [tilt for _, _, tilt in frames]
     run = zip(read(), frames, tilts, strict=True)
     while batch := list(islice(run, _LEVELLED_AT_ONCE)):
-        seen = [(rows["circles"], tilt) for rows, _, tilt in batch if tilt is not None]
-        level = iter(_levelled(seen, camera, settings.calibration_px, found, common))
+        tilted = [(rows["circles"], tilt) for rows, _, tilt in batch if tilt is not None]
+        level = iter(_levelled(tilted, camera, settings.calibration_px, found, common))
         for rows, (prefix, lines, _), tilt in batch:
             by = format_no_tilt(prefix, lines) if tilt is None else format_tilt(tilt)
             circles = rows["circles"] if tilt is None else next(level)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.bounds import FINITE, LARGEST_NUMBER, Bounds
+from redetect.bounds import FINITE, LARGEST_NUMBER, NUMBER, Bounds
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.json_text import json_rows
 from redetect.messages import excerpt, one_line
@@ -28,8 +28,6 @@ PathLike = str | os.PathLike[str]
 _LARGEST_FILE_BYTES = 1 << 26
 _ROUNDING = 1e-6
 _DIGITS = re.compile(r"[-+0-9.eE]*")
-#: A number in a file; unlike `float`, this excludes 1_000, nan and infinity.
-NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 
 def read_json(path: PathLike) -> dict[str, Any]:

@@ -19,10 +19,10 @@ from detect.drawing.frame import draw_explanation, draw_rows, png_of
 from detect.errors import DetectError, FrameError
 from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
-from detect.row_files import SeenRows
+from detect.projection import DiscProjection, image_positions
+from detect.row_files import ImageRows
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
-from detect.seen import Sight, image_positions
 from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
@@ -199,9 +199,9 @@ class Detection(Table):
 
     def picture(self) -> NDArray[np.uint8]:
         """(S H + h, S W, 3) the image with the detections: blue, green, red; see `draw_rows`."""
-        rows = SeenRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
-        sight = Sight.by(self.camera, self.settings)
-        return draw_rows(self.image, sight, rows, self.settings, self.name)
+        rows = ImageRows(circles=self.frame, lines=self.frame, tilt=self.frame_tilt)
+        projection = DiscProjection(self.camera, self.settings)
+        return draw_rows(self.image, projection, rows, self.name)
 
     def __str__(self) -> str:
         words = f"{self.name}: {counted(len(self.discs), 'disc')}, "

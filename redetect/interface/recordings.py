@@ -13,7 +13,7 @@ from detect.comparison.compare import compare_run, compare_with_file
 from detect.comparison.result import Comparison, Kind
 from detect.errors import DetectError
 from detect.options import CompareOptions, SourceOptions
-from detect.seen import Sight
+from detect.projection import DiscProjection
 from detect.sources.interface import Run, RunFrame
 from detect.sources.opening import open_run
 from redetect.interface.detection import CameraLike, Detection, RecordedFrame, camera_of
@@ -179,6 +179,7 @@ def compare(
         raise DetectError(
             f"{run}: nothing to compare: expected detections, and reference rows in {in_file}"
         )
-    sight = Sight.by(seen_by or found[0].camera, found[0].settings, read_head(in_file).level)
+    seen_by = seen_by or found[0].camera
+    projection = DiscProjection(seen_by, found[0].settings, read_head(in_file).level)
     frames, names = [one.frame for one in found], (str(in_file), "detections")
-    return compare_with_file(kind, in_file, frames, options, sight=sight, names=names)
+    return compare_with_file(kind, in_file, frames, options, projection=projection, names=names)

@@ -16,6 +16,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from redetect.bounds import NUMBER
 from redetect.landmarks.records import (
     CIRCLE_NUMBERS,
     LINE_NUMBERS,
@@ -49,12 +50,10 @@ _LONGEST_HEAD_BYTES = _LONGEST_ROW_BYTES = 1 << 16
 _LONGEST_ID_DIGITS = 20
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
-# Stricter than `float`, which also accepts nan, infinity and 1_000.
-_NUMBER_PATTERN = rb"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?"
-_NUMBER = re.compile(_NUMBER_PATTERN)
+_NUMBER = re.compile(NUMBER.encode())
 _WHOLE_NUMBER = re.compile(rb"[+-]?[0-9]+")
 # A comment, so that other programs can read the file as well.
-_LEVELLED = re.compile(rb"# levelled (%b) (%b)\r?\n?" % (_NUMBER_PATTERN, _NUMBER_PATTERN))
+_LEVELLED = re.compile(rf"# levelled ({NUMBER}) ({NUMBER})\r?\n?".encode())
 _STEP_ROW = "STEP %s" + 3 * " %8.5f" + 6 * " %.12f"
 _CIRCLE_ROW = "LANDMARK_C" + len(CIRCLE_NUMBERS) * " %g"
 _LINE_ROW = "LANDMARK_L" + len(LINE_NUMBERS) * " %g"

@@ -224,6 +224,12 @@ class Import:
     # estimates; for a trajectory a path.csv; for a robot a .circles file, or the .csv of its true
     # path; for true landmarks a map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    range_sigma: float = 0.1  # Standard deviation of a data set's ranges (m).
-    bearing_sigma: float = 0.03  # Standard deviation of a data set's bearings (rad).
+    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park, and of the
+    # UTIAS data set 0.03 and 2 %, the same for as long as a landmark is seen.
+    range_sigma: float | None = None
+    # Standard deviation of a data set's bearings (rad); by default 0.03 and 0.02.
+    bearing_sigma: float | None = None
+    # Correct the odometry of a robot of the UTIAS data set, which consists of commands, by how much
+    # later, faster and farther it moves, as the landmarks show it.
+    calibrated: bool = True
     force: bool = False  # Replace an existing file.

@@ -236,11 +236,34 @@ def test_a_thin_prism_is_refused() -> None:
     assert parse_opencv(text.replace("0.04", "0")) == RATIONAL
 
 
-def test_a_fold_inside_the_image_is_told() -> None:
+def test_a_fold_inside_the_image_is_kept(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Calibrations often fold in the corners, where there was no board."""
     folded = ForeignCamera(
-        "radtan", 640, 480, 300.0, 300.0, 320.0, 240.0, (-0.6, 0.0, 0.0, 0.0, 0.0)
+        "radtan", 640, 480, 500.0, 500.0, 320.0, 240.0, (0.17, -0.7, -0.003, -0.005, 0.0)
     )
-    with pytest.raises(ConversionError, match="sees nothing by the radtan model"):
+    found = convert_to_camera(folded)
+    assert isinstance(found.camera, Camera)
+    assert found.deviation_px < 1e-6
+    corner, centre = np.array([[1.0, 1.0]]), np.array([[320.0, 240.0]])
+    for camera in (folded, found.camera):
+        assert np.isnan(camera.undistort(corner)).all()
+        assert np.isfinite(camera.undistort(centre)).all()
+    source = tmp_path / "folded.yaml"
+    source.write_text(format_ros(folded))
+    assert main(["convert", str(source), str(tmp_path / "folded.cam")]) == 0
+    unseen = 100.0 * (1.0 - found.camera.seen_share)
+    assert 1.0 < unseen < 20.0
+    assert f"{unseen:.1f} % of the image, past the distortion's fold" in capsys.readouterr().out
+    assert read_camera(tmp_path / "folded.cam").seen_share == found.camera.seen_share
+
+
+def test_a_lens_that_sees_less_than_half_of_the_image_is_refused() -> None:
+    folded = ForeignCamera(
+        "radtan", 640, 480, 150.0, 150.0, 320.0, 240.0, (-0.6, 0.0, 0.0, 0.0, 0.0)
+    )
+    with pytest.raises(ConversionError, match="of the image see anything, expected 50"):
         convert_to_camera(folded)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from camera import Camera
 from camera.cli import main
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
-from camera.formats.files import convert, format_of, parse
+from camera.formats.files import convert, format_of, format_of_text, parse
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import format_kalibr, format_ros, parse_kalibr, parse_ros
 from camera.options import Convert, Format
@@ -35,10 +36,13 @@ def test_a_region_that_is_the_whole_image_is_none() -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.xml", "<?xml version='1.0'?>", "is XML: expected YAML"),
+        ("a.xml", "<?xml version='1.0'?>", "a.xml:1: no element found"),
+        ("a.xml", "<opencv_storage><!-- 3 --></opencv_storage>", "XML with declarations"),
+        ("a.xml", "<opencv_storage><M1>3</M1></opencv_storage>", "lacks image_width"),
         ("a.yml", "%YAML:1.0\n---\nM1: 3\n", "lacks image_width: add the images' size"),
         ("a.yml", "%YAML:1.0\n---\nimage_Width: 3\n", "lacks image_height: add the images' size"),
-        ("a.yml", "intrinsics: [1, 1, 1, 1]\n", "cam0 with intrinsics"),
+        ("a.yml", "intrinsics: [1, 1, 1, 1]\n", "cam0: lacks resolution"),
+        ("a.yml", "cam0: {resolution: [1, 1]}\n", "cam0 with intrinsics"),
     ],
 )
 def test_what_is_missing_is_told_with_what_to_do(
@@ -62,11 +66,49 @@ def test_other_lines_of_the_same_camera_keep_all_else(published_camera: Camera) 
 def test_what_cannot_be_converted_names_its_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    wide = ForeignCamera("fisheye", 512, 512, 190.0, 190.0, 255.5, 255.5, (0.0,) * 4)
+    wide = ForeignCamera("fisheye", 512, 512, 100.0, 100.0, 255.5, 255.5, (0.0,) * 4)
     source = tmp_path / "wide.yaml"
     source.write_text(format_kalibr(wide))
     assert main(["convert", str(source), str(tmp_path / "b.cam")]) == 1
-    assert f"error: {source}: pixel (0, 0) sees nothing" in capsys.readouterr().err
+    assert f"error: {source}: 29 % of the image see anything" in capsys.readouterr().err
+
+
+def test_opencv_reads_and_writes_the_same_in_xml(tmp_path: Path) -> None:
+    source = tmp_path / "out_camera_data.xml"
+    storage = cv2.FileStorage(str(source), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Tue Apr 19 12:00:00 2016")
+    storage.write("image_width", RADTAN.width)
+    storage.write("image_height", RADTAN.height)
+    storage.write("camera_matrix", np.array(RADTAN.matrix).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array(RADTAN.distortion))
+    storage.release()
+    text = source.read_text()
+    assert format_of_text(source, text) == "opencv"
+    assert parse(text, "opencv", str(source)) == RADTAN
+
+
+def test_a_sensor_of_euroc_is_a_camera_of_a_chain() -> None:
+    """Its published cam0; a camchain holds the same."""
+    text = """
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+    path = Path("sensor.yaml")
+    assert format_of_text(path, text) == "kalibr"
+    camera = parse(text, "kalibr", "sensor.yaml")
+    assert isinstance(camera, ForeignCamera)
+    assert camera.pinhole == (458.654, 457.296, 367.215, 248.375)
+    assert camera.distortion == (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 0.0)
+    assert parse(format_kalibr(camera), "kalibr", "camchain.yaml") == camera
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from camera.model import PARAMETERS
 from camera.uncertainty import with_covariance
 from detect.cli import main
 from detect.levelling import common_covariance
-from detect.seen import level_seen
+from detect.projection import level_positions
 from redetect.landmarks import read_frames
 from tests.camera.test_uncertainty import moved
 from tests.detect.commands import Captured
@@ -56,7 +56,7 @@ def test_errors_are_as_large_as_stated(published_camera: Camera, by_verticals: b
             normal = normals_of_verticals(published_camera, wrong)
             tilt, _ = consensus(verticals(normal, 1e-8, 0.1, 1.0))
             assert tilt is not None
-            found = level_seen(wrong, found, (tilt.pitch_rad, tilt.roll_rad))
+            found = level_positions(wrong, found, (tilt.pitch_rad, tilt.roll_rad))
         stated = common_covariance(
             with_covariance(wrong, COVARIANCE), FLOOR, 0.0, by_verticals=by_verticals
         )

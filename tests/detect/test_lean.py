@@ -17,8 +17,8 @@ from camera import Camera, read_camera, write_camera
 from detect.circles import CircleDetections
 from detect.cli import main
 from detect.levelling import as_calibrated, level_discs
+from detect.projection import leaning_camera
 from detect.runs.frame import lean_of_frame
-from detect.seen import leaning_camera
 from detect.settings_files import read_settings
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
 from tests.detect.commands import Captured

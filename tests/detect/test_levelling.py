@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from camera import Camera, parse_camera
 from detect.circles import CircleDetections
 from detect.levelling import level_discs, levelled, tilt_arrays
-from detect.seen import level_seen
+from detect.projection import level_positions
 from redetect.landmarks import FrameTilt
 from tools.published_camera import PUBLISHED_CAM
 
@@ -29,13 +29,13 @@ def seen_by_tilted_robot(camera: Camera, pitch: float, roll: float) -> np.ndarra
 @given(pitch=st.floats(-0.05, 0.05), roll=st.floats(-0.05, 0.05))
 def test_tilted_views_come_back_level(pitch: float, roll: float) -> None:
     seen = seen_by_tilted_robot(CAMERA, pitch, roll)
-    levelled = level_seen(CAMERA, seen, (pitch, roll))
+    levelled = level_positions(CAMERA, seen, (pitch, roll))
     # The projection uses the exact inverse of a rotation printed in 6 digits.
     np.testing.assert_allclose(levelled, TRUE_XY, atol=1e-5)
 
 
 def test_no_tilt_changes_nothing() -> None:
-    np.testing.assert_allclose(level_seen(CAMERA, TRUE_XY, (0.0, 0.0)), TRUE_XY, atol=1e-12)
+    np.testing.assert_allclose(level_positions(CAMERA, TRUE_XY, (0.0, 0.0)), TRUE_XY, atol=1e-12)
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.02, -0.01)])
@@ -49,7 +49,7 @@ def test_covariances_are_those_of_a_monte_carlo(pitch: float, roll: float) -> No
     draws = 4000
     tilts = rng.multivariate_normal([pitch, roll], tilt, size=draws)
     noise = rng.multivariate_normal([0.0, 0.0], own, size=(draws, len(seen)))
-    levelled = np.array([level_seen(CAMERA, seen + e, tilt) for e, tilt in zip(noise, tilts)])
+    levelled = np.array([level_positions(CAMERA, seen + e, tilt) for e, tilt in zip(noise, tilts)])
     for k in range(len(seen)):
         drawn = np.cov(levelled[:, k].T)
         scale = np.sqrt(np.outer(np.diag(predicted[k]), np.diag(predicted[k])))
@@ -58,8 +58,8 @@ def test_covariances_are_those_of_a_monte_carlo(pitch: float, roll: float) -> No
 
 def test_rays_that_rise_after_levelling_have_no_position() -> None:
     far = np.array([[0.0, -60.0]])
-    assert np.all(np.isnan(level_seen(CAMERA, far, (-0.2, 0.0)))) or np.all(
-        np.isnan(level_seen(CAMERA, far, (0.2, 0.0)))
+    assert np.all(np.isnan(level_positions(CAMERA, far, (-0.2, 0.0)))) or np.all(
+        np.isnan(level_positions(CAMERA, far, (0.2, 0.0)))
     )
 
 
@@ -77,7 +77,7 @@ def test_discs_are_levelled_as_positions_and_covariances_are(
     )
     tilt = FrameTilt("e.0000", pitch, 0.01, 2e-6, 5e-7, 1e-6, 9)
     after = levelled(found, CAMERA, tilt)
-    level_xy = level_seen(CAMERA, floor_xy, (pitch, 0.01))
+    level_xy = level_positions(CAMERA, floor_xy, (pitch, 0.01))
     _, level_cov, down = level_discs(CAMERA, floor_xy, covariance, *tilt_arrays([tilt]))
     np.testing.assert_array_equal(down, np.isfinite(level_xy).all(axis=1))
     assert down.all() == (pitch != -0.2 or farthest_m == 5.0)

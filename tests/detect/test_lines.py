@@ -21,9 +21,8 @@ from detect.drawing.frame import draw_rows, draw_tracks, track_pixels
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines
-from detect.row_files import SeenRows
-from detect.seen import Sight
-from detect.settings import CircleSettings
+from detect.projection import DiscProjection
+from detect.row_files import ImageRows
 from detect.sources.interface import decode_gray
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, LineLandmark, Step
@@ -332,7 +331,7 @@ def test_drawn_lines_lie_on_the_edges() -> None:
     image = np.full((160, 240), 90, np.uint8)
     found = detect_lines(scene(CAMERA), TABLE)
     frame = Frame(Step("x", *[0.0] * 9), found.landmarks())
-    picture = draw_rows(image, Sight(CAMERA), SeenRows(lines=frame), CircleSettings())
+    picture = draw_rows(image, DiscProjection(CAMERA), ImageRows(lines=frame))
     green = (picture[..., 1] > 150) & (picture[..., 2] < 120)
     rows = np.arange(40, 120)
     for bearing in truth():

@@ -19,9 +19,9 @@ from camera.model import PARAMETERS
 from camera.model_checks import checked_pose
 from camera.uncertainty import covariance_of, with_covariance
 from detect.levelling import common_covariance
+from detect.projection import image_positions, level_positions
 from detect.run_mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import FrameTilts
-from detect.seen import image_positions, level_seen
 from detect.settings import LEAST_FRAMES
 from redetect.storage import OutputExistsError
 from tests.detect.commands import Captured
@@ -83,7 +83,7 @@ def test_the_remounted_camera_sees_level(published_camera: Camera) -> None:
 
     seen = remounted(published_camera, mounting).floor_from_pixel(pixels)
 
-    np.testing.assert_allclose(seen, level_seen(published_camera, rows_xy, tilt, raised_m))
+    np.testing.assert_allclose(seen, level_positions(published_camera, rows_xy, tilt, raised_m))
 
 
 def test_the_remounted_camera_states_what_its_mounting_may_be_wrong_by(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from detect.cli import main
-from detect.seen import summed_steps
+from detect.projection import summed_steps
 from redetect.landmarks import Step, read_frames
 from tests.detect.commands import Captured, assert_refused
 from tests.detect.recordings import images_of, write_video

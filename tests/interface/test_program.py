@@ -119,6 +119,7 @@ def test_flags_for_experts_are_taken(tmp_path: Path) -> None:
     [
         ("circles RUN --threshold 0.4", "circles RUN --quality-threshold 0.4"),
         ("lines RUN --threshold=0.4", "lines RUN --response-threshold=0.4"),
+        ("lines RUN --tilt a.tilt", "lines RUN --tilt-output a.tilt"),
         ("explain IMAGE --threshold 0.4", "explain IMAGE --quality-threshold 0.4"),
         ("all RUN --circles.threshold=.4 --lines.threshold .2",
          "all RUN --quality-threshold=.4 --response-threshold .2"),

@@ -15,39 +15,48 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.plane import chain_steps
 from redetect.slam.cli import main
-from redetect.slam.formats.data_sets import discs_of_ranges, trees_of
+from redetect.slam.formats.data_sets import discs_of_ranges, read_robot, trees_of
 from redetect.slam.recording import read_recording
 
 RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01
+LAG_S, SPEED, TURN = 0.3, 1.05, 0.97
 
 
 @pytest.fixture(scope="module")
 def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Robot 1 drives three rounds among 15 landmarks, at 20 Hz, and sees what is before it."""
+    """Robot 1 drives three rounds among 15 landmarks and sees what is before it.
+
+    As in the real logs, odometry consists of commands, which the robot follows later and not
+    exactly, with short zeros at full seconds; "ranges" are depths, and too long.
+    """
     folder = tmp_path_factory.mktemp("utias")
     rng = np.random.default_rng(1)
     landmarks = rng.uniform([-3.5, -3.5], [3.5, 3.5], (15, 2))
-    period, count = 0.05, 2400
-    speed, turn = 0.3, 0.15
-    chord = speed * period * np.sinc(turn * period / (2 * np.pi))
-    half = 0.5 * turn * period
-    along = np.tile([chord * np.cos(half), chord * np.sin(half), 2 * half], (count, 1))
-    poses = chain_steps(along, (0.0, -2.0, 0.1))
+    period, count, late = 0.05, 2400, round(LAG_S / 0.05)
     time = 1248272000.0 + period * np.arange(count + 1)
+    turn = np.where(np.arange(count) // 70 % 2, -0.2, 0.48) + 0.01 * rng.standard_normal(count)
+    command = np.stack([0.3 + 0.01 * rng.standard_normal(count), turn], axis=1)
+    motion = np.concatenate([np.zeros((late, 2)), command[:-late]]) * [SPEED, TURN]
+    half = 0.5 * motion[:, 1] * period
+    chord = motion[:, 0] * period * np.sinc(half / np.pi)
+    along = np.stack([chord * np.cos(half), chord * np.sin(half), 2 * half], axis=1)
+    poses = chain_steps(along, (0.0, -2.0, 0.1))
     odometry, truth, seen = [], [], []
     for k, pose in enumerate(poses):
-        v, w = speed + 0.01 * rng.standard_normal(), turn + 0.01 * rng.standard_normal()
-        odometry.append(f"{time[k]:.3f}\t{v:.3f}\t{w:.3f}")
         truth.append(f"{time[k]:.3f}    {pose[0]:.6f} {pose[1]:.6f} {wrap_angle(pose[2]):.6f}")
+        if k < count:
+            if k and k % 20 == 0:
+                odometry.append(f"{time[k] - 0.02:.3f}\t0.000\t0.000")
+            odometry.append(f"{time[k]:.3f}\t{command[k, 0]:.3f}\t{command[k, 1]:.3f}")
         if k == 0 or k % 10:
             continue
         offset = landmarks - pose[:2]
         reach = np.hypot(*offset.T)
         bearing = wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - pose[2])
         for i in np.flatnonzero((np.abs(bearing) < 0.8) & (reach < 5.0)):
-            r = reach[i] + RANGE_SIGMA * rng.standard_normal()
+            depth = (reach[i] + RANGE_SIGMA * rng.standard_normal()) * np.cos(bearing[i])
             b = bearing[i] + BEARING_SIGMA * rng.standard_normal()
-            seen.append(f"{time[k]:.3f}\t{100 + i}\t{r:.3f}\t{b:.3f}")
+            seen.append(f"{time[k]:.3f}\t{100 + i}\t{1.033 * depth:.3f}\t{b:.3f}")
         seen.append(f"{time[k]:.3f}\t14\t1.000\t0.100")  # another robot
     barcodes = [f"{n + 1} {(5, 14, 41, 32, 23)[n]}" for n in range(5)]
     barcodes += [f"{6 + i} {100 + i}" for i in range(15)]
@@ -73,7 +82,42 @@ def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_movements_in_a_gap_of_the_log_are_uncertain(utias: Path, tmp_path: Path) -> None:
+def test_the_response_of_a_robot_to_its_commands_is_found(
+    utias: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, found = read_robot(utias / "Robot1_Odometry.dat")
+    assert abs(found.lag_s - LAG_S) < 0.02
+    assert abs(found.speed - SPEED) < 0.01
+    assert abs(found.turn - TURN) < 0.01
+    true = read_path(utias / "true.csv").poses
+    raw, commanded = read_robot(utias / "Robot1_Odometry.dat", calibrated=False)
+    assert commanded == (0.0, 1.0, 1.0)
+    off = [
+        np.abs(wrap_angle(chain_steps(run.steps, true[0])[:, 2] - true[:, 2])).max()
+        for run in (recording, raw)
+    ]
+    assert off[0] < 0.1 < 0.3 < off[1]
+    odometry = str(utias / "Robot1_Odometry.dat")
+    target = str(utias / "calibrated.circles")
+    assert main(["import", odometry, "-o", target]) == 0
+    assert f"the robot moves {found.lag_s:.2f} s after its commands" in capsys.readouterr().out
+
+
+def test_sightings_at_about_the_same_time_have_the_same_error(utias: Path) -> None:
+    """A landmark that is seen without interruption has one measured range in five seconds."""
+    rows = read_robot(utias / "Robot1_Odometry.dat")[0].circles
+    x, y = rows.xy.T
+    distance = np.hypot(x, y)
+    radial = np.einsum("ni,nij,nj->n", rows.xy, rows.covariance, rows.xy) / distance**2
+    share = (0.03**2 + (0.02 * distance) ** 2) / radial
+    assert share.max() <= 1.0 + 1e-9
+    assert np.isclose(share, 0.1).any()  # ten sightings, two a second
+    assert share.min() > 0.099
+
+
+def test_movements_in_a_gap_of_the_log_and_changes_of_motion_are_uncertain(
+    utias: Path, tmp_path: Path
+) -> None:
     shutil.copytree(utias, tmp_path, dirs_exist_ok=True)
     log = tmp_path / "Robot1_Odometry.dat"
     rows = log.read_text().splitlines()
@@ -82,8 +126,10 @@ def test_movements_in_a_gap_of_the_log_are_uncertain(utias: Path, tmp_path: Path
     assert main(["import", odometry, "-o", str(tmp_path / "run.circles"), "--force"]) == 0
     lines = (tmp_path / "run.circles").read_text().splitlines()
     sigma = np.sqrt([float(line.split()[10]) for line in lines if line.startswith("STEP")])
-    assert 3 <= np.count_nonzero(sigma) <= 4
-    assert 0.005 < sigma.max() < 0.02  # turns vary by 0.01 rad/s
+    assert 3 <= np.count_nonzero(sigma > 0.1) <= 4  # turns vary by 0.33 rad/s
+    changes = sigma[(sigma > 0.0) & (sigma < 0.1)]
+    assert 20 < len(changes) < 36  # turn rates change 34 times, by 0.66 rad/s within 0.08 s
+    assert np.median(changes) == pytest.approx(0.08 * 0.66, abs=0.01)
 
 
 def _start(folder: Path) -> list[str]:
@@ -97,7 +143,7 @@ def _off(folder: Path, path: Path) -> float:
 
 def test_utias_is_mapped(utias: Path) -> None:
     recording = read_recording(utias / "run.circles")
-    assert len(recording) == len(read_path(utias / "true.csv").poses) - 1 == 240
+    assert len(recording) == len(read_path(utias / "true.csv").poses) - 1 == 191
     assert set(recording.circles.ids.tolist()) <= set(range(6, 21))
     run = ["map", str(utias / "run.circles"), "-o", str(utias / "map"), *_start(utias)]
     assert main(run) == 0
@@ -136,7 +182,7 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
     target = str(odd / "run.circles")
     assert main(["import", str(odd / "Robot1_Odometry.dat"), "-o", target]) == 1
     assert (
-        "Robot1_Odometry.dat:2404: '1.0 2.0': expected 3 numbers: time v omega"
+        "Robot1_Odometry.dat:2522: '1.0 2.0': expected 3 numbers: time v omega"
         in capsys.readouterr().err
     )
     assert main(["import", str(odd / "Robot1_Measurement.dat"), "-o", target]) == 1
@@ -270,7 +316,9 @@ def test_victoria_park_is_mapped_from_odometry(tmp_path: Path) -> None:
         },
     )
     scans = np.array([scan_of(trees, pose) for pose in scanner])
-    savemat(tmp_path / "aa3_lsr2.mat", {"TLsr": time[:, None], "LASER": np.round(scans)})
+    intensity = rng.integers(0, 8, scans.shape)
+    laser = (np.round(scans) + (intensity << 13)).astype(np.uint16)
+    savemat(tmp_path / "aa3_lsr2.mat", {"TLsr": time[:, None], "LASER": laser})
     run = str(tmp_path / "run.circles")
     assert main(["import", str(tmp_path / "aa3_dr.mat"), "-o", run]) == 0
     recording = read_recording(run)

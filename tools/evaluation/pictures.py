@@ -19,7 +19,7 @@ from detect.line_settings import LineSettings
 from detect.lines import detect_lines
 from detect.markers.candidates import closing, dark_pixels
 from detect.markers.detect import detect_markers
-from detect.seen import circle_on_floor, summed_steps
+from detect.projection import circle_on_floor, summed_steps
 from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run

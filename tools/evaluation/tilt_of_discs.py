@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
-from detect.seen import image_positions
+from detect.projection import image_positions
 from detect.sources.image_files import image_name
 from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis

@@ -25,9 +25,9 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
-from redetect.bounds import NOT_NEGATIVE, from_to, inside
+from redetect.bounds import NOT_NEGATIVE, NUMBER, from_to, inside
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.files import NUMBER, JsonObject, PathLike
+from redetect.groundtruth.files import JsonObject, PathLike
 from redetect.storage.bounded import read_content
 
 #: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.

@@ -119,7 +119,8 @@ def _import(command: Import) -> None:
 def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
-    file, sigmas = command.file, (command.range_sigma, command.bearing_sigma)
+    file = command.file
+    noise = data_sets.RangeNoise(command.range_sigma, command.bearing_sigma)
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
         write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
@@ -129,9 +130,10 @@ def _import_data_set(command: Import) -> None:
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
-        _write_run(command, data_sets.read_robot(file, *sigmas), "measurements")
+        run, response = data_sets.read_robot(file, noise, calibrated=command.calibrated)
+        _write_run(command, run, f"measurements; {response.sentence()}")
     elif file.name == data_sets.DRIVE:
-        _write_run(command, data_sets.read_drive(file, *sigmas), "measurements")
+        _write_run(command, data_sets.read_drive(file, noise), "measurements")
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "

@@ -23,12 +23,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
+from scipy.optimize import least_squares
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import LARGEST_NUMBER
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.axes import covariance_from_dataset, to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
-from redetect.plane import between, chain_steps
+from redetect.plane import apply, between, chain_steps, compose, invert
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
@@ -40,17 +42,31 @@ _ROBOTS = 5
 #: Most that the clock of a robot's log may go back, seconds.
 _SET_BACK_S = 1.0
 # A log has a gap if nothing is logged for this many of its usual intervals, and this time.
-_GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.25
+_GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.5
+#: What the logs call range is the depth along the camera's axis, and too long by this factor: in
+#: logs of three robots, of data sets 6 and 7, compared with the true poses, by 1.02, 1.03 and 1.05.
+_DEPTH_SCALE = 1.033
+#: Errors of these ranges, metres and as a share; for how long they are alike; errors of bearings.
+_USUAL_SIGMA_M, _USUAL_SHARE, _ALIKE_S, _USUAL_SIGMA_RAD = 0.03, 0.02, 5.0, 0.02
+#: Zeros between commands that last less than this are none, seconds.
+_SHORT_STOP_S = 0.1
+#: How a robot follows its commands: lags that are tried, seconds; longest time between two
+#: sightings of a landmark that show it, and their least number; prior of speeds and turns.
+_MOST_LAG_S, _LAG_STEP_S, _NEXT_SIGHTING_S, _LEAST_PAIRS, _SCALE_SIGMA = 1.0, 0.1, 1.0, 50, 0.1
+#: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
+_LATE_S = 0.08
 
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
 # The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
 _AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
 _BEAMS = 361
+_RANGES_CM = 1 << 13
 _FARTHEST_M = 75.0
 # Largest range difference of neighbouring beams on a trunk, and least one to the background.
 _SAME_M, _BEHIND_M = 0.5, 1.5
 _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
+_TREE_SIGMA_M, _TREE_SIGMA_RAD = 0.1, 0.03
 
 
 def _names(times: FloatArray) -> tuple[str, ...]:
@@ -59,43 +75,59 @@ def _names(times: FloatArray) -> tuple[str, ...]:
 
 
 def discs_of_ranges(
-    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: float, sigma_rad: float
+    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: ArrayLike, sigma_rad: float
 ) -> tuple[FloatArray, FloatArray]:
     """Landmarks measured by range and bearing, as positions in the robot frame.
 
-    Takes `range_m, bearing_rad` (n,); returns `xy` (n, 2), `covariance` (n, 2, 2).
+    Takes `range_m, bearing_rad` (n,) and their standard deviations, that of ranges (n,) or one;
+    returns `xy` (n, 2), `covariance` (n, 2, 2).
     """
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
     direction = np.stack([sin, -cos], axis=-1)
     across = sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)
-    root = np.stack([sigma_m * direction, across], axis=-1)
+    root = np.stack([np.asarray(sigma_m)[..., None] * direction, across], axis=-1)
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
-def _steps_between(
-    logged: FloatArray,
-    times: FloatArray,
-    along: Callable[[IntArray, FloatArray], FloatArray],
-    ends: tuple[float, float],
-) -> tuple[FloatArray, FloatArray]:
-    """Movements (N, 3) to each time, from the first of `ends` on; log rows hold until the next.
+class _Log(NamedTuple):
+    """What a robot logged of its motion; each row holds until the next."""
 
-    `along` gives the movements for rows of the log (k,) held for some seconds (k,). Movements in
-    gaps of the log have a covariance (N, 3, 3), from how much those per second vary; others zero.
-    """
-    knots = np.union1d(np.append(logged, ends[1]), times)
-    knots = knots[knots >= ends[0]]
-    held = np.clip(np.searchsorted(logged, knots[:-1], side="right") - 1, 0, None)
-    poses = chain_steps(along(held, np.diff(knots)))[np.searchsorted(knots, times)]
-    steps = between(np.concatenate([np.zeros((1, 3)), poses[:-1]]), poses)
-    usual = np.median(np.diff(logged)) if len(logged) > 1 else math.inf
-    silent = knots[1:] - logged[held] > max(_GAP_INTERVALS * usual, _LEAST_GAP_S)
-    of_step = np.searchsorted(times, knots[1:])
-    silence_s = np.bincount(of_step, np.diff(knots) * silent, len(times) + 1)[: len(times)]
-    spread = np.var(along(np.arange(len(logged)), np.ones(len(logged))), axis=0)
-    covariance = silence_s[:, None, None] ** 2 * np.diag(spread) + ASSUMED.covariance(steps)
-    return steps, covariance * (silence_s > 0.0)[:, None, None]
+    times: FloatArray  # (k,): of the rows (s), ascending
+    #: Movements (n, 3), X forward, by rows (n,) that hold for some seconds (n,)
+    along: Callable[[IntArray, FloatArray], FloatArray]
+    late_s: float = 0.0  # standard deviation of the time at which the motion changes
+
+    def poses(self, times: FloatArray) -> FloatArray:
+        """Dead reckoning (n, 3) at some times (n,): the first row's pose is the origin."""
+        rows, since = self._held(times)
+        interval = np.diff(self.times)
+        poses = chain_steps(self.along(np.arange(len(interval)), interval))
+        return compose(poses[rows], self.along(rows, since))
+
+    def steps(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Movements (N, 3) between times (N + 1,).
+
+        Those in gaps of the log, or with a change of motion, are more uncertain than odometry is
+        assumed to be and have a covariance (N, 3, 3); others zero.
+        """
+        poses, (rows, since) = self.poses(times), self._held(times)
+        steps = between(poses[:-1], poses[1:])
+        interval = np.append(np.diff(self.times), math.inf)
+        gap = interval > max(_GAP_INTERVALS * float(np.median(interval)), _LEAST_GAP_S)
+        silence_s = np.concatenate([[0.0], np.cumsum(np.where(gap, interval, 0.0)[:-1])])
+        silent_s = np.diff(silence_s[rows] + since * gap[rows])[:, None]
+        rates = self.along(np.arange(len(gap)), np.ones(len(gap)))
+        late = self.late_s * np.diff(rates[rows], axis=0)
+        more = silent_s**2 * np.var(rates, axis=0) + late**2
+        usual = ASSUMED.covariance(steps)
+        stated = np.any(more > np.diagonal(usual, axis1=1, axis2=2), axis=1)
+        return steps, (usual + more[:, None] * np.eye(3)) * stated[:, None, None]
+
+    def _held(self, times: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The rows (n,) that hold at some times, and since how many seconds; 0 before the first."""
+        rows = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
+        return rows, np.maximum(times - self.times[rows], 0.0)
 
 
 class _Sightings(NamedTuple):
@@ -121,19 +153,128 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
         raise SlamError(f"{odometry}: expected a subject for each barcode")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
-    return _Sightings(times, frame, seen[order, 2], seen[order, 3], ids[order])
+    bearing_rad = seen[order, 3]
+    range_m = seen[order, 2] / (_DEPTH_SCALE * np.cos(bearing_rad))
+    return _Sightings(times, frame, range_m, bearing_rad, ids[order])
 
 
-def read_robot(odometry: Path, sigma_m: float, sigma_rad: float) -> Recording:
-    """A robot's log, with landmarks as discs; steps have no covariance.
+class RangeNoise(NamedTuple):
+    """Standard deviations of independent ranges and bearings; None: as usual in the data set."""
 
-    Takes the standard deviations of ranges and bearings.
+    sigma_m: float | None = None
+    sigma_rad: float | None = None
+
+
+_USUAL = RangeNoise()
+
+
+class Response(NamedTuple):
+    """How a robot follows its commands."""
+
+    lag_s: float = 0.0  # how much later it moves
+    speed: float = 1.0  # its speed over the commanded one
+    turn: float = 1.0  # its turn rate over the commanded one
+
+    def sentence(self) -> str:
+        """Description of the response."""
+        return (
+            f"the robot moves {self.lag_s:.2f} s after its commands, {self.speed:.3f} times as "
+            f"fast, and turns {self.turn:.3f} times"
+        )
+
+
+def read_robot(
+    odometry: Path, noise: RangeNoise = _USUAL, *, calibrated: bool = True
+) -> tuple[Recording, Response]:
+    """A robot's log, with landmarks as discs; most steps have no covariance.
+
+    Parameters
+    ----------
+    odometry : Path
+    noise : RangeNoise
+        Of the rows; for what it does not state see `_usual_sigma_m`.
+    calibrated : bool
+        Whether steps are as the robot follows its commands (`response_of`), not as commanded.
+
+    Returns
+    -------
+    Recording
+    Response
+
+    Raises
+    ------
+    SlamError
+        If a file cannot be used.
     """
     velocity, seen = _log(odometry, "time v omega"), _seen_by_robot(odometry)
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
-    steps = _velocity_steps(velocity, seen.times)
+    velocity = _without_short_stops(velocity)
+    response = response_of(velocity, seen) if calibrated else Response()
+    times = np.append(min(velocity[0, 0], seen.times[0]), seen.times)
+    steps = _driven_by(velocity, response).steps(times)
+    sigma_m = _usual_sigma_m(seen) if noise.sigma_m is None else noise.sigma_m
+    sigma_rad = _USUAL_SIGMA_RAD if noise.sigma_rad is None else noise.sigma_rad
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad)
-    return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids))
+    return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids)), response
+
+
+def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
+    """How a robot follows its commands, as the landmarks show it.
+
+    From one sighting of a landmark to the next, range and bearing change as the robot moves. The
+    most likely response predicts these changes best. If there are few, it is as commanded.
+
+    Parameters
+    ----------
+    velocity : (k, 3) float64
+        Time (s), speed (m/s) and turn rate (rad/s) of each command.
+    seen : _Sightings
+        The landmarks.
+    """
+    by_landmark = np.lexsort((seen.frame, seen.ids))
+    before, after = by_landmark[:-1], by_landmark[1:]
+    apart_s = seen.times[seen.frame[after]] - seen.times[seen.frame[before]]
+    pair = (seen.ids[before] == seen.ids[after]) & (apart_s > 0.0) & (apart_s < _NEXT_SIGHTING_S)
+    before, after = before[pair], after[pair]
+    if len(before) < _LEAST_PAIRS:
+        return Response()
+    bearing, range_m = seen.bearing_rad[before], seen.range_m[after]
+    place = seen.range_m[before, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+
+    def residuals(numbers: ArrayLike) -> FloatArray:
+        response = Response(*np.asarray(numbers).tolist())
+        poses = _driven_by(velocity, response).poses(seen.times)
+        moved = between(poses[seen.frame[before]], poses[seen.frame[after]])
+        x, y = apply(invert(moved), place).T
+        return np.concatenate([
+            wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / _USUAL_SIGMA_RAD,
+            (np.hypot(x, y) - range_m) / np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * range_m),
+            (np.array([response.speed, response.turn]) - 1.0) / _SCALE_SIGMA,
+        ])  # fmt: skip
+
+    def cost(lag_s: float) -> float:
+        return float(np.sum(np.arctan(residuals(Response(lag_s)) ** 2)))
+
+    first = min(np.arange(-_MOST_LAG_S, _MOST_LAG_S, _LAG_STEP_S).tolist(), key=cost)
+    found = least_squares(residuals, Response(first), loss="arctan", diff_step=1e-3)
+    return Response(*found.x.tolist())
+
+
+def _usual_sigma_m(seen: _Sightings) -> FloatArray:
+    """Standard deviations (n,) of ranges, as found in three logs with true poses.
+
+    Ranges are off by 2 % or, in the same way, for as long as a landmark is seen: each of n
+    sightings within some seconds has the n-fold variance.
+    """
+    sigma_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m)
+    for number in np.unique(seen.ids):
+        chosen = seen.ids == number
+        time = seen.times[seen.frame[chosen]]
+        first, end = (
+            np.searchsorted(time, time + reach) for reach in (-_ALIKE_S / 2, _ALIKE_S / 2)
+        )
+        sigma_m[chosen] *= np.sqrt(end - first)
+    return np.asarray(sigma_m)
 
 
 def _run(
@@ -171,16 +312,27 @@ def read_landmarks(path: Path) -> LandmarkMap:
     return LandmarkMap(discs, no_landmarks())
 
 
-def _velocity_steps(velocity: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Movements from the start of the odometry to each time, arcs approximated by their chords."""
-    ends = min(velocity[0, 0], times[0]), max(times[-1], velocity[-1, 0]) + 1.0
+def _without_short_stops(velocity: FloatArray) -> FloatArray:
+    """Commands (k, 3) without the zeros of 10 to 30 ms that the log has at full seconds."""
+    still = ~np.any(velocity[:, 1:] != 0.0, axis=1)
+    bounds = np.flatnonzero(np.diff(still, prepend=~still[:1], append=~still[-1:]))
+    first, end = bounds[:-1], bounds[1:]
+    inside = (first > 0) & (end < len(still))
+    lasts_s = velocity[np.minimum(end, len(still) - 1), 0] - velocity[first, 0]
+    dropped = still[first] & inside & (lasts_s < _SHORT_STOP_S)
+    return np.asarray(velocity[~np.repeat(dropped, end - first)])
+
+
+def _driven_by(velocity: FloatArray, response: Response) -> _Log:
+    """The log of commands (k, 3), as the robot follows them; arcs are approximated by chords."""
+    time, speed, turn_rate = (velocity * [1.0, response.speed, response.turn]).T
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:
-        turn = velocity[held, 2] * duration
-        chord = velocity[held, 1] * duration * np.sinc(turn / (2.0 * np.pi))
+        turn = turn_rate[held] * duration
+        chord = speed[held] * duration * np.sinc(turn / (2.0 * np.pi))
         return np.stack([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn], axis=1)
 
-    return _steps_between(velocity[:, 0], times, along, ends)
+    return _Log(time + response.lag_s, along, _LATE_S)
 
 
 def _beside(odometry: Path, ending: str) -> Path:
@@ -215,7 +367,7 @@ def _table(path: Path, names: str) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
 
 
-def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
+def read_drive(drive: Path, noise: RangeNoise = _USUAL) -> Recording:
     """The car's log, with the trees found in its scans as discs; see `read_robot`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
@@ -226,12 +378,16 @@ def read_drive(drive: Path, sigma_m: float, sigma_rad: float) -> Recording:
     _demand_order(drive.with_name(SCANS), scanned)
     _demand_together(drive, time, drive.with_name(SCANS), scanned)
     usable = scanned >= time[0]
-    times, scans = scanned[usable] / 1000.0, laser[usable] / 100.0
+    # The upper bits of a range are the intensity.
+    times, scans = scanned[usable] / 1000.0, (laser[usable] % _RANGES_CM) / 100.0
     found = [trees_of(scan) for scan in scans]
     trees = np.concatenate([np.zeros((0, 2)), *found])
     frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
+    sigma_m = _TREE_SIGMA_M if noise.sigma_m is None else noise.sigma_m
+    sigma_rad = _TREE_SIGMA_RAD if noise.sigma_rad is None else noise.sigma_rad
     rows = discs_of_ranges(trees[:, 0], trees[:, 1], sigma_m, sigma_rad)
-    steps = _car_steps(time / 1000.0, speed, steering, times)
+    log = _driven(time / 1000.0, speed, steering)
+    steps = log.steps(np.append(log.times[0], times))
     return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
 
 
@@ -255,10 +411,8 @@ def trees_of(scan: FloatArray) -> FloatArray:
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
-def _car_steps(
-    time: FloatArray, speed: FloatArray, steering: FloatArray, times: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Movements of the scanner between times, from the speed of a rear wheel and the steering."""
+def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
+    """The scanner's log, from times (s), the speed of a rear wheel and the steering."""
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:
         slope = np.tan(steering[held])
@@ -266,7 +420,7 @@ def _car_steps(
         turn = way / _AXLES_M * slope
         return np.stack([way - turn * _LEFT_M, turn * _AHEAD_M, turn], axis=1)
 
-    return _steps_between(time, times, along, (time[0], max(time[-1], times[-1])))
+    return _Log(time, along)
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:

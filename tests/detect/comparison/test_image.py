@@ -19,7 +19,7 @@ from detect.comparison.compare import compare_frames
 from detect.comparison.result import DiscComparison
 from detect.levelling import levelled
 from detect.options import CompareOptions
-from detect.seen import Sight, image_positions, level_seen
+from detect.projection import DiscProjection, image_positions, level_positions
 from detect.settings import CircleSettings
 from redetect.landmarks import (
     CircleLandmark,
@@ -68,14 +68,14 @@ def leaning_run(
     for k in range(frames):
         xy = places(rng)
         pixels = camera.project_floor(xy) + rng.normal(0.0, noise_px, xy.shape)
-        again = level_seen(camera, camera.floor_from_pixel(pixels), (PITCH, ROLL))
+        again = level_positions(camera, camera.floor_from_pixel(pixels), (PITCH, ROLL))
         raw.append(frame(k, xy))
         level.append(frame(k, again, (PITCH, ROLL) if declared else None))
     return raw, level
 
 
 def compare(camera: Camera, raw: list[Frame], level: list[Frame]) -> DiscComparison:
-    return compare_frames(raw, level, CompareOptions(), sight=Sight(camera))
+    return compare_frames(raw, level, CompareOptions(), projection=DiscProjection(camera))
 
 
 @given(
@@ -88,7 +88,7 @@ def test_pixels_come_back_from_detection_and_levelling(
 ) -> None:
     seen = np.array(pixels)
     raw = published_camera.floor_from_pixel(seen)
-    level = level_seen(published_camera, raw, (pitch, roll))
+    level = level_positions(published_camera, raw, (pitch, roll))
     known = np.isfinite(level).all(axis=1) & (np.linalg.norm(level, axis=1) < 100.0)
     back = image_positions(published_camera, level, (pitch, roll))
     np.testing.assert_allclose(back[known], seen[known], atol=1e-6)
@@ -164,7 +164,7 @@ def test_rows_levelled_by_other_tilts_are_levelled_alike(published_camera: Camer
     xy = places(np.random.default_rng(6))
     by_one, by_other = (PITCH, ROLL), (0.01, 0.02)
     sides = [
-        [frame(0, level_seen(published_camera, xy, tilt), tilt)] for tilt in (by_one, by_other)
+        [frame(0, level_positions(published_camera, xy, tilt), tilt)] for tilt in (by_one, by_other)
     ]
     found = compare(published_camera, *sides)
     assert found.matched == len(xy)
@@ -191,8 +191,8 @@ def test_level_truth_is_seen_through_the_tilt_of_what_was_detected(
 ) -> None:
     _, level = leaning_run(published_camera)
     truth = [Frame(f.step, f.landmarks) for f in level]
-    sight = Sight(published_camera, reference_level=True)
-    found = compare_frames(truth, level, CompareOptions(), sight=sight)
+    projection = DiscProjection(published_camera, reference_level=True)
+    found = compare_frames(truth, level, CompareOptions(), projection=projection)
     assert found.recall == 1.0
     assert found.image_95_px == pytest.approx(0.0, abs=1e-9)
     # True rows need not say that they are level.
@@ -219,12 +219,14 @@ def test_rows_that_are_not_levelled_match_level_truth(
         truth.append(frame(k, xy))
         seen.append(frame(k, camera.floor_from_pixel(image_positions(camera, xy, by))))
 
-    sight = Sight.by(camera, CircleSettings(tilt_sigma_deg=sigma_deg), reference_level=True)
-    found = compare_frames(truth, seen, sight=sight)
+    projection = DiscProjection(
+        camera, CircleSettings(tilt_sigma_deg=sigma_deg), reference_level=True
+    )
+    found = compare_frames(truth, seen, projection=projection)
 
     assert (found.recall, found.extra) == (1.0, 0)
     assert "not corrected for the robot's tilt" in found.sentences()[2]
-    on_one_tilt = compare_frames(truth, truth, sight=Sight(camera))
+    on_one_tilt = compare_frames(truth, truth, projection=DiscProjection(camera))
     assert "tilt" not in on_one_tilt.sentences()[2]
 
 
@@ -269,7 +271,7 @@ def test_real_rows_levelled_or_not_are_the_same_rows(shared_data: Path, tmp_path
     for index, one in enumerate(raw):
         xy = np.array([(r.px, r.py) for r in one.circles]).reshape(-1, 2)
         level.append(
-            Frame(one.step, frame(index, level_seen(camera, xy, (PITCH, ROLL))).landmarks,
+            Frame(one.step, frame(index, level_positions(camera, xy, (PITCH, ROLL))).landmarks,
                   (PITCH, ROLL))
         )  # fmt: skip
     found = compare(camera, raw, level)

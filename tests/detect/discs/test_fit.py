@@ -12,7 +12,7 @@ from camera import Camera
 from detect.circles import refined_covariance
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
-from detect.seen import image_positions
+from detect.projection import image_positions
 from lut import VoteTable
 from tests.detect.discs.single_fits import fit_discs
 from tests.detect.painted_floor import PaintedFloor

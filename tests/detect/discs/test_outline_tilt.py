@@ -19,7 +19,7 @@ from detect.discs.outline_tilt import (
     mean_of_tilts,
     tilt_of_outlines,
 )
-from detect.seen import image_positions, level_matrix
+from detect.projection import image_positions, level_matrix
 from redetect.landmarks import FrameTilt
 from tests.detect.line_scene import tilted
 from tests.detect.painted_floor import PaintedFloor

@@ -16,7 +16,7 @@ from camera import Camera, read_camera, write_camera
 from detect.cli import main, parsed
 from detect.discs.radius import FACTOR, SMALLEST_M, find_radius
 from detect.options import All, Circles
-from detect.seen import leaning_camera
+from detect.projection import leaning_camera
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from tests.detect.commands import Captured

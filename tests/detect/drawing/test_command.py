@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bars
-from detect.row_files import SeenRows, circle_settings_of
-from detect.seen import Sight
+from detect.projection import DiscProjection
+from detect.row_files import ImageRows, circle_settings_of
 from detect.settings import CircleSettings
 from detect.sources.opening import open_source
 from detect.sources.poses import SomeFrames
@@ -85,14 +85,14 @@ def test_lines_go_through_the_lens(published_camera: Camera) -> None:
 def test_matched_extra_and_missed_have_colours_of_their_own(
     image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    rows = SeenRows(
+    rows = ImageRows(
         circles=Frame(STEP, discs((0.2, -1.3), (-0.6, -1.5), (0.0, -2.0))),
         reference_circles=Frame(STEP, discs((0.21, -1.3), (0.7, -1.6))),
         unlisted=Frame(STEP, discs((0.0, -2.0))),
         lines=Frame(STEP, (vertical(published_camera, 0.3, 0.002),)),
         reference_lines=Frame(STEP, (vertical(published_camera, -0.4, 0.002),)),
     )
-    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS, "x.0001")
+    canvas = draw_rows(image, DiscProjection(published_camera, SETTINGS), rows, "x.0001")
     assert canvas.shape[0] > 576
     assert canvas[576:].any()
 
@@ -122,8 +122,8 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
 def test_without_reference_nothing_is_missed_or_extra(
     image: NDArray[np.uint8], published_camera: Camera
 ) -> None:
-    rows = SeenRows(circles=Frame(STEP, discs((0.2, -1.3))))
-    canvas = draw_rows(image, Sight(published_camera), rows, SETTINGS).astype(int)
+    rows = ImageRows(circles=Frame(STEP, discs((0.2, -1.3))))
+    canvas = draw_rows(image, DiscProjection(published_camera, SETTINGS), rows).astype(int)
     seen = published_camera.project_floor(np.array([0.2, -1.3]) + ring(0.1, 32))
     edge = np.rint(2.0 * seen + 0.5).astype(int)
     apart = np.abs(canvas[edge[:, 1], edge[:, 0]] - (0, 170, 255)).sum(axis=1)
@@ -277,8 +277,8 @@ def test_labels_of_verticals_do_not_cover_each_other(published_camera: Camera) -
 
     def orange(*rows: LineLandmark) -> int:
         frame = Frame(STEP, rows)
-        seen = SeenRows(lines=frame, reference_lines=frame)
-        picture = draw_rows(image, Sight(published_camera), seen, SETTINGS).astype(int)
+        seen = ImageRows(lines=frame, reference_lines=frame)
+        picture = draw_rows(image, DiscProjection(published_camera, SETTINGS), seen).astype(int)
         return int(np.sum((picture == SIGMA_COLOUR).all(axis=2)))
 
     assert orange(*rows) >= 0.97 * sum(orange(row) for row in rows)

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
 from detect.drawing.frame import draw_rows
-from detect.row_files import SeenRows
-from detect.seen import Sight
+from detect.projection import DiscProjection
+from detect.row_files import ImageRows
 from detect.settings import CircleSettings
 from lut import ring
 from redetect.landmarks import Frame, Step, circle_landmarks
@@ -25,8 +25,8 @@ def drawn(
     xy = np.array(places, float).reshape(-1, 2)
     covariance = np.tile(1e-4 * np.eye(2), (len(xy), 1, 1))
     discs = circle_landmarks(xy, np.full(len(xy), 0.87), covariance, np.full(len(xy), -1))
-    rows = SeenRows(circles=Frame(Step("x", *[0.0] * 9), discs))
-    picture = draw_rows(image, Sight(camera), rows, SETTINGS)
+    rows = ImageRows(circles=Frame(Step("x", *[0.0] * 9), discs))
+    picture = draw_rows(image, DiscProjection(camera, SETTINGS), rows)
     return picture[: 2 * image.shape[0]]
 
 

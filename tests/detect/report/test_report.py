@@ -17,10 +17,10 @@ from detect.cli import main
 from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.options import CompareOptions, RowFiles
+from detect.projection import DiscProjection
 from detect.report.figures import binned, rates_over, repeated, whitened
 from detect.report.page import gather, report_page
-from detect.row_files import SeenRows
-from detect.seen import Sight
+from detect.row_files import ImageRows
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_source
 from detect.sources.poses import SomeFrames
@@ -218,7 +218,7 @@ def test_page_states_what_comparing_does(judged_run: Path, tmp_path: Path) -> No
     camera = camera_in(judged_run)
     assert camera is not None
     reference, found = (read_frames(judged_run / f"{name}.circles") for name in ("map", "detected"))
-    expected = compare_frames(reference, found, sight=Sight(camera))
+    expected = compare_frames(reference, found, projection=DiscProjection(camera))
     assert (expected.matched, expected.missed, expected.extra) == (2, 1, 1)
     assert f"recall {expected.recall:.4g}" in words
     assert f"precision {expected.precision:.4g}" in words
@@ -307,7 +307,7 @@ def test_repeatability_is_that_of_the_rows() -> None:
         step = Step(f"s.{k}", *[*(step_sigma * rng.standard_normal(3)).tolist(), *spread])
         covariance = np.tile(np.diag(sigma**2), (len(xy), 1, 1))
         landmarks = circle_landmarks(discs, np.full(len(xy), 0.9), covariance)
-        rows.append(SeenRows(circles=Frame(step, landmarks)))
+        rows.append(ImageRows(circles=Frame(step, landmarks)))
     found = repeated(rows)
     assert found is not None
     assert found.pairs == 199 * len(xy)
@@ -317,7 +317,7 @@ def test_repeatability_is_that_of_the_rows() -> None:
     lost = [
         replace(f, step=replace(f.step, cxx=1e6, cyy=1e6)) for row in rows if (f := row.circles)
     ]
-    assert repeated([SeenRows(circles=frame) for frame in lost]) is None
+    assert repeated([ImageRows(circles=frame) for frame in lost]) is None
 
 
 def test_a_source_is_read_twice_however_many_frames_are_shown(judged_run: Path) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from detect.projection import level_positions
 from detect.runs.level_run import level_run
 from detect.runs.plan import RunSummary
-from detect.seen import level_seen
 from detect.settings import LEAST_FRAMES, CircleSettings
 from redetect.landmarks.files import frames_of_rows, parse_rows
 
@@ -38,7 +38,7 @@ def level(camera: Camera, frames: int) -> dict[str, bytes]:
 def test_discs_come_out_level_also_in_a_frame_without_verticals(published_camera: Camera) -> None:
     written = level(published_camera, 3 * LEAST_FRAMES)
 
-    expected = level_seen(published_camera, np.array([[0.5, -2.5]]), LEAN)[0]
+    expected = level_positions(published_camera, np.array([[0.5, -2.5]]), LEAN)[0]
     frames = list(frames_of_rows(parse_rows(io.BytesIO(written["circles"]))))
     assert len(frames) == 3 * LEAST_FRAMES
     for frame in frames:

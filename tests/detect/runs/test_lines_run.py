@@ -15,9 +15,9 @@ from camera import read_camera, write_camera
 from detect.cli import main
 from detect.line_settings import LineSettings
 from detect.lines import carry_ids
+from detect.projection import leaning_camera
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
-from detect.seen import leaning_camera
 from detect.sources.opening import open_run
 from redetect.landmarks import LineLandmark, read_frames, read_tilts
 from tests.detect.commands import Captured

@@ -23,7 +23,7 @@ from detect.commands.tune import (
     pareto_front,
 )
 from detect.errors import DetectError
-from detect.seen import leaning_camera
+from detect.projection import leaning_camera
 from detect.settings import CircleSettings
 from tests.detect.commands import Captured, assert_refused
 from tests.detect.conftest import SMALL_RUN_DISCS

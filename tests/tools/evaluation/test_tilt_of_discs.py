@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect.seen import level_seen
+from detect.projection import level_positions
 from tools.evaluation.tilt_of_discs import tilt_of_discs
 
 POSE = np.array([2.0, -1.0, 0.7])
@@ -16,7 +16,7 @@ SEEN = np.array([(0.4, -1.2), (-0.6, -1.6), (0.1, -2.1), (0.9, -2.8), (-0.8, -3.
 
 def scene(camera: Camera, raised_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Rows that the tilted camera gives, and where their discs are in the map."""
-    level = level_seen(camera, SEEN, TILT, raised_m)
+    level = level_positions(camera, SEEN, TILT, raised_m)
     cosine, sine = np.cos(POSE[2]), np.sin(POSE[2])
     return SEEN, POSE[:2] + level @ np.array([[cosine, sine], [-sine, cosine]])
 

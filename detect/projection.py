@@ -1,4 +1,4 @@
-"""Maps rows of discs back into the image: undoes the levelling, then projects through the lens.
+"""Projects floor positions into the image, undoing that they were levelled; and levels them.
 
 Plain NumPy, so that comparing files does not load the compiler.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,7 +45,7 @@ def image_positions(
     return camera.project_robot(points - np.array([0.0, 0.0, raised_m]))
 
 
-def level_seen(
+def level_positions(
     camera: Camera, floor_xy: ArrayLike, levelled_by: ArrayLike, raised_m: float = 0.0
 ) -> FloatArray:
     """Level the floor positions (m) that the calibrated camera measures.
@@ -92,48 +92,41 @@ def summed_steps(steps: Iterable[Step]) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """Maps rows of discs into the image, reference and detected ones by the tilts of each."""
+class DiscProjection:
+    """Projects reference and detected discs into the image, each by the tilt that levelled them."""
 
     camera: Camera
-    radius_m: float = 0.10  # of the discs
-    #: Standard deviation of the tilt of rows that are not levelled.
-    tilt_sigma_rad: float = math.radians(USUAL_TILT_DEG)
+    settings: CircleSettings = field(default_factory=CircleSettings)  # of the detected discs
     #: Reference rows are level but do not state their tilt: that of the detected rows is used.
     reference_level: bool = False
-    reference_by: Tilt | None = None
-    detected_by: Tilt | None = None
+    reference_tilt: Tilt | None = None  # that levelled the reference rows
+    detected_tilt: Tilt | None = None
 
-    @classmethod
-    def by(cls, camera: Camera, settings: CircleSettings, reference_level: bool = False) -> Sight:
-        """The mapping for discs that were detected with some settings."""
-        sigma_rad = max(settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
-        return cls(camera, settings.radius_m, sigma_rad, reference_level)
-
-    def of(self, reference: Frame | None, detected: Frame | None) -> Sight:
-        """The mapping for a frame with these rows."""
-        detected_by = None if detected is None else detected.levelled_by
-        reference_by = None if reference is None else reference.levelled_by
-        if self.reference_level and reference_by is None:
-            reference_by = detected_by
-        return replace(self, reference_by=reference_by, detected_by=detected_by)
+    def for_frame(self, reference: Frame | None, detected: Frame | None) -> DiscProjection:
+        """The projection of a frame with these rows."""
+        detected_tilt = None if detected is None else detected.levelled_by
+        reference_tilt = None if reference is None else reference.levelled_by
+        if self.reference_level and reference_tilt is None:
+            reference_tilt = detected_tilt
+        return replace(self, reference_tilt=reference_tilt, detected_tilt=detected_tilt)
 
     def reference_px(self, xy: FloatArray) -> FloatArray:
         """(..., 2) pixels of positions (..., 2) of reference rows."""
-        return image_positions(self.camera, xy, self.reference_by)
+        return image_positions(self.camera, xy, self.reference_tilt)
 
     def detected_px(self, xy: FloatArray) -> FloatArray:
         """(..., 2) pixels of positions (..., 2) of detected rows."""
-        return image_positions(self.camera, xy, self.detected_by)
+        return image_positions(self.camera, xy, self.detected_tilt)
 
-    def levelled_alike(self, reference_xy: FloatArray) -> FloatArray:
+    def levelled_as_detected(self, reference_xy: FloatArray) -> FloatArray:
         """(N, 2) reference positions levelled as the detected ones are; as they are where the
         levelled ray does not meet the floor.
         """
-        if self.reference_by == self.detected_by:
+        if self.reference_tilt == self.detected_tilt:
             return reference_xy
         xy = self.camera.floor_from_pixel(self.reference_px(reference_xy))
-        xy = xy if self.detected_by is None else level_seen(self.camera, xy, self.detected_by)
+        if self.detected_tilt is not None:
+            xy = level_positions(self.camera, xy, self.detected_tilt)
         return np.where(np.isfinite(xy), xy, reference_xy)
 
     def gates(self, reference_xy: FloatArray) -> FloatArray:
@@ -141,12 +134,13 @@ class Sight:
 
         Wider where the tilt between the reference and the detected rows is unknown.
         """
-        edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), self.radius_m, 16))
-        seen = np.isfinite(edge)
-        low = np.where(seen, edge, np.inf).min(axis=1, initial=np.inf)
-        high = np.where(seen, edge, -np.inf).max(axis=1, initial=-np.inf)
+        radius_m = self.settings.radius_m
+        edge = self.reference_px(circle_on_floor(reference_xy.reshape(-1, 2), radius_m, 16))
+        visible = np.isfinite(edge)
+        low = np.where(visible, edge, np.inf).min(axis=1, initial=np.inf)
+        high = np.where(visible, edge, -np.inf).max(axis=1, initial=-np.inf)
         gates = np.maximum(0.5 * (high - low), LEAST_GATE_PX)
-        if self.reference_level and self.detected_by is None:
-            focal_px = np.array([self.camera.scale_x, self.camera.scale_y])
-            gates += _TILT_GATE * self.tilt_sigma_rad * focal_px
+        if self.reference_level and self.detected_tilt is None:
+            sigma_rad = max(self.settings.tilt_sigma_rad, math.radians(USUAL_TILT_DEG))
+            gates += _TILT_GATE * sigma_rad * np.array(self.camera.pinhole[:2])
         return np.asarray(gates)
