@@ -25,12 +25,7 @@ from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import (
-    camera_of_run,
-    camera_xy_of,
-    joined,
-    read_runs,
-)
+from redetect.slam.recording import camera_of_run, camera_xy_of, joined, read_runs
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]

@@ -334,6 +334,17 @@ def test_comparison_of_files(demo: Path, tmp_path: Path) -> None:
         rd.compare(tmp_path, reference=demo / "map.circles")
 
 
+def test_a_lost_robot_is_located_without_a_word(
+    demo: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = rd.localize(demo, rd.map(demo), association="joint", lost=True).result.located
+    assert found is not None
+    assert np.hypot(*found.pose[:2]) < 0.1
+    assert capsys.readouterr().out == ""
+    with pytest.raises(rd.Error, match="`lost` and `start`: expected one of them"):
+        rd.localize(demo, rd.map(demo), lost=True, start=(1.0, 0.0, 0.0))
+
+
 def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     landmarks = rd.map(demo, lines=True)
     assert len(landmarks.discs) > 20

@@ -50,19 +50,19 @@ class ErrorFigures:
 def _figures(error: FloatArray) -> dict[str, float]:
     """The `ErrorFigures` of (N, 3) errors x, y (m), theta (rad)."""
     distance, turn = np.hypot(error[:, 0], error[:, 1]), error[:, 2]
-    figures = ErrorFigures(
-        float(distance.mean()),
-        sigma_of(distance),
-        float(np.median(distance)),
-        float(np.sqrt(np.mean(distance**2))),
-        float(distance.max()),
-        float(turn.mean()),
-        sigma_of(turn),
-        float(np.sqrt(np.mean(turn**2))),
-        float(np.abs(turn).mean()),
-        float(np.abs(turn).max()),
-    )
-    return vars(figures)
+    figures = {
+        "position_mean_m": distance.mean(),
+        "position_sigma_m": sigma_of(distance),
+        "position_median_m": np.median(distance),
+        "position_rmse_m": np.sqrt(np.mean(distance**2)),
+        "position_max_m": distance.max(),
+        "angle_mean_rad": turn.mean(),
+        "angle_sigma_rad": sigma_of(turn),
+        "angle_rmse_rad": np.sqrt(np.mean(turn**2)),
+        "angle_abs_mean_rad": np.abs(turn).mean(),
+        "angle_max_rad": np.abs(turn).max(),
+    }
+    return {name: float(value) for name, value in figures.items()}
 
 
 @dataclass(frozen=True)
