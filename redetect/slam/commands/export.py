@@ -120,7 +120,8 @@ def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
     file = command.file
-    noise = data_sets.RangeNoise(command.range_sigma, command.bearing_sigma)
+    stated = {"sigma_m": command.range_sigma, "sigma_rad": command.bearing_sigma}
+    sigmas = {name: sigma for name, sigma in stated.items() if sigma is not None}
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
         write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
@@ -130,10 +131,10 @@ def _import_data_set(command: Import) -> None:
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
-        run, response = data_sets.read_robot(file, noise, calibrated=command.calibrated)
+        run, response = data_sets.read_robot(file, **sigmas, calibrated=command.calibrated)
         _write_run(command, run, f"measurements; {response.sentence()}")
     elif file.name == data_sets.DRIVE:
-        _write_run(command, data_sets.read_drive(file, noise), "measurements")
+        _write_run(command, data_sets.read_drive(file, **sigmas), "measurements")
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "

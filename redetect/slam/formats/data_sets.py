@@ -66,7 +66,6 @@ _FARTHEST_M = 75.0
 # Largest range difference of neighbouring beams on a trunk, and least one to the background.
 _SAME_M, _BEHIND_M = 0.5, 1.5
 _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
-_TREE_SIGMA_M, _TREE_SIGMA_RAD = 0.1, 0.03
 
 
 def _names(times: FloatArray) -> tuple[str, ...]:
@@ -158,16 +157,6 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
     return _Sightings(times, frame, range_m, bearing_rad, ids[order])
 
 
-class RangeNoise(NamedTuple):
-    """Standard deviations of independent ranges and bearings; None: as usual in the data set."""
-
-    sigma_m: float | None = None
-    sigma_rad: float | None = None
-
-
-_USUAL = RangeNoise()
-
-
 class Response(NamedTuple):
     """How a robot follows its commands."""
 
@@ -184,15 +173,20 @@ class Response(NamedTuple):
 
 
 def read_robot(
-    odometry: Path, noise: RangeNoise = _USUAL, *, calibrated: bool = True
+    odometry: Path,
+    sigma_m: float | None = None,
+    sigma_rad: float | None = None,
+    *,
+    calibrated: bool = True,
 ) -> tuple[Recording, Response]:
     """A robot's log, with landmarks as discs; most steps have no covariance.
 
     Parameters
     ----------
     odometry : Path
-    noise : RangeNoise
-        Of the rows; for what it does not state see `_usual_sigma_m`.
+    sigma_m, sigma_rad : float, optional
+        Standard deviations of independent ranges and bearings; by default, ranges have those of
+        `_usual_sigma_m`.
     calibrated : bool
         Whether steps are as the robot follows its commands (`response_of`), not as commanded.
 
@@ -212,9 +206,9 @@ def read_robot(
     response = response_of(velocity, seen) if calibrated else Response()
     times = np.append(min(velocity[0, 0], seen.times[0]), seen.times)
     steps = _driven_by(velocity, response).steps(times)
-    sigma_m = _usual_sigma_m(seen) if noise.sigma_m is None else noise.sigma_m
-    sigma_rad = _USUAL_SIGMA_RAD if noise.sigma_rad is None else noise.sigma_rad
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad)
+    of_ranges = _usual_sigma_m(seen) if sigma_m is None else sigma_m
+    of_bearings = _USUAL_SIGMA_RAD if sigma_rad is None else sigma_rad
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, of_ranges, of_bearings)
     return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids)), response
 
 
@@ -367,7 +361,7 @@ def _table(path: Path, names: str) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
 
 
-def read_drive(drive: Path, noise: RangeNoise = _USUAL) -> Recording:
+def read_drive(drive: Path, sigma_m: float = 0.1, sigma_rad: float = 0.03) -> Recording:
     """The car's log, with the trees found in its scans as discs; see `read_robot`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
@@ -383,8 +377,6 @@ def read_drive(drive: Path, noise: RangeNoise = _USUAL) -> Recording:
     found = [trees_of(scan) for scan in scans]
     trees = np.concatenate([np.zeros((0, 2)), *found])
     frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
-    sigma_m = _TREE_SIGMA_M if noise.sigma_m is None else noise.sigma_m
-    sigma_rad = _TREE_SIGMA_RAD if noise.sigma_rad is None else noise.sigma_rad
     rows = discs_of_ranges(trees[:, 0], trees[:, 1], sigma_m, sigma_rad)
     log = _driven(time / 1000.0, speed, steering)
     steps = log.steps(np.append(log.times[0], times))
