@@ -40,8 +40,8 @@ _WHOLE_RIM = 0.8  #: Share of the rim from which it is complete.
 _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.9, 0.97
 #: The fit of a whole disc is final if it explains this share of the variance.
 _EXPLAINS_ALL = 0.99
-_AT_BOUND = 0.98  #: If the blur reaches this share of a patch's bound, the fit is repeated,
-_MOST_REFITS = 2  #: in a wider patch, up to so many times.
+_AT_BOUND = 0.98  #: If the blur reaches this share of a patch's bound, the fit is repeated.
+_MOST_REFITS = 2  #: Largest number of repetitions, each in a wider patch.
 #: Stages of fits: whole discs, up to as often; then parts of discs; then again with a better size.
 _PARTS, _LAST = _MOST_REFITS + 1, _MOST_REFITS + 2
 #: Initial blur, pixels.
