@@ -48,6 +48,8 @@ class SourceOptions(Bounded, error=DetectError):
     #: File of the images' times, rows `prefix seconds`; by default <folder>.times among the images.
     times: str = ""
     image_topic: str = ""  #: Image topic of a bag, if there are several.
+    #: Bits of values that are stored in 16; by default the fewest that hold those of some images.
+    bit_depth: Annotated[MaybeInt, whole(8, 16)] = None
     #: Stop after this many frames; 0 for all of them (with a live camera: until Ctrl-C).
     frames: Annotated[int, whole(0, MOST_FRAMES)] = 0
 
@@ -321,7 +323,7 @@ class Report(RunFlags):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explain:
+class Explain(Bounded, error=DetectError):
     """Explain why discs of an image are found or not: each candidate, and what rejected it.
 
     Example: detect explain images/e/images/e.0000.jpg --at 377 85 -o /tmp/why.png
@@ -332,6 +334,8 @@ class Explain:
     at: MaybePixel = None
     #: Calibration; by default the one in the image's folder, or in its parent.
     camera: MaybePath = None
+    #: Bits of values that are stored in 16; by default the fewest that hold those of the image.
+    bit_depth: Annotated[MaybeInt, whole(8, 16)] = None
     #: PNG file for a picture of the candidates, numbered as in the table.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     json: MaybePath = None  #: Write the candidates as JSON; -: to standard output.

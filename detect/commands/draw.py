@@ -20,9 +20,8 @@ from detect.options import Draw
 from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
-from detect.sources.interface import ImageRun, Run, RunFrame, read_image
+from detect.sources.interface import ImageRun, Run, RunFrame, SomeFrames, read_image
 from detect.sources.opening import demand_recording, open_source
-from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage
 from redetect.messages import counted

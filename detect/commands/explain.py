@@ -34,7 +34,8 @@ def perform(command: Explain) -> int:
             f"{command.image}: no calibration: expected a .cam file in its folder or the one "
             "above, or one named by --camera"
         )
-    image = read_image(RunFrame(still("image"), command.image), camera)
+    frame = RunFrame(still("image"), command.image, bit_depth=command.bit_depth)
+    image = read_image(frame, camera)
     found = explain_discs(image, camera, command.detector, command.at)
     _print(found)
     if command.output is not None:

@@ -17,7 +17,7 @@ from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Ma
 from detect.projection import leaning_camera
 from detect.row_files import KINDS, RunRows
 from detect.runs.hints import hints, some_images
-from detect.runs.outputs import frames_tilt_place, lean_sentence
+from detect.runs.outputs import depth_sentence, frames_tilt_place, lean_sentence
 from detect.runs.plan import (
     FramePlan,
     FramesByImage,
@@ -210,6 +210,8 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     for kind, what in (("circles", "disc"), ("markers", "marker")):
         if kind in places:
             print(f"{places[kind]}: {counted(found[f'{what}s'], what)} in {frames}")
+    if job.run.bit_depth is not None:
+        print(depth_sentence(job.run.bit_depth))
     if summary.lean is not None:
         print(lean_sentence(summary.lean))
     if summary.unlevelled_deg is not None and "tilt" not in places and not job.known.tilts:

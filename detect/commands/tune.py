@@ -28,9 +28,8 @@ from detect.runs.stream import with_first_look
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
 from detect.settings import UNREFINED, CircleSettings
 from detect.settings_files import read_settings, word_value
-from detect.sources.interface import Run, RunFrame
+from detect.sources.interface import Run, RunFrame, SomeFrames
 from detect.sources.opening import demand_recording, open_run
-from detect.sources.poses import SomeFrames
 from detect.terminal import progress_bar, report_failures
 from redetect import __version__
 from redetect.array_types import FloatArray

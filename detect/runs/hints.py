@@ -12,8 +12,7 @@ from detect.errors import DetectError, FrameError
 from detect.projection import leaning_camera
 from detect.runs.plan import Job, Known, RunSummary
 from detect.settings import UNREFINED, CircleSettings
-from detect.sources.interface import Run, read_image
-from detect.sources.poses import SomeFrames
+from detect.sources.interface import Run, read_image, spread_frames
 from redetect.array_types import ByteArray
 from redetect.messages import counted
 
@@ -34,8 +33,7 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
     """Images spread over a run, if its length is known in advance."""
     if run.frames.expected is None:
         raise DetectError("--radius-m auto: expected recorded images, which can be read twice")
-    step = max(1, run.frames.expected // count)
-    for frame in SomeFrames(run.frames, step * count, step):
+    for frame in spread_frames(run.frames, count):
         with suppress(FrameError):
             yield read_image(frame, run.camera)
 

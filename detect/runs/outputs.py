@@ -111,7 +111,7 @@ def _circles_text(job: Job) -> list[str]:
     levelled = plan.levelling != "none" and (plan.lines or job.known.tilts is not None)
     return [
         f"Discs on the floor, detected by redetect {__version__}.",
-        *(_ROBOT, _STEP, _odometry(job.run)),
+        *(_ROBOT, _STEP, *_source_text(job.run)),
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
         f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([f"  positions are {LEVELLED}: # levelled <pitch> <roll>"] if levelled else []),
@@ -145,7 +145,7 @@ def _lines_text(run: ImageRun, plan: FramePlan) -> list[str]:
         sign += ", with the data set's own sign"
     return [
         f"Verticals of the building, detected by redetect {__version__}.",
-        *(_ROBOT, _STEP, _odometry(run)),
+        *(_ROBOT, _STEP, *_source_text(run)),
         "LANDMARK_L <xTop> <yTop> <xBottom> <yBottom> <alpha> <beta> <quality> <sigma> <ID>",
         "  ends: undistorted normalised coordinates; beta: inclination of the plane's normal",
         f"  alpha: bearing (0 forward, positive to the left), {sign}; sigma: its deviation",
@@ -156,7 +156,7 @@ def _lines_text(run: ImageRun, plan: FramePlan) -> list[str]:
 def _markers_text(run: ImageRun, plan: FramePlan) -> list[str]:
     return [
         f"Square markers, detected by redetect {__version__}.",
-        *(_STEP, _odometry(run)),
+        *(_STEP, *_source_text(run)),
         "LANDMARK_M <dictionary> <ID> <quality>, and for each corner <u> <v> <cUU> <cUV> <cVV>",
         "  corners top left, top right, bottom right, bottom left of the marker as printed;",
         "  pixels of the original image, the top left pixel's centre is 0 0; quality: 1 is perfect",
@@ -178,9 +178,15 @@ def _json_file(path: Path, plan: FramePlan) -> Output:
     return Output(path, "json", head, f"\n ]{tail}\n", ",")
 
 
-def _odometry(run: ImageRun) -> str:
+def _source_text(run: ImageRun) -> list[str]:
     source = run.odometry.name if run.odometry is not None else "none: the steps are zeros"
-    return f"  odometry: {source}; the image was taken after the step"
+    odometry = f"  odometry: {source}; the image was taken after the step"
+    return [odometry, f"  {depth_sentence(run.bit_depth)}"] if run.bit_depth else [odometry]
+
+
+def depth_sentence(bit_depth: int) -> str:
+    """A sentence on the scale of images whose values are stored in 16 bits."""
+    return f"of values stored in 16 bits, the 8 highest of {bit_depth} bits are used (--bit-depth)"
 
 
 def _made_with(plan: FramePlan, settings: Any) -> tuple[str, str]:
@@ -206,6 +212,7 @@ def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, obje
         "camera": None if plan.camera is None else plan.camera.content_hash,
         "settings": {kind: values for kind, values in settings.items() if values},
         **({"lean_rad": plan.lean} if plan.lean else {}),
+        **({"bit_depth": job.run.bit_depth} if job.run.bit_depth else {}),
         "failures": failures,
         "frames": summary.frames,
         "failed": summary.failed,

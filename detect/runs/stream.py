@@ -44,20 +44,20 @@ from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary, lean_finds_more
 from detect.runs.workers import WorkerPool, Workers, local_workers
 from detect.settings import LEAST_FRAMES
-from detect.sources.interface import ImageRun, RunFrame
-from detect.sources.poses import SomeFrames
+from detect.sources.interface import ImageRun, RunFrame, spread_frames
 from redetect import __version__
 from redetect.storage import OutputExistsError
 from redetect.storage.parts import PartFile, demand_place, folder_locked, left_part, new_part
 
 #: Incremented with every change of the format of a journal or of the rows in it.
-_JOURNAL_VERSION = 8
+_JOURNAL_VERSION = 9
 
 _DIGITS = 16
 _LONGEST_LINE = 1 << 26
 _COMPLETE = "complete"
 #: Largest number of frames from which a run's tilt is estimated first, and their largest spacing.
-_FIRST_FRAMES, _FIRST_STEP = 32, 20
+_FIRST_FRAMES = 32
+_FIRST_SPACING = 20
 
 _log = logging.getLogger("redetect")
 
@@ -150,8 +150,8 @@ def task_digest(task: FrameTask) -> str:
     An image file is identified by name, size and modification time.
     """
     frame = task.frame
-    beside = (frame.step, _file_of(frame), frame.time_s, frame.failure, task.known)
-    return _digest_of(repr(beside), b"" if frame.content is None else bytes(frame.content))
+    values = (frame.step, _file_of(frame), frame.time_s, frame.failure, frame.bit_depth, task.known)
+    return _digest_of(repr(values), b"" if frame.content is None else bytes(frame.content))
 
 
 def _digest_of(text: str, content: bytes = b"") -> str:
@@ -232,15 +232,14 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
 
     That is the camera's lean and, if positions are not levelled by the run, the usual tilt.
     """
-    camera, circles, expected = plan.camera, plan.circles, run.frames.expected or 0
+    camera, circles = plan.camera, plan.circles
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    if expected < LEAST_FRAMES:
+    if (run.frames.expected or 0) < LEAST_FRAMES:
         return plan
     from detect.runs.level_run import searched_lean, tilt_of_some  # loads the compiler
 
-    step = min(max(expected // _FIRST_FRAMES, 1), _FIRST_STEP)
-    tasks = [FrameTask(frame) for frame in SomeFrames(run.frames, step * _FIRST_FRAMES, step)]
+    tasks = [FrameTask(frame) for frame in spread_frames(run.frames, _FIRST_FRAMES, _FIRST_SPACING)]
 
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]

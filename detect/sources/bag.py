@@ -28,7 +28,7 @@ from camera.formats.yaml_files import camera_of_info
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import FloatArray
 from redetect.messages import OneLineError, excerpt, imported_for, one_line
 from redetect.plane import rotation
 
@@ -173,7 +173,7 @@ def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
     return pixels[:, :, [2, 1, 0, 3][:channels]] if encoding.startswith("rgb") else pixels
 
 
-def content_of_message(message: Any, name: object) -> bytes | GreyImage:
+def content_of_message(message: Any, name: object) -> bytes | NDArray[Any]:
     """The grey values of a `sensor_msgs/Image`, or the file in a `sensor_msgs/CompressedImage`."""
     if not hasattr(message, "format"):
         return gray_of_pixels(pixels_of_message(message, name), name)
@@ -206,7 +206,7 @@ class Bag(Source):
             for number, (recorded_s, message) in enumerate(said):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
-                content: bytes | GreyImage | None = None
+                content: bytes | NDArray[Any] | None = None
                 failure = None
                 try:
                     with understood(name):

@@ -2,9 +2,10 @@
 
 A frame is a STEP row, of zeros without odometry, with its image; frames are made on demand. Images
 become 8-bit grey ones. Colour is 0.299 R + 0.587 G + 0.114 B, as in OpenCV (for a JPEG, its
-luminance). Of 16-bit images, the 8 highest of the bits that their values need are kept: values of a
-12-bit camera in 16-bit files would be nearly black otherwise. No image takes more memory than the
-images of its run do, whatever its file contains or claims.
+luminance). Of values with 16 bits, the 8 highest of a bit depth are kept: those of a 12-bit camera
+would be nearly black otherwise. It is one for the whole run: else discs would have another contrast
+in each image, by the brightest things beside them. No image takes more memory than the images of
+its run do, whatever its file contains or claims.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,9 +35,12 @@ from redetect.storage.images import decoded_image
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
 
-#: Bit depths of cameras; a 16-bit image has the lowest that holds all but this share of its values
-#: (hot pixels).
-_BIT_DEPTHS, _BRIGHTEST = (8, 10, 12, 14, 16), 1e-4
+_BIT_DEPTHS = (8, 10, 12, 14, 16)  # of cameras
+#: Number of images by which a run's bit depth is found, and their largest spacing.
+_DEPTH_IMAGES = 32
+_DEPTH_SPACING = 20
+#: Largest share of values that a bit depth need not hold: hot pixels.
+_HOT_PIXELS = 1e-4
 # Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
 # expand, plus thumbnails and other metadata of cameras.
 _BYTES_PER_PIXEL = 16
@@ -47,10 +53,12 @@ class RunFrame:
 
     step: Step
     image: Path | None  # its file, if it has one
-    #: The encoded image or (H, W) uint8 grey values, if it has no file of its own.
-    content: bytes | GreyImage | None = field(default=None, compare=False, repr=False)
+    #: The encoded image or (H, W) grey values, uint8 or uint16, if it has no file of its own.
+    content: bytes | NDArray[Any] | None = field(default=None, compare=False, repr=False)
     time_s: float | None = None  # time of the image, if known
     failure: str | None = None  # why there is no image, although there should be
+    #: Of values that are stored in 16 bits; None: the lowest that holds those of the image.
+    bit_depth: int | None = None
 
 
 class Frames(ABC):
@@ -63,6 +71,34 @@ class Frames(ABC):
 
     @abstractmethod
     def __iter__(self) -> Generator[RunFrame, None, None]: ...
+
+
+class SomeFrames(Frames):
+    """Every n-th of the first `count` frames of another source (0: of all), of a bit depth."""
+
+    def __init__(
+        self, frames: Frames, count: int = 0, every: int = 1, bit_depth: int | None = None
+    ) -> None:
+        self._frames, self._count, self._every = frames, count, every
+        self._bit_depth = bit_depth
+        self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
+        known = [number for number in (frames.expected, count or None) if number is not None]
+        self.expected = -(-min(known) // every) if known else None
+
+    def __iter__(self) -> Generator[RunFrame, None, None]:
+        with closing(iter(self._frames)) as frames:
+            for frame in islice(frames, 0, self._count or None, self._every):
+                yield replace(frame, bit_depth=self._bit_depth) if self._bit_depth else frame
+            self.left_out = self._frames.left_out
+
+
+def spread_frames(frames: Frames, count: int, farthest: int | None = None) -> SomeFrames:
+    """About `count` frames spread over a source, or over its beginning: the first ones if its
+    length is not known, or ones that are `farthest` apart.
+    """
+    every = max((frames.expected or 0) // count, 1)
+    every = every if farthest is None else min(every, farthest)
+    return SomeFrames(frames, every * count, every)
 
 
 class Source(Frames):
@@ -111,6 +147,7 @@ class ImageRun:
     odometry: Path | None  # source of the STEP rows
     output_base: Path  # results are called this, with an ending of their own
     has_times: bool = False  # whether times of frames are known, and written beside the results
+    bit_depth: int | None = None  # of all frames, if their values are stored in 16 bits
 
     @property
     def name(self) -> str:
@@ -133,15 +170,24 @@ class Run(ImageRun):
 def read_image(
     frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
 ) -> GreyImage:
-    """The grey image (H, W) of a frame; 16 bits become 8 (see `detect.sources.interface`).
+    """The grey image (H, W) of a frame, of 8 bits (see `detect.sources.interface`).
 
     Paths are relative to `working_folder`, by default the process's own. FrameError if there is no
-    image, it cannot be read, or has another size than the camera.
+    image, it cannot be read, or has another size than the camera or values beyond the bit depth.
     """
+    stored = stored_image(frame, camera, working_folder)
+    return eight_bits(stored, frame.image or frame.step.prefix, frame.bit_depth)
+
+
+def stored_image(
+    frame: RunFrame, camera: Camera | None, working_folder: Path | None = None
+) -> NDArray[Any]:
+    """The grey values (H, W) of a frame, of 8 or 16 bits; parameters and errors as `read_image`."""
     name: object = frame.image or frame.step.prefix
     size = None if camera is None else (camera.width, camera.height)
     if frame.failure is not None:
         raise FrameError(frame.failure)
+    image: NDArray[Any]
     if isinstance(frame.content, np.ndarray):
         image = frame.content
     elif frame.content is not None:
@@ -156,8 +202,8 @@ def read_image(
     return image
 
 
-def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> GreyImage:
-    """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) uint8 grey values.
+def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Decode a JPEG, PNG, PNM, BMP or TIFF file's content to (H, W) grey values, uint8 or uint16.
 
     An image with another width and height than `size` is not decoded. Raises FrameError, with
     `name` for the image, if the content is not an image, or is truncated.
@@ -172,8 +218,8 @@ def decode_gray(content: bytes, name: object, size: tuple[int, int] | None = Non
     return gray_of_pixels(decoded_image(content, name, FrameError), name)
 
 
-def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
-    """Convert pixels to (H, W) uint8 grey values, contiguous and writable.
+def gray_of_pixels(pixels: NDArray[Any], name: object) -> NDArray[Any]:
+    """Convert pixels to (H, W) grey values of as many bits, contiguous and writable.
 
     From (H, W) or (H, W, 1) grey values, or (H, W, 3 or 4) blue, green, red and perhaps opacity, of
     8 or 16 bits, any byte order and strides; else FrameError, `name` as in `decode_gray`.
@@ -196,11 +242,48 @@ def gray_of_pixels(pixels: NDArray[Any], name: object) -> GreyImage:
         gray = np.asarray(cv2.cvtColor(gray, code), dtype)
     elif gray.ndim == 3:
         gray = gray[:, :, 0]
-    if dtype == np.uint8:
-        return gray
-    few = _BRIGHTEST * gray.size
-    bits = next(bits for bits in _BIT_DEPTHS if np.count_nonzero(gray >> bits) <= few)
-    return np.asarray(np.minimum(gray >> (bits - 8), 255), np.uint8)
+    return gray
+
+
+def eight_bits(stored: NDArray[Any], name: object, bit_depth: int | None = None) -> GreyImage:
+    """The 8 highest bits of grey values (H, W), by default of the lowest bit depth that holds them.
+
+    Raises FrameError, with `name` for the image, if a given one does not.
+    """
+    if stored.dtype == np.uint8:
+        return stored
+    bits = bit_depth or bits_needed(stored)
+    if not _holds(bits, stored):
+        raise FrameError(
+            f"{name}: values of {bits_needed(stored)} bits: expected {bits}, as in the images by "
+            f"which the run's bit depth was found, or as stated: --bit-depth {bits_needed(stored)}"
+        )
+    return np.asarray(np.minimum(stored >> (bits - 8), 255), np.uint8)
+
+
+def bit_depth_of(frames: Frames, camera: Camera | None) -> int | None:
+    """The bit depth of images whose values are stored in 16 bits, by some of them.
+
+    None if the first that can be read has 8 bits; if later ones have more, each has its own depth.
+    """
+    depth = None
+    for frame in spread_frames(frames, _DEPTH_IMAGES, _DEPTH_SPACING):
+        with suppress(FrameError):  # reported when the frame is processed
+            stored = stored_image(frame, camera)
+            if stored.dtype == np.uint16:
+                depth = max(depth or 0, bits_needed(stored))
+            elif depth is None:
+                return None
+    return depth
+
+
+def bits_needed(stored: NDArray[Any]) -> int:
+    """The lowest bit depth of cameras that holds grey values, apart from hot pixels."""
+    return next(bits for bits in _BIT_DEPTHS if _holds(bits, stored))
+
+
+def _holds(bits: int, stored: NDArray[Any]) -> bool:
+    return bool(np.count_nonzero(stored >> bits) <= _HOT_PIXELS * stored.size)
 
 
 def bounded_content(path: Path | str, name: object, size: tuple[int, int] | None) -> bytes:

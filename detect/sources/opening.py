@@ -11,15 +11,8 @@ from camera import Camera, read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
 from detect.sources.image_files import WILDCARDS, ImageFiles
-from detect.sources.interface import Frames, ImageRun, Run, Source
-from detect.sources.poses import (
-    FramesAlongPoses,
-    PoseStream,
-    SomeFrames,
-    tick_poses,
-    tum_poses,
-    velocity_poses,
-)
+from detect.sources.interface import Frames, ImageRun, Run, SomeFrames, Source, bit_depth_of
+from detect.sources.poses import FramesAlongPoses, PoseStream, tick_poses, tum_poses, velocity_poses
 from detect.sources.video import LiveCamera, VideoFile
 from redetect.landmarks import LandmarkError, read_steps
 from redetect.storage.image_headers import IMAGE_SUFFIXES
@@ -86,9 +79,14 @@ def open_source(
     else:
         frames, odometry = _frames(source, options)
         has_times = source.has_times
-    frames = SomeFrames(frames, options.frames) if options.frames else frames
+    bit_depth = options.bit_depth
+    if bit_depth is None and not isinstance(source, VideoFile | LiveCamera):  # these have 8 bits
+        # Errors in the poses are those of the run.
+        bit_depth = bit_depth_of(source if isinstance(frames, FramesAlongPoses) else frames, camera)
+    if options.frames or bit_depth:
+        frames = SomeFrames(frames, options.frames, bit_depth=bit_depth)
     base = source.output_base
-    run = ImageRun(base.parent, frames, odometry, base, has_times=has_times)
+    run = ImageRun(base.parent, frames, odometry, base, has_times=has_times, bit_depth=bit_depth)
     return run if camera is None else Run(**vars(run), camera=camera)
 
 

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -272,18 +271,3 @@ class FramesAlongPoses(Frames):
                 poses.jumped = poses.jumps
                 yield image
                 last = pose
-
-
-class SomeFrames(Frames):
-    """Every n-th of the first `count` frames of another source (0: of all)."""
-
-    def __init__(self, frames: Frames, count: int = 0, every: int = 1) -> None:
-        self._frames, self._count, self._every = frames, count, every
-        self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
-        known = [number for number in (frames.expected, count or None) if number is not None]
-        self.expected = -(-min(known) // every) if known else None
-
-    def __iter__(self) -> Generator[RunFrame, None, None]:
-        with closing(iter(self._frames)) as frames:
-            yield from islice(frames, 0, self._count or None, self._every)
-            self.left_out = self._frames.left_out

@@ -240,7 +240,7 @@ def detect(
     ----------
     image : (H, W) uint8, or path
         Grey values of the camera's size (an array, or a grey image of PIL or PyTorch), or an image
-        file.
+        file (16 bits become 8 by the fewest that hold its values; in `open`, by those of the run).
     camera : Camera, or path
         The calibrated camera, or its `.cam` file.
     radius_m : float, optional

@@ -18,7 +18,7 @@ from detect.errors import DetectError, FrameError
 from detect.row_files import circle_settings_of
 from detect.runs.stream import Journal
 from detect.sources.bag import pixels_of_message
-from detect.sources.interface import bounded_content, decode_gray, gray_of_pixels
+from detect.sources.interface import bounded_content, decode_gray, eight_bits, gray_of_pixels
 from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses, velocity_poses
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
@@ -55,7 +55,7 @@ def _header(path: Path) -> object:
 def _image(path: Path) -> object:
     """As frames are decoded."""
     content = bounded_content(path, path, _SIZE)
-    image = decode_gray(content, path, _SIZE)
+    image = eight_bits(decode_gray(content, path, _SIZE), path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image
@@ -98,7 +98,8 @@ class _Message:
 
 
 def _image_message(path: Path) -> object:
-    image = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path)
+    stored = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path)
+    image = eight_bits(stored, path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image

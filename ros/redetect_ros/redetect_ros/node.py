@@ -20,6 +20,7 @@ from rosidl_runtime_py.utilities import get_message
 from scipy.spatial.transform import Rotation
 
 import redetect as rd
+from detect.options import SourceOptions
 from detect.ros_messages import TOPICS, Values, header_of, ros_messages, transform_of
 from detect.settings_files import SettingsFile, read_settings
 from detect.sources.bag import content_of_message
@@ -34,6 +35,7 @@ PARAMETERS = {
     "radius_m": 0.0,
     "polarity": "",
     "image_transport": "raw",
+    "bit_depth": 0,
     "frame_prefix": "",
     "publish_tf": False,
 }
@@ -98,6 +100,7 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
             settings=settings.circles,
             line_settings=settings.lines,
         )
+        self._bit_depth = SourceOptions(bit_depth=given["bit_depth"] or None).bit_depth
         # Compiles the kernels and makes the tables before the first image arrives.
         self._detect(np.zeros((self._camera.height, self._camera.width), np.uint8))
         self._frame_prefix = given["frame_prefix"]
@@ -120,7 +123,8 @@ class Redetect(Node):  # type: ignore[misc]  # ROS comes without types
     def on_image(self, message: Any) -> None:
         """Process an image and publish the detections, with the image's time."""
         try:
-            frame = RunFrame(still("image"), None, content_of_message(message, "image"))
+            content = content_of_message(message, "image")
+            frame = RunFrame(still("image"), None, content, bit_depth=self._bit_depth)
             found = self._detect(read_image(frame, self._camera))
         except rd.Error as error:
             self.get_logger().warning(str(error), throttle_duration_sec=5.0)

@@ -16,8 +16,8 @@ from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bar
 from detect.projection import DiscProjection
 from detect.row_files import ImageRows, circle_settings_of
 from detect.settings import CircleSettings
+from detect.sources.interface import SomeFrames
 from detect.sources.opening import open_source
-from detect.sources.poses import SomeFrames
 from lut import ring
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, Step, circle_landmarks
 from redetect.landmarks.files import read_head

@@ -21,9 +21,8 @@ from detect.projection import DiscProjection
 from detect.report.figures import binned, rates_over, repeated, whitened
 from detect.report.page import gather, report_page
 from detect.row_files import ImageRows
-from detect.sources.interface import RunFrame
+from detect.sources.interface import RunFrame, SomeFrames
 from detect.sources.opening import open_source
-from detect.sources.poses import SomeFrames
 from redetect.landmarks import (
     CircleLandmark,
     Frame,

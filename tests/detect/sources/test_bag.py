@@ -21,7 +21,7 @@ from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.options import SourceOptions
 from detect.sources.bag import pixels_of_message
-from detect.sources.interface import gray_of_pixels, read_image
+from detect.sources.interface import eight_bits, gray_of_pixels, read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
 from redetect.landmarks.times import read_times
@@ -253,7 +253,7 @@ def test_encodings(
         padding = 4
     message = Ros().image(pixels, encoding, 1.0, padding=padding)
     found = pixels_of_message(message, "image")
-    gray = gray_of_pixels(found, "image")
+    gray = eight_bits(gray_of_pixels(found, "image"), "image")
     assert gray.dtype == np.uint8
     assert np.abs(gray.astype(int) - expected).max() <= (1 if encoding == "rgb16" else 0)
 
@@ -268,7 +268,7 @@ def test_bayer_patterns(pattern: str, deep: bool) -> None:
     if deep:
         mosaic <<= 8
     message = Ros().image(mosaic, f"bayer_{pattern}{16 if deep else 8}", 1.0)
-    gray = gray_of_pixels(pixels_of_message(message, "image"), "image")
+    gray = eight_bits(gray_of_pixels(pixels_of_message(message, "image"), "image"), "image")
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 50
     assert np.abs(gray[2:-2, 2:-2] - expected).max() <= 1.0
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.sources.interface import gray_of_pixels
+from detect.sources.interface import eight_bits, gray_of_pixels
 
 COLOURS = np.random.default_rng(3).integers(0, 256, (6, 8, 4)).astype(np.uint8)
 GRAY = COLOURS[:, :, 0]
@@ -44,7 +44,7 @@ def read_only(pixels: NDArray[Any]) -> NDArray[Any]:
 )
 def test_arrays_that_are_taken(pixels: NDArray[Any], expected: NDArray[np.uint8]) -> None:
     before = pixels.copy()
-    gray = gray_of_pixels(pixels, "image")
+    gray = eight_bits(gray_of_pixels(pixels, "image"), "image")
     np.testing.assert_array_equal(gray, expected)
     np.testing.assert_array_equal(pixels, before)
     assert gray.dtype == np.uint8
