@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from detect.sources.poses import PoseStream
 
 _BIT_DEPTHS = (8, 10, 12, 14, 16)  # of cameras
-#: Number of images by which a run's bit depth is found, and their largest spacing.
+#: Number of images by which a run's bit depth is found, and their largest spacing in a bag.
 _DEPTH_IMAGES = 32
 _DEPTH_SPACING = 20
 #: Largest share of values that a bit depth need not hold: hot pixels.
@@ -267,7 +267,9 @@ def bit_depth_of(frames: Frames, camera: Camera | None) -> int | None:
     None if the first that can be read has 8 bits; if later ones have more, each has its own depth.
     """
     depth = None
-    for frame in spread_frames(frames, _DEPTH_IMAGES, _DEPTH_SPACING):
+    # All messages of a bag before the last of these are read.
+    farthest = _DEPTH_SPACING if frames.ships_images else None
+    for frame in spread_frames(frames, _DEPTH_IMAGES, farthest):
         with suppress(FrameError):  # reported when the frame is processed
             stored = stored_image(frame, camera)
             if stored.dtype == np.uint16:

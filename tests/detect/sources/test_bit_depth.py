@@ -37,6 +37,14 @@ def test_dark_and_bright_images_have_one_scale(tmp_path: Path, dark_first: bool)
         np.testing.assert_array_equal(read_image(frame, None), ramp(each) >> 4)
 
 
+def test_images_of_all_of_a_long_run_are_considered(tmp_path: Path) -> None:
+    for number in range(64):
+        assert cv2.imwrite(
+            str(tmp_path / f"s.{number:04d}.png"), ramp(500 if number < 60 else 4000)
+        )
+    assert open_source(tmp_path).bit_depth == 12
+
+
 def test_messages_of_a_bag_have_one_scale(tmp_path: Path) -> None:
     ros, brightest = Ros(), (900, 4000)
     said = [
