@@ -1,4 +1,4 @@
-"""``camera calibrate``: pictures in; a .cam file, its report and its pictures out."""
+"""``camera board`` and ``calibrate``: a page to print; a .cam file from its pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from camera.boards.board import Board, board_of, charuco_of
+from camera.boards.board import Board, board_of, charuco_of, pdf_of, sheet_of_board, sheet_of_discs
 from camera.boards.points import corners_counted, find_board
 from camera.calibration.calibrate import (
     BoardView,
@@ -30,6 +30,7 @@ from camera.camfile import format_camera
 from camera.commands.floor import write_picture
 from camera.errors import CalibrationError
 from camera.model import Camera
+from camera.options import Board as BoardCommand
 from camera.options import Calibrate
 from camera.uncertainty import projection_sigma
 from redetect import __version__
@@ -47,7 +48,19 @@ _RIGHT = {
 _WHETHER = {"auto": None, "on": True, "off": False}
 
 
-def perform(options: Calibrate) -> int:
+def perform_board(command: BoardCommand) -> int:
+    """Execute the command; returns the exit code."""
+    demand_place(command.output, overwrite=command.force)
+    if command.board == "discs":
+        sheet = sheet_of_discs(command.circle_m, command.columns, command.rows)
+    else:
+        sheet = sheet_of_board(board_of(command))
+    write_bytes(command.output, pdf_of(sheet), overwrite=command.force)
+    print(f"written: {command.output}: {sheet.text}; print at 100 %, measure the bar")
+    return 0
+
+
+def perform_calibrate(options: Calibrate) -> int:
     """Execute the command; returns the exit code."""
     output = options.output
     kinds = ("residuals", "coverage")
