@@ -8,24 +8,22 @@ from __future__ import annotations
 from redetect.command_line import Program
 from redetect.groundtruth import options
 
-_COMMANDS = "redetect.groundtruth.commands"
-
 PROGRAM = Program(
     "groundtruth",
     "Where the robot really was: markers, lasers, clocks, and their fusion.\n\n"
     "Example: groundtruth poses images/m -o poses.csv",
     # In the order in which a session needs them.
     {
-        options.Rig: f"{_COMMANDS}.markers:perform_rig",
-        options.Network: f"{_COMMANDS}.markers:perform_network",
-        options.Poses: f"{_COMMANDS}.markers:perform_poses",
-        options.Score: f"{_COMMANDS}.validation:perform_score",
-        options.Lasers: f"{_COMMANDS}.lasers:perform_lasers",
-        options.Laser: f"{_COMMANDS}.lasers:perform_laser",
-        options.Sync: f"{_COMMANDS}.fusion:perform_sync",
-        options.Fuse: f"{_COMMANDS}.fusion:perform_fuse",
-        options.Validate: f"{_COMMANDS}.validation:perform_validate",
-        options.Report: f"{_COMMANDS}.validation:perform_report",
+        options.Rig: "redetect.groundtruth.commands.markers:perform_rig",
+        options.Network: "redetect.groundtruth.commands.markers:perform_network",
+        options.Poses: "redetect.groundtruth.commands.markers:perform_poses",
+        options.Score: "redetect.groundtruth.commands.validation:perform_score",
+        options.Lasers: "redetect.groundtruth.commands.lasers:perform_lasers",
+        options.Laser: "redetect.groundtruth.commands.lasers:perform_laser",
+        options.Sync: "redetect.groundtruth.commands.fusion:perform_sync",
+        options.Fuse: "redetect.groundtruth.commands.fusion:perform_fuse",
+        options.Validate: "redetect.groundtruth.commands.validation:perform_validate",
+        options.Report: "redetect.groundtruth.commands.validation:perform_report",
     },
 )
 
