@@ -13,12 +13,12 @@ PROGRAM = Program(
     "Print boards, calibrate a camera, estimate its pose, convert its calibration.\n\n"
     "Example: camera calibrate photographs --columns 9 --rows 6 --square-m 0.025 -o my.cam",
     {
-        Board: "camera.commands.board",
-        Calibrate: "camera.commands.calibrate",
-        Floor: "camera.commands.floor",
+        Board: "camera.commands.calibrate:perform_board",
+        Calibrate: "camera.commands.calibrate:perform_calibrate",
+        Floor: "camera.commands.floor:perform",
         # Needs detection, so the command is implemented in `detect`.
-        Level: "detect.commands.level",
-        Convert: "camera.commands.convert",
+        Level: "detect.commands.level:perform",
+        Convert: "camera.commands.convert:perform",
     },
 )
 

@@ -109,16 +109,17 @@ PROGRAM = DetectProgram(
     "Landmarks with covariances from a calibrated camera's images.\n\nExample: detect all images/e",
     {
         **dict.fromkeys(
-            (options.Circles, options.Lines, options.Markers, options.All), "detect.commands.run"
+            (options.Circles, options.Lines, options.Markers, options.All),
+            "detect.commands.run:perform",
         ),
-        options.Compare: "detect.commands.compare",
-        options.Export: "detect.commands.export",
-        options.Draw: "detect.commands.draw",
-        options.View: "detect.commands.view",
-        options.Report: "detect.commands.report",
-        options.Tune: "detect.commands.tune",
-        options.Explain: "detect.commands.explain",
-        options.Demo: "detect.commands.report",
+        options.Compare: "detect.commands.compare:perform",
+        options.Export: "detect.commands.export:perform",
+        options.Draw: "detect.commands.draw:perform",
+        options.View: "detect.commands.view:perform",
+        options.Report: "detect.commands.report:perform",
+        options.Tune: "detect.commands.tune:perform",
+        options.Explain: "detect.commands.explain:perform",
+        options.Demo: "detect.commands.report:perform",
     },
     EXPERT,
 )

@@ -1,6 +1,6 @@
 """The command line of a program: its commands, their errors and exit codes.
 
-Each command is executed by its own module; only what `--help` needs is imported at once. A
+Commands are executed by other modules; only what `--help` needs is imported at once. A
 command ends with its exit code and, in case of an error, one line on the terminal.
 """
 
@@ -16,12 +16,12 @@ from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_st
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from functools import reduce
-from importlib import import_module
 from inspect import cleandoc
 from io import StringIO
 from itertools import takewhile
 from operator import or_
 from pathlib import Path
+from pkgutil import resolve_name
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NoReturn, cast, get_type_hints
 
@@ -139,7 +139,7 @@ class Program:
     name: str
     description: str  # for its `--help`
     #: Dataclasses of flags, one for each command, whose name is that of the class in lower case,
-    #: and the module whose `perform` executes it.
+    #: and the function that executes it, as `module:function`.
     performed_by: Mapping[type, str]
     expert: Mapping[type, frozenset[str]] = field(default_factory=dict)
 
@@ -195,7 +195,7 @@ class Program:
 
     def carry_out(self, command: Any) -> int:
         """Execute a command; returns the exit code."""
-        code: int = import_module(self.performed_by[type(command)]).perform(command)
+        code: int = resolve_name(self.performed_by[type(command)])(command)
         return code
 
     def _brief(self, kind: type) -> type:

@@ -24,8 +24,7 @@ from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
-from redetect.landmarks.tilts import numbered_tilts
-from redetect.landmarks.times import read_times
+from redetect.landmarks.frames import numbered_tilts, read_times
 from redetect.messages import counted, imported_for
 from redetect.storage import demand_place, write_whole
 

@@ -23,7 +23,7 @@ from redetect import __version__
 from redetect.json_text import json_text
 from redetect.landmarks import format_head
 from redetect.landmarks.files import LEVELLED
-from redetect.landmarks.times import TIMES_HEAD
+from redetect.landmarks.frames import TIMES_HEAD
 
 #: The kind of the tilts that the second pass writes (`detect.runs.level_run`).
 RUN_TILT = "run tilt"

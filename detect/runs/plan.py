@@ -34,8 +34,8 @@ from redetect.landmarks import (
     read_rows,
     read_tilts,
 )
+from redetect.landmarks.frames import format_time
 from redetect.landmarks.map_file import read_map, read_path
-from redetect.landmarks.times import format_time
 from redetect.plane import rotation
 
 if TYPE_CHECKING:

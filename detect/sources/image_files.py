@@ -16,7 +16,7 @@ from pathlib import Path
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
-from redetect.landmarks.times import read_times
+from redetect.landmarks.frames import read_times
 from redetect.messages import excerpt
 from redetect.storage.bounded import leads_out, link_out
 from redetect.storage.image_headers import IMAGE_SUFFIXES

@@ -213,7 +213,3 @@ class Report:
     # The page to write; by default report.html in the session.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
     force: bool = False  # Replace an existing file.
-
-
-#: All commands, in the order in which a session needs them.
-COMMANDS = (Rig, Network, Poses, Score, Lasers, Laser, Sync, Fuse, Validate, Report)

@@ -16,16 +16,15 @@ from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.messages import excerpt, keywords_named, path_of
-from redetect.slam.distances import path_distance
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Associator, FilterRun
-from redetect.slam.filters.localizer import localize_run
-from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.run_map import MappedRun, map_run
+from redetect.slam.filters.base import FilterRun
+from redetect.slam.filters.localizer import localize_by_flags
+from redetect.slam.mapping.run_map import MappedRun, map_run_by_flags
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import camera_of_run, camera_xy_of, joined, read_runs
+from redetect.slam.recording import joined, read_runs
+from redetect.slam.scoring import path_distance
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
@@ -211,16 +210,7 @@ def map_landmarks(
     command = _checked(
         Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
     )
-    recording = joined(read_runs(command))
-    needs_camera = command.calibrate or len(recording.lines) > 0
-    mapped = map_run(
-        recording,
-        camera_of_run(command.run, command.camera) if needs_camera else None,
-        Weighting.of(command),
-        start=command.start,
-        solver=command.solver,
-        name=", ".join(map(str, command.runs)),
-    )
+    mapped = map_run_by_flags(command, joined(read_runs(command)))
     return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
 
 
@@ -262,16 +252,7 @@ def localize(
         places = landmarks.result.landmarks_jointly()
     else:
         places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
-    recording = joined(read_runs(command))
-    result = localize_run(
-        recording,
-        places,
-        Associator(command.association, command.gate_probability),
-        start=command.known_start,
-        start_sigma=command.start_sigma,
-        camera_xy=camera_xy_of(recording, command.run, command.camera),
-        names=(str(command.run), str(command.map)),
-    )
+    result = localize_by_flags(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
 
 

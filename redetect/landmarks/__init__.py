@@ -25,6 +25,12 @@ from redetect.landmarks.files import read_rows as read_rows
 from redetect.landmarks.files import read_steps as read_steps
 from redetect.landmarks.files import write_frames as write_frames
 from redetect.landmarks.files import write_rows as write_rows
+from redetect.landmarks.frames import FrameTilt as FrameTilt
+from redetect.landmarks.frames import format_no_tilt as format_no_tilt
+from redetect.landmarks.frames import format_outline_tilt as format_outline_tilt
+from redetect.landmarks.frames import format_tilt as format_tilt
+from redetect.landmarks.frames import read_tilts as read_tilts
+from redetect.landmarks.frames import tilt_as_written as tilt_as_written
 from redetect.landmarks.records import CircleLandmark as CircleLandmark
 from redetect.landmarks.records import Frame as Frame
 from redetect.landmarks.records import Landmark as Landmark
@@ -36,9 +42,3 @@ from redetect.landmarks.records import MarkerLandmark as MarkerLandmark
 from redetect.landmarks.records import Record as Record
 from redetect.landmarks.records import Row as Row
 from redetect.landmarks.records import Step as Step
-from redetect.landmarks.tilts import FrameTilt as FrameTilt
-from redetect.landmarks.tilts import format_no_tilt as format_no_tilt
-from redetect.landmarks.tilts import format_outline_tilt as format_outline_tilt
-from redetect.landmarks.tilts import format_tilt as format_tilt
-from redetect.landmarks.tilts import read_tilts as read_tilts
-from redetect.landmarks.tilts import tilt_as_written as tilt_as_written

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import astuple, fields
 from typing import Literal, NamedTuple
 
+from redetect.landmarks.frames import FrameTilt
 from redetect.landmarks.records import (
     MARKER_CORNERS,
     CircleLandmark,
@@ -17,7 +18,6 @@ from redetect.landmarks.records import (
     MarkerLandmark,
     Step,
 )
-from redetect.landmarks.tilts import FrameTilt
 
 Kind = Literal["text", "number", "whole number", "whole numbers"]
 TableName = Literal["steps", "circles", "lines", "markers", "tilts"]

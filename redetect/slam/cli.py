@@ -13,14 +13,14 @@ PROGRAM = Program(
     "Uses of landmarks: map, localisation, SLAM, association, noise.\n\n"
     "Example: slam map images/e --circles --lines -o /tmp/e-map",
     {
-        Map: "redetect.slam.commands.map",
-        Audit: "redetect.slam.commands.audit",
-        Localize: "redetect.slam.commands.filters",
-        Ekf: "redetect.slam.commands.filters",
-        Associate: "redetect.slam.commands.associate",
-        Noise: "redetect.slam.commands.noise",
-        Export: "redetect.slam.commands.export",
-        Import: "redetect.slam.commands.export",
+        Map: "redetect.slam.commands.map:perform",
+        Audit: "redetect.slam.commands.audit:perform",
+        Localize: "redetect.slam.commands.filters:perform",
+        Ekf: "redetect.slam.commands.filters:perform",
+        Associate: "redetect.slam.commands.associate:perform",
+        Noise: "redetect.slam.commands.conversion:perform_noise",
+        Export: "redetect.slam.commands.conversion:perform_export",
+        Import: "redetect.slam.commands.conversion:perform_import",
     },
 )
 

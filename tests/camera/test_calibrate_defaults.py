@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from camera.calibration.calibrate import BoardView, Calibration, aspect_of, calibrate_freely
-from camera.calibration.images import calibration_images
 from camera.calibration.model import CalibrationSettings
-from camera.commands.calibrate import true_board
+from camera.commands.calibrate import calibration_images, true_board
 from tests.camera.conftest import BOARD, CAMERA
 from tools.evaluation.boards import board_poses
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera import Camera, CameraError
 from camera.boards.board import Board
-from camera.calibration.images import calibration_images
+from camera.commands.calibrate import calibration_images
 from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError

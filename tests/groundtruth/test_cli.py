@@ -282,7 +282,7 @@ def test_a_network_from_corners(
 ) -> None:
     views = [(view, number) for number, shot in enumerate(shots(0.1, 8)) for view in shot]
     monkeypatch.setattr(
-        "redetect.groundtruth.commands.network.find_boards",
+        "redetect.groundtruth.commands.markers.find_boards",
         lambda image, *_: views[int(image.image.stem)][0],
     )
     folder = tmp_path / "boards"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from redetect.landmarks import LandmarkFileError
-from redetect.landmarks.times import read_times
+from redetect.landmarks.frames import read_times
 
 
 def test_times_are_read_by_prefix(tmp_path: Path) -> None:

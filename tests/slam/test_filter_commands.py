@@ -19,10 +19,10 @@ from redetect.landmarks.map_file import (
 )
 from redetect.slam.cli import main
 from redetect.slam.commands.filters import lost_lines
-from redetect.slam.distances import map_distance, path_distance
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import FilterRun, RowCount
 from redetect.slam.recording import LineRows, Recording
+from redetect.slam.scoring import map_distance, path_distance
 from tests.slam.ekf_rows import circle_rows
 
 STEP = "STEP a.{k} 0.0 -0.2 0.05 1e-4 0 1e-4 0 0 1e-5\n"

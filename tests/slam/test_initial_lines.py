@@ -11,9 +11,15 @@ from hypothesis import strategies as st
 
 from camera import Camera
 from redetect.least_squares.solver import LossKind
-from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
+from redetect.slam.mapping.graph import (
+    MOST_SIGMA_M,
+    Estimate,
+    graph_of_recording,
+    place_lines,
+    well_placed,
+    with_lines,
+)
 from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.initial_lines import MOST_SIGMA_M, place_lines, well_placed
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import LineRows

@@ -17,9 +17,8 @@ from redetect.landmarks import read_frames
 from redetect.plane import between, chain_steps
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import filtered_poses
-from redetect.slam.mapping.graph import first_sight, graph_of_recording
+from redetect.slam.mapping.graph import first_sight, graph_of_recording, place_lines
 from redetect.slam.mapping.graph_terms import PLACE_PRIOR_M, Weighting
-from redetect.slam.mapping.initial_lines import place_lines
 from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam

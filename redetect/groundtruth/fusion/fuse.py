@@ -43,9 +43,8 @@ _NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LONGEST_GAP_TO_LEARN_FROM_S = 20.0
 _LEARNING_ROUNDS = 2
-# Spacing of the measurements between which odometry predicts, number of rounds for the factor, and
-# significance level for too small variances.
-_SPACING_S = 2.0
+# Number of rounds for the factor of variances over seconds, and significance level for too small
+# ones.
 _LOOSENING_ROUNDS = 3
 _DOUBT = 0.001
 # Akaike's criterion: by chance, an estimate fits its own measurements better by this.
@@ -98,7 +97,7 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
     short = short.with_only(short.innovations(noise).accepted)
-    some = [part.thinned(_SPACING_S) for part in short.split(_LONGEST_GAP_TO_LEARN_FROM_S)]
+    some = [part.thinned() for part in short.split(_LONGEST_GAP_TO_LEARN_FROM_S)]
     numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
         return 1.0
@@ -122,7 +121,7 @@ def useful_terms(
     poses do not confirm, a spurious scale of turns results (regression dilution). Over seconds, and
     over gaps, such an estimate makes predictions worse.
     """
-    thin = problem.thinned(_SPACING_S)
+    thin = problem.thinned()
     kept = deviations > 0.0
 
     def aic(terms: BoolArray) -> float:

@@ -136,30 +136,23 @@ def wrap(angle: float) -> float:
 
 
 @kernel()
-def _invert_3x3(m: FloatArray, inverse: FloatArray) -> float:
-    """Invert a symmetric 3x3 matrix by cofactors; returns its determinant."""
-    a, b, c = m[0, 0], m[0, 1], m[0, 2]
-    d, e, f = m[1, 1], m[1, 2], m[2, 2]
-    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * c00 + b * c01 + c * c02
-    scale = 1.0 / determinant
-    inverse[0, 0] = c00 * scale
-    inverse[0, 1] = inverse[1, 0] = c01 * scale
-    inverse[0, 2] = inverse[2, 0] = c02 * scale
-    inverse[1, 1] = (a * f - c * c) * scale
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
-    inverse[2, 2] = (a * d - b * b) * scale
-    return float(determinant)
-
-
-@kernel()
 def squared_innovation(
     innovation: FloatArray, s: FloatArray, s_inverse: FloatArray
 ) -> tuple[float, float]:
-    """Normalised square of an innovation with covariance `s`, whose inverse is filled in; and the
-    determinant of `s`.
+    """Normalised square of an innovation with covariance `s`, whose inverse, by cofactors, is
+    filled in; and the determinant of `s`.
     """
-    determinant = _invert_3x3(s, s_inverse)
+    a, b, c = s[0, 0], s[0, 1], s[0, 2]
+    d, e, f = s[1, 1], s[1, 2], s[2, 2]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    scale = 1.0 / determinant
+    s_inverse[0, 0] = c00 * scale
+    s_inverse[0, 1] = s_inverse[1, 0] = c01 * scale
+    s_inverse[0, 2] = s_inverse[2, 0] = c02 * scale
+    s_inverse[1, 1] = (a * f - c * c) * scale
+    s_inverse[1, 2] = s_inverse[2, 1] = (b * c - a * e) * scale
+    s_inverse[2, 2] = (a * d - b * b) * scale
     squared = 0.0
     for i in range(POSE):
         for j in range(POSE):

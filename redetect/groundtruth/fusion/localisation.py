@@ -21,7 +21,8 @@ from scipy.optimize import minimize
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion.kernels import POSE
-from redetect.groundtruth.fusion.movement import UNMEASURED_S, MovementProblem
+from redetect.groundtruth.fusion.movement import MovementProblem
+from redetect.groundtruth.fusion.slips import UNMEASURED_S
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     interpolate_poses,
@@ -31,9 +32,8 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.landmarks import wrap_angle
 
-# Both models of odometry are compared on measurements this far apart, if there are enough, and only
-# if a longer gap has to be bridged.
-_SPACING_S = 2.0
+# Both models of odometry are compared on thinned measurements, if there are enough, and only if a
+# longer gap has to be bridged.
 _FEWEST = 10
 _LEAST_EXTENT_M = 0.01
 _LEAST_GAP_S = 20.0
@@ -73,7 +73,7 @@ def as_localisation(
     # A gyroscope, whose headings come without positions, is no localisation.
     if np.max(np.ptp(odometry.poses[:, :2], axis=0)) < _LEAST_EXTENT_M:
         return None
-    thin = problem.thinned(_SPACING_S)
+    thin = problem.thinned()
     if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
         return None
     own, _ = interpolate_poses(odometry, thin.measured_s)

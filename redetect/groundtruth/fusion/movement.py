@@ -21,7 +21,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion import inputs, kernels
-from redetect.groundtruth.fusion.slips import slip_variances
+from redetect.groundtruth.fusion.slips import UNMEASURED_S, slip_variances
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -29,8 +29,8 @@ from redetect.groundtruth.trajectories.streams import (
     pose_differences,
 )
 
-#: Least duration of a gap without measurements; rejections after a gap are attributed to it.
-UNMEASURED_S = 1.0
+# Predictions of odometry over seconds are between measurements this far apart, or farther.
+_SPACING_S = 2.0
 _TURN_PER_METRE = 4
 # The filter restarts after this number of consecutive rejections, with these variances.
 _RESTART_AFTER = 40
@@ -143,11 +143,11 @@ class MovementProblem:
         """
         return self.forward(self._variances(noise), systematic=systematic)
 
-    def thinned(self, spacing_s: float) -> MovementProblem:
-        """The problem with measurements at least this far apart."""
+    def thinned(self) -> MovementProblem:
+        """The problem with measurements two seconds apart, or farther."""
         kept, last = np.zeros(len(self.streams), dtype=np.bool_), -np.inf
         for i, time in enumerate(self.measured_s):
-            if time - last >= spacing_s:
+            if time - last >= _SPACING_S:
                 kept[i] = True
                 last = time
         return self.with_only(kept)
@@ -178,7 +178,7 @@ class MovementProblem:
         after = np.flatnonzero(np.diff(self.measured_s) > UNMEASURED_S)
         for begin, end in zip(nodes[after], nodes[after + 1]):
             variances[begin + 1 : end + 1] *= looser_in_gaps
-        slips = slip_variances(self, variances, UNMEASURED_S)
+        slips = slip_variances(self, variances)
         variances += slips
         history = kernels.empty_history(len(self.times_s))
         cuts = np.zeros(len(self.times_s), dtype=np.bool_)

@@ -20,6 +20,8 @@ from redetect.groundtruth.fusion.kernels import AFTER_REJECTIONS, Innovations
 if TYPE_CHECKING:
     from redetect.groundtruth.fusion.movement import MovementProblem
 
+#: Least duration of a gap without measurements; rejections after a gap are attributed to it.
+UNMEASURED_S = 1.0
 # Least number of consecutive rejections, and the same at the end of a segment, where it is not
 # known whether the measurements would have returned.
 _LEAST_RUN, _LEAST_LAST_RUN = 10, 20
@@ -34,12 +36,10 @@ _LEAST_GAIN = 0.8
 _ROUNDS = 12
 
 
-def slip_variances(
-    problem: MovementProblem, variances: FloatArray, longest_gap_s: float
-) -> FloatArray:
+def slip_variances(problem: MovementProblem, variances: FloatArray) -> FloatArray:
     """(N, 3) by how much variances (N, 3) of movements to nodes are too small for slips.
 
-    Rejections that begin after a gap longer than `longest_gap_s` are no sign of slips.
+    Rejections that begin after a gap without measurements are no sign of slips.
     """
     slips = np.zeros_like(variances)
     nodes, times_s, gate = problem.measured.nodes, problem.measured_s, problem.gate()
@@ -50,8 +50,8 @@ def slip_variances(
             (begin, end)
             for begin, end in _runs(found, nodes)
             if begin not in hopeless
-            and times_s[begin] - times_s[begin - 1] <= longest_gap_s
-            and _is_slip(found, times_s, (begin, end), gate, longest_gap_s)
+            and times_s[begin] - times_s[begin - 1] <= UNMEASURED_S
+            and _is_slip(found, times_s, (begin, end), gate)
         ]
         if not runs:
             break
@@ -118,12 +118,10 @@ def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
     return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]
 
 
-def _is_slip(
-    found: Innovations, times_s: FloatArray, run: tuple[int, int], gate: float, longest_gap_s: float
-) -> bool:
+def _is_slip(found: Innovations, times_s: FloatArray, run: tuple[int, int], gate: float) -> bool:
     """Whether the measurements after a run of rejections do not return to the predicted path."""
     begin, end = run
-    if end == len(times_s) or times_s[end] - times_s[end - 1] > longest_gap_s:
+    if end == len(times_s) or times_s[end] - times_s[end - 1] > UNMEASURED_S:
         return end - begin >= _LEAST_LAST_RUN
     # Where the filter restarted, the last measurement of the run is accepted.
     return bool(found.accepted[end - 1] or found.squared[end] > _NO_RETURN * gate)

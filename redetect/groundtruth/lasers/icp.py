@@ -15,6 +15,8 @@ A. Censi, "An ICP variant using a point-to-line metric", ICRA 2008.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,19 +42,16 @@ def best_share(squared: FloatArray, gate_m: float, kept: float) -> BoolArray:
     return within
 
 
+@dataclass(frozen=True, eq=False)
 class Scan:
-    """Points of a scan in the order of the beams, and the lines through them.
+    """Points of a scan in the order of the beams, and the lines through them."""
 
-    Attributes
-    ----------
-    points : (n, 2) float64
-    normals : (n, 2) float64
-        Of the lines; zeros if there is none.
-    """
+    points: FloatArray  # (n, 2)
+    normals: FloatArray  # (n, 2): of the lines; zeros if there is none
 
-    def __init__(self, points: FloatArray, normals: FloatArray) -> None:
-        self.points, self.normals = points, normals
-        self._tree = cKDTree(points)
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self.points)
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, IntArray]:
         """Squared distances to the nearest of the scan's points, and their indices."""

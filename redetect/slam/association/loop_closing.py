@@ -29,9 +29,8 @@ from redetect.slam.association.loops import (
     shared_landmarks,
     sightings,
 )
-from redetect.slam.mapping.graph import Estimate, graph_of_recording, with_lines
+from redetect.slam.mapping.graph import Estimate, graph_of_recording, meeting_points, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
-from redetect.slam.mapping.initial_lines import meeting_points
 from redetect.slam.mapping.solve import solve
 from redetect.slam.recording import Recording
 

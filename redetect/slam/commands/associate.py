@@ -16,12 +16,12 @@ from redetect.array_types import IntArray
 from redetect.bounds import NOT_NEGATIVE, demand, whole
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.slam.association.run import associate_run
-from redetect.slam.association.score import Scores, score_run
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
 from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
+from redetect.slam.scoring import Scores, score_run
 from redetect.storage import demand_free
 
 

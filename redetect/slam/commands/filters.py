@@ -13,14 +13,14 @@ from redetect import __version__
 from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.slam.commands import files
-from redetect.slam.distances import map_distance, path_distance
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
-from redetect.slam.filters.localizer import localize_run
+from redetect.slam.filters.localizer import localize_by_flags
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import draw_errors, draw_map
 from redetect.slam.recording import Recording, camera_xy_of
+from redetect.slam.scoring import map_distance, path_distance
 from redetect.storage import demand_free, write_bytes
 
 ERROR_PICTURE = "errors.png"
@@ -101,15 +101,7 @@ def _localized(command: Localize, recording: Recording) -> _Result:
         if landmark_map.joint_covariance is None:
             name = map_file.covariance_file(command.map).name
             said.append(f"errors of the map are assumed independent: no {name}")
-    run = localize_run(
-        recording,
-        landmark_map,
-        Associator(command.association, command.gate_probability),
-        start=command.known_start,
-        start_sigma=command.start_sigma,
-        camera_xy=camera_xy_of(recording, command.run, command.camera),
-        names=(str(command.run), str(command.map)),
-    )
+    run = localize_by_flags(command, recording, landmark_map)
     if (found := run.located) is not None:
         x, y, heading = found.pose
         print(

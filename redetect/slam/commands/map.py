@@ -17,13 +17,12 @@ from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping import run_map
-from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
-from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run, table_lines
+from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run_by_flags, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import camera_of_run, first_poses, joined
+from redetect.slam.recording import first_poses, joined
 from redetect.storage import demand_free, write_bytes
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
@@ -48,15 +47,7 @@ def perform(command: Map) -> int:
     recording = joined(runs)
     begin = time.perf_counter()
     demand_fields(command, SlamError)
-    needs_camera = command.calibrate or len(recording.lines) > 0
-    mapped = map_run(
-        recording,
-        camera_of_run(command.run, command.camera) if needs_camera else None,
-        Weighting.of(command),
-        start=command.start,
-        solver=command.solver,
-        name=", ".join(map(str, command.runs)),
-    )
+    mapped = map_run_by_flags(command, recording)
     seconds = time.perf_counter() - begin
 
     output.mkdir(parents=True, exist_ok=True)

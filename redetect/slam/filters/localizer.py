@@ -29,7 +29,8 @@ from redetect.slam.filters.base import (
     FrameRows,
     run_filter,
 )
-from redetect.slam.recording import NO_CAMERA, Recording
+from redetect.slam.options import Localize
+from redetect.slam.recording import NO_CAMERA, Recording, camera_xy_of
 
 
 class Localizer(Filter):
@@ -131,3 +132,18 @@ def localize_run(
             expected = "some near one, seen from the pose at --start"
         raise SlamError(f"{names[0]}: no row shows a landmark of {names[1]}: expected {expected}")
     return replace(run, located=found)
+
+
+def localize_by_flags(
+    flags: Localize, recording: Recording, landmark_map: LandmarkMap
+) -> FilterRun:
+    """`localize_run` as the flags of `slam localize` state."""
+    return localize_run(
+        recording,
+        landmark_map,
+        Associator(flags.association, flags.gate_probability),
+        start=flags.known_start,
+        start_sigma=flags.start_sigma,
+        camera_xy=camera_xy_of(recording, flags.run, flags.camera),
+        names=(str(flags.run), str(flags.map)),
+    )

@@ -1,6 +1,6 @@
 """The least-squares map of a run.
 
-`run_map` makes a map from rows: `graph` has the measurements and unknowns, `graph_terms` their
-whitened errors and Jacobians, `initial_lines` the initial lines, `solve` (or `solve_gtsam`) the
-minimum and its covariances. `audit` finds wrong identifiers.
+`run_map` makes a map from rows: `graph` has the measurements, unknowns and their first estimates,
+`graph_terms` whitened errors and Jacobians, `solve` (or `solve_gtsam`) the minimum and its
+covariances. `audit` finds wrong identifiers.
 """

@@ -21,13 +21,22 @@ from redetect.least_squares.solver import Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.ekf_slam import filtered_poses
-from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
+from redetect.slam.mapping.graph import (
+    Estimate,
+    Graph,
+    InitialLines,
+    first_sight,
+    graph_of_recording,
+    place_lines,
+    well_placed,
+    with_lines,
+)
 from redetect.slam.mapping.graph_terms import Weighting, errors
-from redetect.slam.mapping.initial_lines import InitialLines, place_lines, well_placed
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
-from redetect.slam.recording import Recording
+from redetect.slam.options import Map
+from redetect.slam.recording import Recording, camera_of_run
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
@@ -265,6 +274,19 @@ def map_run(
         cost=minima[-1].costs[-1],
         steps=sum(len(minimum.costs) - 1 for minimum in minima),
         mounting=mounting,
+    )
+
+
+def map_run_by_flags(flags: Map, recording: Recording) -> MappedRun:
+    """`map_run` as the flags of `slam map` state, of a run or several joined ones."""
+    needs_camera = flags.calibrate or len(recording.lines) > 0
+    return map_run(
+        recording,
+        camera_of_run(flags.run, flags.camera) if needs_camera else None,
+        Weighting.of(flags),
+        start=flags.start,
+        solver=flags.solver,
+        name=", ".join(map(str, flags.runs)),
     )
 
 

@@ -24,7 +24,7 @@ from detect.sources.bag import pixels_of_message
 from detect.sources.interface import eight_bits, gray_of_pixels, read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
-from redetect.landmarks.times import read_times
+from redetect.landmarks.frames import read_times
 from tests.detect.commands import Captured, rows_in
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 from tests.pictures import read_grey

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.commands.lasers import perform
+from redetect.groundtruth.commands.lasers import perform_lasers
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.alignment import STEPS, align_scanners
 from redetect.groundtruth.lasers.scanners import (
@@ -113,7 +113,7 @@ def test_a_scanner_measured_far_off_is_found_and_named(
     for one, empty in zip(scanners, empty_scans(scanners, 8)):
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
     write_building(tmp_path / "building.csv", ROOM)
-    assert perform(Lasers(tmp_path)) == 0
+    assert perform_lasers(Lasers(tmp_path)) == 0
     content = json.loads((tmp_path / "aligned.json").read_text())
     assert content["far_off_measured"] == ["fixed2"]
     assert "fixed2: was measured wrong" in capsys.readouterr().err
@@ -248,9 +248,9 @@ def test_the_command(tmp_path: Path) -> None:
     for one, empty in zip(scanners, empty_scans(scanners, 8)):
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
     with pytest.raises(GroundTruthError, match="building"):
-        perform(Lasers(tmp_path))
+        perform_lasers(Lasers(tmp_path))
     write_building(tmp_path / "building.csv", ROOM)
-    assert perform(Lasers(tmp_path)) == 0
+    assert perform_lasers(Lasers(tmp_path)) == 0
     first = (tmp_path / "aligned.json").read_bytes(), (tmp_path / "aligned.png").read_bytes()
     found = read_scanners(tmp_path / "aligned.json")
     for one, exact in zip(found, scanners):
@@ -259,8 +259,8 @@ def test_the_command(tmp_path: Path) -> None:
     content = json.loads(first[0])
     assert list(content["steps"]) == list(STEPS)
     with pytest.raises(FileExistsError):
-        perform(Lasers(tmp_path))
-    assert perform(Lasers(tmp_path, force=True)) == 0
+        perform_lasers(Lasers(tmp_path))
+    assert perform_lasers(Lasers(tmp_path, force=True)) == 0
     again = (tmp_path / "aligned.json").read_bytes(), (tmp_path / "aligned.png").read_bytes()
     assert first == again
 
@@ -297,10 +297,10 @@ def test_a_drawing_that_is_centimetres_off_is_noticed(
     for one, empty in zip(scanners, empty_scans(scanners, 8)):
         write_scans(tmp_path / "empty" / f"{one.name}.scans.npz", empty, overwrite=True)
     write_building(tmp_path / "building.csv", drawn)
-    assert perform(Lasers(tmp_path)) == 0
+    assert perform_lasers(Lasers(tmp_path)) == 0
     assert "the walls are off the map by some" in capsys.readouterr().err
     write_building(tmp_path / "building.csv", 1000.0 * ROOM, overwrite=True)
-    assert perform(Lasers(tmp_path, output=tmp_path / "other.json")) == 0
+    assert perform_lasers(Lasers(tmp_path, output=tmp_path / "other.json")) == 0
     assert "of its readings lie on walls of" in capsys.readouterr().err
     path = tmp_path / "aligned.json"
     joint_read = read_joint_covariance(path, read_scanners(path))

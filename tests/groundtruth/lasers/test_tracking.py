@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.commands.laser import perform
+from redetect.groundtruth.commands.lasers import perform_laser
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     ScanSets,
@@ -407,11 +407,11 @@ def test_the_command_writes_the_same_bytes_again(
 ) -> None:
     scans = record(scanners, circle, (0.0, 1.5), FRONTED, 15)
     write_session(tmp_path, scanners, scans, FRONTED)
-    assert perform(Laser(tmp_path)) == 0
+    assert perform_laser(Laser(tmp_path)) == 0
     first = {e: (tmp_path / f"laser.{e}").read_bytes() for e in ("csv", "jsonl", "json")}
     with pytest.raises(FileExistsError):
-        perform(Laser(tmp_path))
-    assert perform(Laser(tmp_path, force=True)) == 0
+        perform_laser(Laser(tmp_path))
+    assert perform_laser(Laser(tmp_path, force=True)) == 0
     assert first == {e: (tmp_path / f"laser.{e}").read_bytes() for e in first}
     poses = read_planar_poses(tmp_path / "laser.csv")
     assert poses.covariances is not None
@@ -431,7 +431,7 @@ def test_a_session_without_the_robot_gives_no_pose(
 ) -> None:
     scans = record(scanners, lambda t: None, (0.0, 0.4), FRONTED, 16)
     write_session(tmp_path, scanners, scans, FRONTED)
-    assert perform(Laser(tmp_path)) == 1
+    assert perform_laser(Laser(tmp_path)) == 1
 
 
 def test_settings_are_checked() -> None:

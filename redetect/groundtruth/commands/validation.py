@@ -1,4 +1,4 @@
-"""The command ``groundtruth validate``: distances and scans in, table, poses and plots out."""
+"""The commands ``groundtruth score``, ``validate`` and ``report``: how good poses are."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from redetect import __version__
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
@@ -19,9 +20,17 @@ from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
 from redetect.groundtruth.lasers.scanners import find_scans, read_robot, read_scans
-from redetect.groundtruth.options import Validate
+from redetect.groundtruth.options import Report, Score, Validate
+from redetect.groundtruth.report.inputs import gather
+from redetect.groundtruth.report.page import report_page
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
-from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
+from redetect.groundtruth.trajectories.streams import (
+    matched_streams,
+    moved_poses,
+    planar_alignment,
+    read_planar_poses,
+    write_planar_poses,
+)
 from redetect.groundtruth.validation import onboard, reference_poses, scoring
 from redetect.storage import write_bytes
 
@@ -29,7 +38,44 @@ from redetect.storage import write_bytes
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.json")
 
 
-def perform(options: Validate) -> int:
+def perform_score(command: Score) -> int:
+    """Carry out ``groundtruth score``; returns the exit code."""
+    check_outputs((command.json,), command.force)
+    solution, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
+    relations = None if command.relations is None else scoring.read_relations(command.relations)
+    poses, truth, unmatched = matched_streams(
+        solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
+    )
+    alignment = planar_alignment(poses, truth) if command.align else None
+    if alignment is not None:
+        poses = moved_poses(poses, alignment)
+    score = scoring.score_poses(poses, truth, unmatched)
+    print(f"poses              {score.poses} ({score.unmatched} without the other at their time)")
+    print(*score.lines(), sep="\n")
+    relative = {}
+    if relations is not None:
+        relative["relations"] = scoring.score_relations(solution, relations, command.largest_gap_s)
+    if command.rpe_step is not None:
+        steps = scoring.score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
+        relative[f"steps of {command.rpe_step}"] = steps
+    for name, figures in relative.items():
+        print(
+            f"relative error, {name}: {figures.pairs} pairs ({figures.unmatched} left out), "
+            f"rmse {1e3 * figures.position_rmse_m:.2f} mm, median "
+            f"{1e3 * figures.position_median_m:.2f}, max {1e3 * figures.position_max_m:.2f}; "
+            f"rmse {math.degrees(figures.angle_rmse_rad):.3f} deg"
+        )
+    if command.json is not None:
+        values: dict[str, Any] = asdict(score)
+        if alignment is not None:
+            values["alignment"] = alignment.tolist()
+        if relative:
+            values["relative"] = {name: asdict(figures) for name, figures in relative.items()}
+        write_json(command.json, values, overwrite=command.force)
+    return 0
+
+
+def perform_validate(options: Validate) -> int:
     """Execute the command; returns the exit code: 1 without a reference pose to compare with."""
     session, folder = options.session, options.output
     outputs = {name: folder / name for name in OUTPUTS}
@@ -203,3 +249,17 @@ def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     if not on_board:
         warn("no scans of a scanner on board: using distances only")
     return on_board, files
+
+
+def perform_report(options: Report) -> int:
+    """Execute the command; returns the exit code."""
+    output = options.output or options.session / "report.html"
+    check_outputs([output], options.force)
+    inputs = gather(options.session, options.truth)
+    page = report_page(inputs, __version__)
+    write_bytes(output, page, overwrite=options.force)
+    for problem in inputs.problems:
+        warn(problem)
+    shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]
+    print(f"{output}: {', '.join(shown) or 'no poses'}; {len(inputs.missing)} missing files")
+    return 0

@@ -1,6 +1,6 @@
-"""Tilt files: pitch and roll of each frame, from the building's verticals.
+"""Files with a row per frame: its tilt, from the building's verticals, or its time.
 
-One row per frame, ``#`` comments and blank lines skipped:
+Tilt files; ``#`` comments and blank lines are skipped:
 
     TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>
     NOTILT <image> <lines>
@@ -10,6 +10,8 @@ Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robo
 that levels measured directions; its covariance and the number of verticals that agree with it
 follow. A frame with too few of them has a NOTILT row. A TILT_D row after either is the same
 frame's tilt from the outlines of discs; readers of tilts skip it.
+
+Files of times have a row ``<image> <seconds>`` for each frame, with ``#`` comments.
 """
 
 from __future__ import annotations
@@ -23,6 +25,9 @@ from redetect.bounds import number_in, whole_number_in
 from redetect.landmarks.files import decode, opened, rows_of_words
 from redetect.landmarks.records import LandmarkFileError
 from redetect.messages import excerpt
+
+#: The first line of written files.
+TIMES_HEAD = "Times of the frames: <image> <seconds>, as their source gives them."
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,3 +116,32 @@ def _tilt(words: list[str], name: str, line: int) -> FrameTilt:
     if not (cpp > 0.0 and crr > 0.0 and cpp * crr > cpr * cpr):
         raise LandmarkFileError(name, line, "the tilt's covariance is not positive definite")
     return FrameTilt(words[1], pitch, roll, cpp, cpr, crr, lines)
+
+
+def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
+    """The times of images (s) by prefix; rows are separated by blanks or a comma.
+
+    Raises LandmarkFileError if the file cannot be read, a row is malformed or an image has two.
+    """
+    times: dict[str, float] = {}
+    with opened(path, "file of times") as stream:
+        for row, _, line in rows_of_words(stream, os.fspath(path)):
+            words = decode(b" ".join(row)).replace(",", " ").split()
+            if not words:
+                continue
+            try:
+                prefix, seconds = words[0], number_in(words[1])
+            except (IndexError, ValueError):
+                prefix, seconds = "", math.nan
+            if len(words) != 2 or not math.isfinite(seconds):
+                found = f"{excerpt(' '.join(words))}: expected an image's prefix and seconds"
+                raise LandmarkFileError(path, line, found)
+            if prefix in times:
+                raise LandmarkFileError(path, line, f"{excerpt(prefix)} is listed a second time")
+            times[prefix] = seconds
+    return times
+
+
+def format_time(prefix: str, time_s: float) -> str:
+    """The row of an image, without line end."""
+    return f"{prefix} {time_s:.6f}"

@@ -1,17 +1,18 @@
-"""``slam export`` and ``slam import``: runs in the formats of other tools, and back."""
+"""``slam noise``, ``export`` and ``import``: runs with noise, for other tools, and from them."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
-from redetect.landmarks import write_frames
+from redetect.landmarks import read_rows, write_frames, write_rows
 from redetect.landmarks.axes import MEANING
+from redetect.landmarks.frames import read_times
 from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path, write_table
-from redetect.landmarks.times import read_times
 from redetect.plane import chain_steps
 from redetect.slam.commands.files import recording_of
 from redetect.slam.errors import SlamError
@@ -19,17 +20,26 @@ from redetect.slam.formats import data_sets
 from redetect.slam.formats.g2o import graph_of_run, read_g2o, write_g2o
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.tum import read_tum, write_tum
-from redetect.slam.options import Export, Import
-from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs
+from redetect.slam.noise import noisy_rows
+from redetect.slam.options import Export, Import, Noise
+from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs, landmark_files
 from redetect.storage import demand_free
 
 
-def perform(command: Export | Import) -> int:
+def perform_noise(options: Noise) -> int:
     """Execute the command; returns the exit code."""
-    if isinstance(command, Import):
-        _import(command)
-    else:
-        {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to](command)
+    noise, lines = options.noise, options.lines
+    (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
+    target = options.output or source.with_name(f"noisy{source.suffix}")
+    rows = noisy_rows(read_rows(source), noise)
+    write_rows(target, rows, overwrite=options.force)
+    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
+    return 0
+
+
+def perform_export(command: Export) -> int:
+    """Execute the command; returns the exit code."""
+    {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to](command)
     return 0
 
 
@@ -99,7 +109,8 @@ def _export_tables(command: Export) -> None:
     print(f"{folder}: {', '.join(parts)}")
 
 
-def _import(command: Import) -> None:
+def perform_import(command: Import) -> int:
+    """Execute the command; returns the exit code."""
     if command.file.suffix in (".circles", ".lines", ".markers"):
         raise SlamError(
             f"{command.file}: is a landmark file: expected a .g2o graph or a trajectory; "
@@ -114,6 +125,7 @@ def _import(command: Import) -> None:
     else:
         graph = read_g2o(command.file)
         _write_path(command, Path2D(("start", *graph.recording.prefixes), graph.poses))
+    return 0
 
 
 def _import_data_set(command: Import) -> None:

@@ -1,17 +1,66 @@
-"""Scores labels found for a run's rows against the IDs in the file."""
+"""Results against references: paths and maps of the same run, and labels found for its rows."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from redetect.array_types import IntArray
+from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks.map_file import LandmarkMap, Path2D
 from redetect.slam.association.run import RunAssociation
+from redetect.slam.errors import SlamError
 from redetect.slam.recording import UNKNOWN_ID, Recording
+
+
+def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[str, float]:
+    """Distance of a path from another one of the same run in the same map, `reference` (N, 3).
+
+    Rms, median and largest distance of positions (m) and headings (rad), and those of the last
+    pose. Raises `SlamError`, beginning with `name`, if their numbers of poses differ.
+    """
+    other = np.asarray(reference, dtype=np.float64)
+    if len(other) != len(path.poses):
+        raise SlamError(f"{name}{len(other)} poses: expected {len(path.poses)}, as in this run")
+    position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
+    heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
+    return {
+        f"{name}_{figure}_{unit}": float(value)
+        for name, unit, distance in (("position", "m", position), ("heading", "rad", heading))
+        for figure, value in (
+            ("rms", math.sqrt(float(np.mean(distance**2)))),
+            ("median", np.median(distance)),
+            ("max", np.max(distance)),
+            ("last", distance[-1]),
+        )
+    }
+
+
+def map_distance(landmark_map: LandmarkMap, reference: LandmarkMap) -> dict[str, float]:
+    """Distance of landmarks from those of another map with the same identifiers."""
+    offsets, covariances = [], []
+    kinds = (landmark_map.discs, reference.discs), (landmark_map.lines, reference.lines)
+    for some, others in kinds:
+        _, own, other = np.intersect1d(some.ids, others.ids, return_indices=True)
+        offsets.append(some.xy[own] - others.xy[other])
+        covariances.append(some.covariance[own])
+    offset, covariance = np.concatenate(offsets), np.concatenate(covariances)
+    if not len(offset):
+        raise SlamError("no landmark is in both maps: expected some of the same identifiers")
+    distance = np.hypot(*offset.T)
+    return {
+        "landmarks": float(len(distance)),
+        "rms_m": math.sqrt(float(np.mean(distance**2))),
+        "median_m": float(np.median(distance)),
+        "max_m": float(np.max(distance)),
+        "normalised": float(np.mean(squared_mahalanobis(offset, covariance))) / 2.0,
+    }
 
 
 @dataclass(frozen=True)
