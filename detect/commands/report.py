@@ -1,14 +1,20 @@
-"""The commands ``detect report``, rows in and one HTML page out, and ``detect demo``."""
+"""The commands ``detect compare``, ``report`` and ``demo``: rows against reference rows."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+
+from rich.console import Console
 
 from detect.commands.run import perform as detect_run
 from detect.comparison.compare import compare_run
-from detect.options import All, Demo, Report, RowFiles
+from detect.comparison.report import comparison_tables
+from detect.comparison.result import DiscComparison
+from detect.options import All, Compare, Demo, Report, RowFiles
 from detect.report.page import gather, report_page
 from detect.sources.opening import demand_recording, open_source
+from redetect.command_line import EXIT_ERROR
 from redetect.messages import counted
 from redetect.storage import demand_free, demand_place, write_bytes
 
@@ -16,12 +22,36 @@ from redetect.storage import demand_free, demand_place, write_bytes
 DEMO_RUN = Path(__file__).resolve().parents[2] / "redetect" / "demo"
 
 
-def perform(command: Report | Demo) -> int:
-    """Execute the command; returns the exit code."""
-    return _demo(command) if isinstance(command, Demo) else _report(command)
+def compare(command: Compare) -> int:
+    """Compare rows with reference rows; returns the exit code."""
+    result = compare_run(
+        command.run,
+        "lines" if command.lines else "circles",
+        command.detected,
+        command.reference,
+        camera=command.camera,
+        options=command.matching,
+        unlisted=command.unlisted,
+    )
+    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.gate_m):
+        print("no calibration: positions are compared on the floor; give one by --camera")
+    Console().print(comparison_tables(result))
+    if command.json is not None:
+        write_bytes(command.json, result.to_json().encode(), overwrite=command.force)
+    code = 0
+    for name, value, least in (
+        ("recall", result.recall, command.min_recall),
+        ("precision", result.precision, command.min_precision),
+    ):
+        if least is not None and (value is None or value < least):
+            shown = "unknown" if value is None else f"{value:.4f}"
+            print(f"{name} is {shown}: expected at least {least:g}", file=sys.stderr)
+            code = EXIT_ERROR
+    return code
 
 
-def _report(options: Report) -> int:
+def report(options: Report) -> int:
+    """Write a page about a run; returns the exit code."""
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     output = run.output("html") if options.output is None else options.output
@@ -35,8 +65,8 @@ def _report(options: Report) -> int:
     return 0
 
 
-def _demo(command: Demo) -> int:
-    """Detect a small run, compare it with the truth, and write a page."""
+def demo(command: Demo) -> int:
+    """Detect a small run, compare it with the truth, write a page; returns the exit code."""
     run = command.run or DEMO_RUN
     page = command.output / "demo.html"
     demand_free([page], overwrite=command.force)
@@ -45,6 +75,6 @@ def _demo(command: Demo) -> int:
     if code != 0:
         return code
     result = compare_run(run, detected=command.output / "detected.circles")
-    _report(Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force))
+    report(Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force))
     print("", *result.sentences(), sep="\n")
     return 0
