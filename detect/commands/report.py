@@ -22,7 +22,7 @@ from redetect.storage import demand_free, demand_place, write_bytes
 DEMO_RUN = Path(__file__).resolve().parents[2] / "redetect" / "demo"
 
 
-def compare(command: Compare) -> int:
+def perform_compare(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     result = compare_run(
         command.run,
@@ -50,7 +50,7 @@ def compare(command: Compare) -> int:
     return code
 
 
-def report(options: Report) -> int:
+def perform_report(options: Report) -> int:
     """Write a page about a run; returns the exit code."""
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
@@ -65,7 +65,7 @@ def report(options: Report) -> int:
     return 0
 
 
-def demo(command: Demo) -> int:
+def perform_demo(command: Demo) -> int:
     """Detect a small run, compare it with the truth, write a page; returns the exit code."""
     run = command.run or DEMO_RUN
     page = command.output / "demo.html"
@@ -75,6 +75,8 @@ def demo(command: Demo) -> int:
     if code != 0:
         return code
     result = compare_run(run, detected=command.output / "detected.circles")
-    report(Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force))
+    perform_report(
+        Report(run=run, output=page, files=RowFiles(rows=command.output), force=command.force)
+    )
     print("", *result.sentences(), sep="\n")
     return 0
