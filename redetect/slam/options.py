@@ -229,7 +229,7 @@ class Import:
     range_sigma: float | None = None
     # Standard deviation of a data set's bearings (rad); by default 0.03 and 0.02.
     bearing_sigma: float | None = None
-    # Correct the odometry of a robot of the UTIAS data set, which consists of commands, by how much
-    # later, faster and farther it moves, as the landmarks show it.
+    # Correct what the UTIAS data set does not state: ranges are depths, and the robot moves later,
+    # faster and farther than its odometry, by as much as the landmarks show.
     calibrated: bool = True
     force: bool = False  # Replace an existing file.

@@ -92,6 +92,9 @@ def test_the_response_of_a_robot_to_its_commands_is_found(
     true = read_path(utias / "true.csv").poses
     raw, commanded = read_robot(utias / "Robot1_Odometry.dat", calibrated=False)
     assert commanded == (0.0, 1.0, 1.0)
+    distance, depth = (np.hypot(*run.circles.xy.T) for run in (recording, raw))
+    bearing = np.arctan2(raw.circles.xy[:, 0], -raw.circles.xy[:, 1])
+    np.testing.assert_allclose(distance * 1.033 * np.cos(bearing), depth)
     off = [
         np.abs(wrap_angle(chain_steps(run.steps, true[0])[:, 2] - true[:, 2])).max()
         for run in (recording, raw)
@@ -101,6 +104,17 @@ def test_the_response_of_a_robot_to_its_commands_is_found(
     target = str(utias / "calibrated.circles")
     assert main(["import", odometry, "-o", target]) == 0
     assert f"the robot moves {found.lag_s:.2f} s after its commands" in capsys.readouterr().out
+
+
+def test_a_robot_that_shows_nothing_of_its_response_has_the_usual_one(tmp_path: Path) -> None:
+    for name, rows in (
+        ("Robot1_Odometry", "4 0 0\n6 0 0\n"),
+        ("Robot1_Measurement", "5 100 1 0\n5.5 100 1 0\n"),
+        ("Barcodes", "6 100\n"),
+    ):
+        (tmp_path / f"{name}.dat").write_text(rows)
+    found = read_robot(tmp_path / "Robot1_Odometry.dat")[1]
+    np.testing.assert_allclose(found, (0.25, 1.0, 1.0), atol=1e-3)
 
 
 def test_sightings_at_about_the_same_time_have_the_same_error(utias: Path) -> None:
@@ -211,6 +225,11 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
             "Robot1_Measurement",
             "5 100 1 0\n6 100 -1 0\n",
             "Odometry.dat: range -1 at 6.000: expected above 0",
+        ),
+        (
+            "Robot1_Measurement",
+            "5 100 1 0\n6 100 1 3\n",
+            "Odometry.dat: bearing 3 at 6.000: expected within +-1.2, as seen by a camera",
         ),
         (
             "Robot1_Measurement",

@@ -46,13 +46,15 @@ _GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.5
 #: What the logs call range is the depth along the camera's axis, and too long by this factor: in
 #: logs of three robots, of data sets 6 and 7, compared with the true poses, by 1.02, 1.03 and 1.05.
 _DEPTH_SCALE = 1.033
+#: Largest bearing that a camera sees, radians.
+_WIDEST_RAD = 1.2
 #: Errors of these ranges, metres and as a share; for how long they are alike; errors of bearings.
 _USUAL_SIGMA_M, _USUAL_SHARE, _ALIKE_S, _USUAL_SIGMA_RAD = 0.03, 0.02, 5.0, 0.02
 #: Zeros between commands that last less than this are none, seconds.
 _SHORT_STOP_S = 0.1
-#: How a robot follows its commands: lags that are tried, seconds; longest time between two
-#: sightings of a landmark that show it, and their least number; prior of speeds and turns.
-_MOST_LAG_S, _LAG_STEP_S, _NEXT_SIGHTING_S, _LEAST_PAIRS, _SCALE_SIGMA = 1.0, 0.1, 1.0, 50, 0.1
+#: How a robot follows its commands: lags that are tried, and the longest time between two sightings
+#: of a landmark that show it, seconds.
+_LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
 _LATE_S = 0.08
 
@@ -139,8 +141,11 @@ class _Sightings(NamedTuple):
     ids: IntArray  # (n,): the landmark
 
 
-def _seen_by_robot(odometry: Path) -> _Sightings:
-    """The measurements beside a robot's odometry; sightings of other robots are ignored."""
+def _seen_by_robot(odometry: Path, *, calibrated: bool) -> _Sightings:
+    """The measurements beside a robot's odometry; sightings of other robots are ignored.
+
+    Calibrated ones have ranges instead of depths.
+    """
     seen = _table(_beside(odometry, MEASUREMENTS), "time barcode range bearing")
     barcodes = _table(odometry.with_name(BARCODES), "subject barcode")
     subject = {int(barcode): int(number) for number, barcode in barcodes}
@@ -152,8 +157,15 @@ def _seen_by_robot(odometry: Path) -> _Sightings:
         raise SlamError(f"{odometry}: expected a subject for each barcode")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
-    bearing_rad = seen[order, 3]
-    range_m = seen[order, 2] / (_DEPTH_SCALE * np.cos(bearing_rad))
+    range_m, bearing_rad = seen[order, 2], seen[order, 3]
+    if calibrated:
+        for k in np.flatnonzero(np.abs(bearing_rad) > _WIDEST_RAD)[:1]:
+            raise SlamError(
+                f"{odometry}: bearing {bearing_rad[k]:g} at {seen[order[k], 0]:.3f}: expected "
+                f"within +-{_WIDEST_RAD:g}, as seen by a camera; --no-calibrated takes ranges and "
+                "odometry as they are"
+            )
+        range_m = range_m / (_DEPTH_SCALE * np.cos(bearing_rad))
     return _Sightings(times, frame, range_m, bearing_rad, ids[order])
 
 
@@ -172,6 +184,10 @@ class Response(NamedTuple):
         )
 
 
+#: As found in logs of the data set, and how much it varies.
+_USUAL_RESPONSE, _RESPONSE_SIGMA = Response(0.25), (0.25, 0.1, 0.1)
+
+
 def read_robot(
     odometry: Path,
     sigma_m: float | None = None,
@@ -188,7 +204,8 @@ def read_robot(
         Standard deviations of independent ranges and bearings; by default, ranges have those of
         `_usual_sigma_m`.
     calibrated : bool
-        Whether steps are as the robot follows its commands (`response_of`), not as commanded.
+        Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
+        ranges are computed from the depths that the log has.
 
     Returns
     -------
@@ -200,7 +217,8 @@ def read_robot(
     SlamError
         If a file cannot be used.
     """
-    velocity, seen = _log(odometry, "time v omega"), _seen_by_robot(odometry)
+    velocity = _log(odometry, "time v omega")
+    seen = _seen_by_robot(odometry, calibrated=calibrated)
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     velocity = _without_short_stops(velocity)
     response = response_of(velocity, seen) if calibrated else Response()
@@ -216,7 +234,7 @@ def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
     """How a robot follows its commands, as the landmarks show it.
 
     From one sighting of a landmark to the next, range and bearing change as the robot moves. The
-    most likely response predicts these changes best. If there are few, it is as commanded.
+    most likely response predicts these changes best. What they do not show is as usual.
 
     Parameters
     ----------
@@ -230,8 +248,6 @@ def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
     apart_s = seen.times[seen.frame[after]] - seen.times[seen.frame[before]]
     pair = (seen.ids[before] == seen.ids[after]) & (apart_s > 0.0) & (apart_s < _NEXT_SIGHTING_S)
     before, after = before[pair], after[pair]
-    if len(before) < _LEAST_PAIRS:
-        return Response()
     bearing, range_m = seen.bearing_rad[before], seen.range_m[after]
     place = seen.range_m[before, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
 
@@ -243,14 +259,14 @@ def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
         return np.concatenate([
             wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / _USUAL_SIGMA_RAD,
             (np.hypot(x, y) - range_m) / np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * range_m),
-            (np.array([response.speed, response.turn]) - 1.0) / _SCALE_SIGMA,
+            np.subtract(response, _USUAL_RESPONSE) / _RESPONSE_SIGMA,
         ])  # fmt: skip
 
     def cost(lag_s: float) -> float:
         return float(np.sum(np.arctan(residuals(Response(lag_s)) ** 2)))
 
-    first = min(np.arange(-_MOST_LAG_S, _MOST_LAG_S, _LAG_STEP_S).tolist(), key=cost)
-    found = least_squares(residuals, Response(first), loss="arctan", diff_step=1e-3)
+    first = Response(min(_LAGS_S.tolist(), key=cost))
+    found = least_squares(residuals, first, loss="arctan", diff_step=1e-3)
     return Response(*found.x.tolist())
 
 
@@ -281,7 +297,8 @@ def _run(
 
 def read_truth(odometry: Path) -> tuple[Path2D, int]:
     """True poses at a robot's start and its frames; how many lie outside: these are the nearest."""
-    times, logged = _seen_by_robot(odometry).times, _log(odometry, "time v omega")
+    times = _seen_by_robot(odometry, calibrated=False).times
+    logged = _log(odometry, "time v omega")
     truth = _log(_beside(odometry, TRUTH), "time x y theta")
     _demand_together(odometry, logged[:, 0], _beside(odometry, MEASUREMENTS), times)
     _demand_together(odometry, times, _beside(odometry, TRUTH), truth[:, 0])
