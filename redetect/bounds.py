@@ -137,10 +137,11 @@ def demand_fields(settings: object, error: type[Exception]) -> None:
 def expectation(hint: Any) -> str:
     """Which values a setting or flag of some type may have, in words."""
     marks = getattr(hint, "__metadata__", ())
-    for mark in marks:
-        if isinstance(mark, Bounds):
-            return mark.expected
+    bounds = next((mark.expected for mark in marks if isinstance(mark, Bounds)), "")
     hint = hint.__origin__ if marks else hint
+    if bounds:
+        several = get_origin(hint) is tuple and ... not in get_args(hint)
+        return f"{len(get_args(hint))} numbers of {bounds}" if several else bounds
     kinds = get_args(hint)
     if get_origin(hint) is Literal:
         return f"one of {', '.join(map(str, kinds))}"

@@ -36,6 +36,8 @@ _FACTORS = {"same": 1.0, "halve": 0.5, "double": 2.0}
 
 # Grids of pixels: for the fit, and for the largest deviation.
 _FIT_GRID, _CHECK_GRID = (41, 31), (129, 97)
+# Largest share of pixels that the target need not see at the source's fold.
+_AT_FOLD = 0.02
 # Largest deviation after least squares above which a fuller model is tried.
 _NEAR_PX = 0.02
 
@@ -296,8 +298,8 @@ def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatAr
     share = area[seen].sum() / area.sum()
     if share < LEAST_SEEN_SHARE:
         raise ConversionError(
-            f"{100.0 * share:.0f} % of the image see anything, expected "
-            f"{100.0 * LEAST_SEEN_SHARE:.0f}: the distortion folds inside the image, or the lens "
+            f"only {100.0 * share:.0f} % of the image is seen: expected at least "
+            f"{100.0 * LEAST_SEEN_SHARE:.0f} %: the distortion folds inside the image, or the lens "
             "sees 90 degrees and more off its axis"
         )
     return pixels[seen], rays[seen]
@@ -306,8 +308,9 @@ def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatAr
 def _measured(camera: AnyCamera, check: tuple[FloatArray, FloatArray]) -> Converted:
     pixels, rays = check
     away = np.linalg.norm(camera.distort(rays) - pixels, axis=1)
+    unseen = ~np.isfinite(away)
     # If the source folds inside the image, the models differ in how close to the fold they see.
     folds = len(pixels) < np.prod(_CHECK_GRID)
-    away = np.where(np.isfinite(away), away, 0.0 if folds and np.isfinite(away).any() else np.inf)
+    away[unseen] = 0.0 if folds and np.mean(unseen) < _AT_FOLD else np.inf
     worst = int(np.argmax(away))
     return Converted(camera, float(away[worst]), (float(pixels[worst, 0]), float(pixels[worst, 1])))

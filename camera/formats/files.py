@@ -60,14 +60,14 @@ def format_of_text(path: Path, text: str) -> Format:
         return "cam"
     if path.suffix.lower() == ".txt":
         return "colmap"
-    if text.startswith("%YAML:") or "!!opencv-matrix" in text or text.lstrip().startswith("<"):
+    if "!!opencv-matrix" in text or text.lstrip().startswith("<"):
         return "opencv"
-    content = yaml_files.parse_yaml(text, str(path))
+    content, opencv = yaml_files.parse_yaml(text, str(path)), text.startswith("%YAML:")
     if yaml_files.kalibr_cameras(content):
         return "kalibr"
-    if "distortion_model" in content:
+    if "distortion_model" in content and not opencv:
         return "ros"
-    if "fisheye_model" in content or "image_width" in content:
+    if opencv or "fisheye_model" in content or "image_width" in content:
         return "opencv"
     raise ConversionError(
         f"{path}: neither a .cam file nor a camera in OpenCV's, ROS's, Kalibr's or COLMAP's format "

@@ -42,7 +42,9 @@ _LARGEST_SIDE_PX = 65536
 # Number of steps from the image's centre in which the inverse is found.
 _WALK = 24
 _NEWTON_STEPS = 20
-_ROUNDING_PX, _CONVERGED_PX, _NEAR_PX = 1e-12, 1e-7, 1.0
+_ROUNDING_PX, _CONVERGED_PX = 1e-12, 1e-7
+# Number of places between the centre and a pixel at which a fold would be noticed.
+_WAY = 96
 
 
 @dataclass(frozen=True)
@@ -110,24 +112,20 @@ class ForeignCamera:
         method, continued outwards from the centre to avoid branches past a fold.
         """
         centre = np.array([self.cx, self.cy])
-        xy, there = np.zeros_like(pixels), np.ones(len(pixels), np.bool_)
+        xy = np.zeros_like(pixels)
         with np.errstate(all="ignore"):
             for share in np.linspace(0.0, 1.0, _WALK + 1)[1:]:
                 target = centre + share * (pixels - centre)
-                last = share == 1.0
-                for _ in range(_NEWTON_STEPS if last else 2):
+                for _ in range(_NEWTON_STEPS):
                     seen = self._seen(xy)
-                    xy = (
-                        xy
-                        + (inverse_2x2(seen.by_place) @ (target - seen.pixels)[..., None])[..., 0]
-                    )
-                    if np.abs(target - seen.pixels).max() < _ROUNDING_PX:
+                    off = target - seen.pixels
+                    xy = xy + (inverse_2x2(seen.by_place) @ off[..., None])[..., 0]
+                    if not np.any(np.abs(off) >= _ROUNDING_PX):
                         break
-                seen = self._seen(xy)
-                off = np.abs(seen.pixels - target).max(axis=-1)
-                there &= (off < (_CONVERGED_PX if last else _NEAR_PX)) & (
-                    np.linalg.det(seen.by_place) > 0.0
-                )
+            there = np.abs(self._seen(xy).pixels - pixels).max(axis=-1) < _CONVERGED_PX
+            # A place beyond a fold may be seen at the same pixel, but there is a fold on the way.
+            for share in np.linspace(0.0, 1.0, _WAY + 1)[1:]:
+                there &= np.linalg.det(self._seen(share * xy).by_place) > 0.0
         return np.where(there[:, None], xy, np.nan)
 
     def _seen(self, normalised: FloatArray) -> Projected:

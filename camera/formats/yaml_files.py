@@ -7,6 +7,7 @@ YAML is read safely: plain values only, bounded, without aliases. OpenCV's own d
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -93,14 +94,16 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
 
 def _parse_xml(text: str, name: str) -> dict[str, Any]:
     """The values of an XML text of OpenCV's FileStorage."""
-    if "<!" in text:
-        raise ConversionError(f"{name}: XML with declarations or comments: expected plain values")
+    if re.search("<!(?!--)", text):
+        raise ConversionError(f"{name}: XML with declarations: expected plain values")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise ConversionError(f"{name}:{error.position[0]}: {error}: expected XML") from None
     content: dict[str, Any] = {}
     for element in root:
+        if element.tag in content:
+            raise ConversionError(f"{name}: {excerpt(element.tag)} twice: expected it once")
         data, value = element.findtext("data"), (element.text or "").strip()
         whole = value.isascii() and value.isdecimal() and len(value) < _LONGEST_LIST
         single = int(value) if whole else value

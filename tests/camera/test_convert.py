@@ -259,11 +259,30 @@ def test_a_fold_inside_the_image_is_kept(
     assert read_camera(tmp_path / "folded.cam").seen_share == found.camera.seen_share
 
 
+@given(st.floats(150.0, 500.0), st.floats(-0.6, 0.1), st.floats(-0.2, 0.3), st.floats(-0.1, 0.1))
+def test_pixels_before_the_fold_are_seen_and_none_beyond(
+    focal_px: float, k1: float, k2: float, k3: float
+) -> None:
+    lens = ForeignCamera(
+        "radtan", 640, 480, focal_px, focal_px, 320.0, 240.0, (k1, k2, 0.0, 0.0, k3)
+    )
+    radius = np.linspace(0.0, 4.0, 40_001)
+    seen_at = radius * (1.0 + k1 * radius**2 + k2 * radius**4 + k3 * radius**6)
+    rising = np.append(np.diff(seen_at) > 0.0, [False])
+    fold = int(np.argmin(rising))
+    u = np.linspace(320.0, 720.0, 81)
+    found = lens.undistort(np.stack([u, np.full(81, 240.0)], axis=1))[:, 0]
+    off = (u - 320.0) / focal_px
+    sure = np.abs(off - seen_at[fold]) > 1e-3
+    expected = np.interp(off, seen_at[: fold + 1], radius[: fold + 1], right=np.nan)
+    np.testing.assert_allclose(found[sure], expected[sure], atol=1e-4)
+
+
 def test_a_lens_that_sees_less_than_half_of_the_image_is_refused() -> None:
     folded = ForeignCamera(
         "radtan", 640, 480, 150.0, 150.0, 320.0, 240.0, (-0.6, 0.0, 0.0, 0.0, 0.0)
     )
-    with pytest.raises(ConversionError, match="of the image see anything, expected 50"):
+    with pytest.raises(ConversionError, match="% of the image is seen: expected at least 50 %"):
         convert_to_camera(folded)
 
 

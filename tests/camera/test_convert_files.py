@@ -37,7 +37,8 @@ def test_a_region_that_is_the_whole_image_is_none() -> None:
     ("name", "text", "message"),
     [
         ("a.xml", "<?xml version='1.0'?>", "a.xml:1: no element found"),
-        ("a.xml", "<opencv_storage><!-- 3 --></opencv_storage>", "XML with declarations"),
+        ("a.xml", "<!DOCTYPE a [<!ENTITY b '3'>]><a><M1>&b;</M1></a>", "XML with declarations"),
+        ("a.xml", "<a><M1>3</M1><M1>4</M1></a>", "'M1' twice: expected it once"),
         ("a.xml", "<opencv_storage><M1>3</M1></opencv_storage>", "lacks image_width"),
         ("a.yml", "%YAML:1.0\n---\nM1: 3\n", "lacks image_width: add the images' size"),
         ("a.yml", "%YAML:1.0\n---\nimage_Width: 3\n", "lacks image_height: add the images' size"),
@@ -70,13 +71,14 @@ def test_what_cannot_be_converted_names_its_file(
     source = tmp_path / "wide.yaml"
     source.write_text(format_kalibr(wide))
     assert main(["convert", str(source), str(tmp_path / "b.cam")]) == 1
-    assert f"error: {source}: 29 % of the image see anything" in capsys.readouterr().err
+    assert f"error: {source}: only 29 % of the image is seen" in capsys.readouterr().err
 
 
 def test_opencv_reads_and_writes_the_same_in_xml(tmp_path: Path) -> None:
     source = tmp_path / "out_camera_data.xml"
     storage = cv2.FileStorage(str(source), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Tue Apr 19 12:00:00 2016")
+    storage.writeComment("flags: +fix_aspectRatio")
     storage.write("image_width", RADTAN.width)
     storage.write("image_height", RADTAN.height)
     storage.write("camera_matrix", np.array(RADTAN.matrix).reshape(3, 3))
@@ -103,7 +105,7 @@ distortion_model: radial-tangential
 distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 """
     path = Path("sensor.yaml")
-    assert format_of_text(path, text) == "kalibr"
+    assert format_of_text(path, text) == format_of_text(path, f"%YAML:1.0{text}") == "kalibr"
     camera = parse(text, "kalibr", "sensor.yaml")
     assert isinstance(camera, ForeignCamera)
     assert camera.pinhole == (458.654, 457.296, 367.215, 248.375)

@@ -144,7 +144,8 @@ def _import_data_set(command: Import) -> None:
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
         run, response = data_sets.read_robot(file, **sigmas, calibrated=command.calibrated)
-        _write_run(command, run, f"measurements; {response.sentence()}")
+        told = [] if response is None else [response.sentence()]
+        _write_run(command, run, "measurements", *told)
     elif file.name == data_sets.DRIVE:
         _write_run(command, data_sets.read_drive(file, **sigmas), "measurements")
     else:
@@ -154,10 +155,14 @@ def _import_data_set(command: Import) -> None:
         )
 
 
-def _write_run(command: Import, run: Recording, what: str) -> None:
-    head, frames = _made_by(command.file), frames_of_discs(run)
-    write_frames(command.output, frames, head=head, overwrite=command.force)
-    print(f"{command.output}: {len(run)} steps, {len(run.circles)} {what}")
+def _write_run(command: Import, run: Recording, what: str, *told: str) -> None:
+    names = ("range_sigma", "bearing_sigma", "calibrated")
+    settings = ", ".join(f"{name}: {getattr(command, name)}" for name in names)
+    head = "\n".join(
+        [_made_by(command.file), *([settings] if what == "measurements" else []), *told]
+    )
+    write_frames(command.output, frames_of_discs(run), head=head, overwrite=command.force)
+    print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *told]))
 
 
 def _write_path(command: Import, path: Path2D, note: str = "") -> None:

@@ -50,11 +50,15 @@ _DEPTH_SCALE = 1.033
 _WIDEST_RAD = 1.2
 #: Errors of these ranges, metres and as a share; for how long they are alike; errors of bearings.
 _USUAL_SIGMA_M, _USUAL_SHARE, _ALIKE_S, _USUAL_SIGMA_RAD = 0.03, 0.02, 5.0, 0.02
-#: Zeros between commands that last less than this are none, seconds.
+#: The same without calibration.
+_RAW_SIGMA_M, _RAW_SIGMA_RAD = 0.1, 0.03
+#: Zeros between commands that last less than this are ignored, seconds.
 _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
 #: of a landmark that show it, seconds.
 _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
+#: Added to a response while it is estimated: steps of derivatives are relative to it.
+_FROM_0 = (1.0, 0.0, 0.0)
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
 _LATE_S = 0.08
 
@@ -62,6 +66,7 @@ _LATE_S = 0.08
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
 # The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
 _AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
+_MOST_STEERING_RAD = 1.2
 _BEAMS = 361
 _RANGES_CM = 1 << 13
 _FARTHEST_M = 75.0
@@ -109,15 +114,16 @@ class _Log(NamedTuple):
     def steps(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Movements (N, 3) between times (N + 1,).
 
-        Those in gaps of the log, or with a change of motion, are more uncertain than odometry is
-        assumed to be and have a covariance (N, 3, 3); others zero.
+        Those in gaps of the log, before and after it, or with a change of motion, are more
+        uncertain than odometry is assumed to be and have a covariance (N, 3, 3); others zero.
         """
         poses, (rows, since) = self.poses(times), self._held(times)
         steps = between(poses[:-1], poses[1:])
         interval = np.append(np.diff(self.times), math.inf)
         gap = interval > max(_GAP_INTERVALS * float(np.median(interval)), _LEAST_GAP_S)
         silence_s = np.concatenate([[0.0], np.cumsum(np.where(gap, interval, 0.0)[:-1])])
-        silent_s = np.diff(silence_s[rows] + since * gap[rows])[:, None]
+        early_s = np.minimum(times - self.times[0] + _LEAST_GAP_S, 0.0)
+        silent_s = np.diff(early_s + silence_s[rows] + since * gap[rows])[:, None]
         rates = self.along(np.arange(len(gap)), np.ones(len(gap)))
         late = self.late_s * np.diff(rates[rows], axis=0)
         more = silent_s**2 * np.var(rates, axis=0) + late**2
@@ -146,22 +152,25 @@ def _seen_by_robot(odometry: Path, *, calibrated: bool) -> _Sightings:
 
     Calibrated ones have ranges instead of depths.
     """
-    seen = _table(_beside(odometry, MEASUREMENTS), "time barcode range bearing")
-    barcodes = _table(odometry.with_name(BARCODES), "subject barcode")
+    measurements, listed = _beside(odometry, MEASUREMENTS), odometry.with_name(BARCODES)
+    seen = _table(measurements, "time barcode range bearing")
+    barcodes = _table(listed, "subject barcode")
     subject = {int(barcode): int(number) for number, barcode in barcodes}
     ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
     for k in np.flatnonzero(seen[:, 2] <= 0.0)[:1]:
-        raise SlamError(f"{odometry}: range {seen[k, 2]:g} at {seen[k, 0]:.3f}: expected above 0")
+        raise SlamError(
+            f"{measurements}: range {seen[k, 2]:g} at {seen[k, 0]:.3f}: expected above 0"
+        )
     if len(subject) < len(barcodes):
-        raise SlamError(f"{odometry}: expected a subject for each barcode")
+        raise SlamError(f"{listed}: expected a subject for each barcode")
     order = np.argsort(seen[:, 0], kind="stable")
     times, frame = np.unique(seen[order, 0], return_inverse=True)
     range_m, bearing_rad = seen[order, 2], seen[order, 3]
     if calibrated:
         for k in np.flatnonzero(np.abs(bearing_rad) > _WIDEST_RAD)[:1]:
             raise SlamError(
-                f"{odometry}: bearing {bearing_rad[k]:g} at {seen[order[k], 0]:.3f}: expected "
+                f"{measurements}: bearing {bearing_rad[k]:g} at {seen[order[k], 0]:.3f}: expected "
                 f"within +-{_WIDEST_RAD:g}, as seen by a camera; --no-calibrated takes ranges and "
                 "odometry as they are"
             )
@@ -170,22 +179,22 @@ def _seen_by_robot(odometry: Path, *, calibrated: bool) -> _Sightings:
 
 
 class Response(NamedTuple):
-    """How a robot follows its commands."""
+    """How a robot follows its commands; the usual response in logs of the data set."""
 
-    lag_s: float = 0.0  # how much later it moves
+    lag_s: float = 0.25  # how much later it moves
     speed: float = 1.0  # its speed over the commanded one
     turn: float = 1.0  # its turn rate over the commanded one
 
     def sentence(self) -> str:
         """Description of the response."""
         return (
-            f"the robot moves {self.lag_s:.2f} s after its commands, {self.speed:.3f} times as "
-            f"fast, and turns {self.turn:.3f} times"
+            f"the robot is taken to move {self.lag_s:.2f} s after its commands, {self.speed:.3f} "
+            f"times as fast, and to turn {self.turn:.3f} times"
         )
 
 
-#: As found in logs of the data set, and how much it varies.
-_USUAL_RESPONSE, _RESPONSE_SIGMA = Response(0.25), (0.25, 0.1, 0.1)
+#: How much responses vary.
+_RESPONSE_SIGMA = Response(0.25, 0.1, 0.1)
 
 
 def read_robot(
@@ -194,15 +203,15 @@ def read_robot(
     sigma_rad: float | None = None,
     *,
     calibrated: bool = True,
-) -> tuple[Recording, Response]:
+) -> tuple[Recording, Response | None]:
     """A robot's log, with landmarks as discs; most steps have no covariance.
 
     Parameters
     ----------
     odometry : Path
     sigma_m, sigma_rad : float, optional
-        Standard deviations of independent ranges and bearings; by default, ranges have those of
-        `_usual_sigma_m`.
+        Standard deviations of independent ranges and bearings; by default, those of calibrated
+        ranges are as found in logs with true poses, where their errors last (`_alike`).
     calibrated : bool
         Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
         ranges are computed from the depths that the log has.
@@ -210,7 +219,8 @@ def read_robot(
     Returns
     -------
     Recording
-    Response
+    Response or None
+        None without calibration.
 
     Raises
     ------
@@ -220,28 +230,38 @@ def read_robot(
     velocity = _log(odometry, "time v omega")
     seen = _seen_by_robot(odometry, calibrated=calibrated)
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
-    velocity = _without_short_stops(velocity)
-    response = response_of(velocity, seen) if calibrated else Response()
-    times = np.append(min(velocity[0, 0], seen.times[0]), seen.times)
-    steps = _driven_by(velocity, response).steps(times)
-    of_ranges = _usual_sigma_m(seen) if sigma_m is None else sigma_m
-    of_bearings = _USUAL_SIGMA_RAD if sigma_rad is None else sigma_rad
+    usual_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m) if calibrated else _RAW_SIGMA_M
+    usual_rad = _USUAL_SIGMA_RAD if calibrated else _RAW_SIGMA_RAD
+    of_ranges = np.broadcast_to(usual_m if sigma_m is None else sigma_m, seen.range_m.shape)
+    of_bearings = usual_rad if sigma_rad is None else sigma_rad
+    response, log = None, _driven_by(velocity)
+    if calibrated:
+        velocity = _without_short_stops(velocity)
+        response = response_of(velocity, seen, of_ranges, of_bearings)
+        log = _driven_by(velocity, response)
+        if sigma_m is None:
+            of_ranges = of_ranges * np.sqrt(_alike(seen))
+    steps = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, of_ranges, of_bearings)
     return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids)), response
 
 
-def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
+def response_of(
+    velocity: FloatArray, seen: _Sightings, sigma_m: FloatArray, sigma_rad: float
+) -> Response:
     """How a robot follows its commands, as the landmarks show it.
 
     From one sighting of a landmark to the next, range and bearing change as the robot moves. The
-    most likely response predicts these changes best. What they do not show is as usual.
+    most likely response predicts these changes best; where they tell little, it is the usual one.
 
     Parameters
     ----------
     velocity : (k, 3) float64
         Time (s), speed (m/s) and turn rate (rad/s) of each command.
     seen : _Sightings
-        The landmarks.
+        The landmarks, n times.
+    sigma_m, sigma_rad : (n,) float64, float
+        Standard deviations of ranges and bearings.
     """
     by_landmark = np.lexsort((seen.frame, seen.ids))
     before, after = by_landmark[:-1], by_landmark[1:]
@@ -252,39 +272,39 @@ def response_of(velocity: FloatArray, seen: _Sightings) -> Response:
     place = seen.range_m[before, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
 
     def residuals(numbers: ArrayLike) -> FloatArray:
-        response = Response(*np.asarray(numbers).tolist())
+        response = Response(*np.subtract(numbers, _FROM_0).tolist())
         poses = _driven_by(velocity, response).poses(seen.times)
         moved = between(poses[seen.frame[before]], poses[seen.frame[after]])
         x, y = apply(invert(moved), place).T
-        return np.concatenate([
-            wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / _USUAL_SIGMA_RAD,
-            (np.hypot(x, y) - range_m) / np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * range_m),
-            np.subtract(response, _USUAL_RESPONSE) / _RESPONSE_SIGMA,
+        changes = np.concatenate([
+            wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / sigma_rad,
+            (np.hypot(x, y) - range_m) / sigma_m[after],
         ])  # fmt: skip
+        robust = np.copysign(np.sqrt(np.arctan(changes**2)), changes)
+        return np.concatenate([robust, np.subtract(response, Response()) / _RESPONSE_SIGMA])
 
-    def cost(lag_s: float) -> float:
-        return float(np.sum(np.arctan(residuals(Response(lag_s)) ** 2)))
+    starts = [np.add(Response(lag_s), _FROM_0) for lag_s in _LAGS_S]
+    first = min(starts, key=lambda numbers: float(np.sum(residuals(numbers) ** 2)))
+    least, most = np.add([(_LAGS_S[0], 0.5, 0.5), (_LAGS_S[-1], 2.0, 2.0)], _FROM_0)
+    found = least_squares(residuals, first, bounds=(least - 1e-9, most + 1e-9), diff_step=1e-3)
+    return Response(*np.subtract(found.x, _FROM_0).tolist())
 
-    first = Response(min(_LAGS_S.tolist(), key=cost))
-    found = least_squares(residuals, first, loss="arctan", diff_step=1e-3)
-    return Response(*found.x.tolist())
 
+def _alike(seen: _Sightings) -> FloatArray:
+    """Number (n,) of sightings of the same landmark at about the same time.
 
-def _usual_sigma_m(seen: _Sightings) -> FloatArray:
-    """Standard deviations (n,) of ranges, as found in three logs with true poses.
-
-    Ranges are off by 2 % or, in the same way, for as long as a landmark is seen: each of n
-    sightings within some seconds has the n-fold variance.
+    In logs with true poses, errors of ranges hardly change while a landmark is seen: together they
+    are worth one measurement.
     """
-    sigma_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m)
+    count = np.ones(len(seen.ids))
     for number in np.unique(seen.ids):
         chosen = seen.ids == number
         time = seen.times[seen.frame[chosen]]
         first, end = (
             np.searchsorted(time, time + reach) for reach in (-_ALIKE_S / 2, _ALIKE_S / 2)
         )
-        sigma_m[chosen] *= np.sqrt(end - first)
-    return np.asarray(sigma_m)
+        count[chosen] = end - first
+    return count
 
 
 def _run(
@@ -334,16 +354,17 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
     return np.asarray(velocity[~np.repeat(dropped, end - first)])
 
 
-def _driven_by(velocity: FloatArray, response: Response) -> _Log:
+def _driven_by(velocity: FloatArray, response: Response | None = None) -> _Log:
     """The log of commands (k, 3), as the robot follows them; arcs are approximated by chords."""
-    time, speed, turn_rate = (velocity * [1.0, response.speed, response.turn]).T
+    lag_s, speed_share, turn_share = response or (0.0, 1.0, 1.0)
+    time, speed, turn_rate = (velocity * [1.0, speed_share, turn_share]).T
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:
         turn = turn_rate[held] * duration
         chord = speed[held] * duration * np.sinc(turn / (2.0 * np.pi))
         return np.stack([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn], axis=1)
 
-    return _Log(time + response.lag_s, along, _LATE_S)
+    return _Log(time + lag_s, along, 0.0 if response is None else _LATE_S)
 
 
 def _beside(odometry: Path, ending: str) -> Path:
@@ -385,6 +406,8 @@ def read_drive(drive: Path, sigma_m: float = 0.1, sigma_rad: float = 0.03) -> Re
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
     if len({len(time), len(speed), len(steering)}) != 1 or laser.shape != (len(scanned), _BEAMS):
         raise SlamError(f"{drive}: expected rows of equal number, and scans of {_BEAMS} beams")
+    if np.any(np.abs(steering) > _MOST_STEERING_RAD):
+        raise SlamError(f"{drive}: steering: expected angles within +-{_MOST_STEERING_RAD:g} rad")
     _demand_order(drive, time)
     _demand_order(drive.with_name(SCANS), scanned)
     _demand_together(drive, time, drive.with_name(SCANS), scanned)
@@ -435,8 +458,12 @@ def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
 def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
     try:
         content = loadmat(str(path))
-        return [np.asarray(content[name], dtype=np.float64) for name in names]
+        arrays = [np.asarray(np.real_if_close(content[name]), np.float64) for name in names]
     except (OSError, TypeError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
         raise SlamError(
             f"{path}: cannot be read ({error}): expected a MATLAB file with {', '.join(names)}"
         ) from None
+    for name, values in zip(names, arrays):
+        if not np.all(np.abs(values) <= LARGEST_NUMBER):
+            raise SlamError(f"{path}: {name}: expected numbers within +-{LARGEST_NUMBER:g}")
+    return arrays
