@@ -112,7 +112,7 @@ PROGRAM = DetectProgram(
             (options.Circles, options.Lines, options.Markers, options.All),
             "detect.commands.run:perform",
         ),
-        options.Compare: "detect.commands.report:perform_compare",
+        options.Compare: "detect.commands.compare:perform",
         options.Export: "detect.commands.export:perform",
         options.Draw: "detect.commands.draw:perform",
         options.View: "detect.commands.view:perform",

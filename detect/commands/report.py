@@ -1,53 +1,19 @@
-"""The commands ``detect compare``, ``report`` and ``demo``: rows against reference rows."""
+"""The commands ``detect report`` and ``demo``: a page about a run."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-
-from rich.console import Console
 
 from detect.commands.run import perform as detect_run
 from detect.comparison.compare import compare_run
-from detect.comparison.report import comparison_tables
-from detect.comparison.result import DiscComparison
-from detect.options import All, Compare, Demo, Report, RowFiles
+from detect.options import All, Demo, Report, RowFiles
 from detect.report.page import gather, report_page
 from detect.sources.opening import demand_recording, open_source
-from redetect.command_line import EXIT_ERROR
 from redetect.messages import counted
 from redetect.storage import demand_free, demand_place, write_bytes
 
 #: Images included in the program: the first ones of the demo run (`images/README.md`).
 DEMO_RUN = Path(__file__).resolve().parents[2] / "redetect" / "demo"
-
-
-def perform_compare(command: Compare) -> int:
-    """Compare rows with reference rows; returns the exit code."""
-    result = compare_run(
-        command.run,
-        "lines" if command.lines else "circles",
-        command.detected,
-        command.reference,
-        camera=command.camera,
-        options=command.matching,
-        unlisted=command.unlisted,
-    )
-    if isinstance(result, DiscComparison) and not (result.in_image or command.matching.gate_m):
-        print("no calibration: positions are compared on the floor; give one by --camera")
-    Console().print(comparison_tables(result))
-    if command.json is not None:
-        write_bytes(command.json, result.to_json().encode(), overwrite=command.force)
-    code = 0
-    for name, value, least in (
-        ("recall", result.recall, command.min_recall),
-        ("precision", result.precision, command.min_precision),
-    ):
-        if least is not None and (value is None or value < least):
-            shown = "unknown" if value is None else f"{value:.4f}"
-            print(f"{name} is {shown}: expected at least {least:g}", file=sys.stderr)
-            code = EXIT_ERROR
-    return code
 
 
 def perform_report(options: Report) -> int:

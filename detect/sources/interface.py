@@ -74,7 +74,10 @@ class Frames(ABC):
 
 
 class SomeFrames(Frames):
-    """Every n-th of the first `count` frames of another source (0: of all), of a bit depth."""
+    """Every n-th of the first `count` frames of another source (0: of all).
+
+    With a `bit_depth`, images have that one instead of one found from each.
+    """
 
     def __init__(
         self, frames: Frames, count: int = 0, every: int = 1, bit_depth: int | None = None

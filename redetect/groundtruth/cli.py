@@ -16,7 +16,7 @@ PROGRAM = Program(
     {
         options.Rig: "redetect.groundtruth.commands.markers:perform_rig",
         options.Network: "redetect.groundtruth.commands.markers:perform_network",
-        options.Poses: "redetect.groundtruth.commands.markers:perform_poses",
+        options.Poses: "redetect.groundtruth.commands.poses:perform",
         options.Score: "redetect.groundtruth.commands.score:perform",
         options.Lasers: "redetect.groundtruth.commands.lasers:perform_lasers",
         options.Laser: "redetect.groundtruth.commands.lasers:perform_laser",

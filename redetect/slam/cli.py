@@ -18,7 +18,7 @@ PROGRAM = Program(
         Localize: "redetect.slam.commands.filters:perform",
         Ekf: "redetect.slam.commands.filters:perform",
         Associate: "redetect.slam.commands.associate:perform",
-        Noise: "redetect.slam.commands.conversion:perform_noise",
+        Noise: "redetect.slam.commands.noise:perform",
         Export: "redetect.slam.commands.conversion:perform_export",
         Import: "redetect.slam.commands.conversion:perform_import",
     },

@@ -1,15 +1,14 @@
-"""``slam noise``, ``export`` and ``import``: runs with noise, for other tools, and from them."""
+"""``slam export`` and ``import``: runs for other tools, and from them."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 
 from redetect import __version__
 from redetect.bounds import ABOVE_0, demand
-from redetect.landmarks import read_rows, write_frames, write_rows
+from redetect.landmarks import write_frames
 from redetect.landmarks.axes import MEANING
 from redetect.landmarks.frames import read_times
 from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path, write_table
@@ -20,21 +19,9 @@ from redetect.slam.formats import data_sets
 from redetect.slam.formats.g2o import graph_of_run, read_g2o, write_g2o
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.tum import read_tum, write_tum
-from redetect.slam.noise import noisy_rows
-from redetect.slam.options import Export, Import, Noise
-from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs, landmark_files
+from redetect.slam.options import Export, Import
+from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs
 from redetect.storage import demand_free
-
-
-def perform_noise(options: Noise) -> int:
-    """Execute the command; returns the exit code."""
-    noise, lines = options.noise, options.lines
-    (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
-    target = options.output or source.with_name(f"noisy{source.suffix}")
-    rows = noisy_rows(read_rows(source), noise)
-    write_rows(target, rows, overwrite=options.force)
-    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
-    return 0
 
 
 def perform_export(command: Export) -> int:

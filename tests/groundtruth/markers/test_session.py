@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redetect.groundtruth.commands.markers import print_left_out
+from redetect.groundtruth.commands.poses import print_left_out
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.refinement import chain_points
 from redetect.groundtruth.markers.session import (

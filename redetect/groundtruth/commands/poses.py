@@ -1,0 +1,103 @@
+"""The command ``groundtruth poses``: a robot's poses from its markers in cameras' images."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from redetect.command_line import EXIT_ERROR
+from redetect.groundtruth.commands import outputs
+from redetect.groundtruth.files import write_json
+from redetect.groundtruth.markers import session
+from redetect.groundtruth.markers.track import PoseStatus, Track, report_entry, track_by_markers
+from redetect.groundtruth.options import Poses
+from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
+from redetect.json_text import json_text
+from redetect.storage import write_bytes
+
+#: Share of markers that disagree, or times that have no pose, above which a warning is printed; a
+#: marker is wrong if more than a share of its views disagree, and hardly any others do.
+_MANY_LEFT_OUT, _MOST_LEFT_OUT, _OF_THE_WRONG = 0.1, 0.5, 0.8
+#: Squared residuals per degree of freedom above which a warning is printed.
+_MUCH_TOO_LARGE = 9.0
+
+
+def perform(command: Poses) -> int:
+    """Carry out ``groundtruth poses``; returns the exit code: 1 without a single pose."""
+    runs = session.find_runs(command.session)
+    network_path = command.network or command.session / "network.json"
+    rig_path = command.rig or command.session / "rig.json"
+    output = command.output or command.session / "poses.csv"
+    settings_path = output.with_suffix(".json")
+    outputs.check_outputs((output, settings_path, command.tum, command.report), command.force)
+    network = session.read_network(network_path)
+    rig = session.read_rig(rig_path)
+    frames = session.read_network_frames(runs, network)
+    groups = session.group_by_time(frames, command.settings.time_tolerance_s)
+    track = track_by_markers(outputs.progress(groups, "poses"), rig, network, command.settings)
+    poses = track.planar()
+    print(
+        f"{len(poses)} poses of {len(track.times)} times: "
+        + ", ".join(f"{number} {status}" for status, number in track.counts.items() if number)
+    )
+    if track.unknown_markers:
+        print(f"{track.unknown_markers} markers found are not on the rig: ignored")
+        sets = {marker.dictionary for frame in frames for marker in frame.markers}
+        if others := sorted(sets - {rig.dictionary}):
+            found = f"markers of {', '.join(others)} were found"
+            outputs.warn(f"{found}, those in {rig_path} are of {rig.dictionary}")
+    print_left_out(track, rig_path, network_path)
+    if command.report is not None:
+        lines = [f"{json_text(report_entry(t, network), indent=None)}\n" for t in track.times]
+        write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
+    if not len(poses):
+        print("error: no pose", file=sys.stderr)
+        return EXIT_ERROR
+    print(f"squared residuals per degree of freedom: {track.reduced_cost:.2f}")
+    if track.reduced_cost > _MUCH_TOO_LARGE:
+        outputs.warn(
+            f"residuals are {track.reduced_cost**0.5:.0f} times as large as expected: the "
+            f"widths and poses of markers in {rig_path}, the poses of cameras in {network_path}, "
+            "or a lens calibration may be wrong"
+        )
+    write_planar_poses(output, poses, overwrite=command.force)
+    content = {
+        **outputs.provenance(command.settings, (rig_path, network_path)),
+        "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
+        "times": dict(track.counts),
+        "reduced_cost": track.reduced_cost,
+    }
+    write_json(settings_path, content, overwrite=command.force)
+    if command.tum is not None:
+        in_space = np.stack([pose.world_from_robot for _, pose in track.posed])
+        text = format_tum(poses.times_s, in_space)
+        write_bytes(command.tum, text.encode(), overwrite=command.force)
+    print(f"{output}: written")
+    return 0
+
+
+def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
+    """Say how many markers disagree with others, and what may be wrong if they are many."""
+    seen: Counter[int] = Counter()
+    left_out: Counter[int] = Counter()
+    for tracked in track.times:
+        if tracked.pose and tracked.estimate:
+            for view, good in zip(tracked.views, tracked.estimate.views):
+                seen[view.marker.id] += 1
+                left_out[view.marker.id] += not good
+    total, failed = left_out.total(), track.counts[PoseStatus.FAILED]
+    if total:
+        print(f"{total} markers disagree with the others at their time: ignored")
+    if total <= _MANY_LEFT_OUT * seen.total() and failed <= _MANY_LEFT_OUT * len(track.times):
+        return
+    wrong = [m for m, count in sorted(left_out.items()) if count > _MOST_LEFT_OUT * seen[m]]
+    named = wrong and sum(left_out[m] for m in wrong) > _OF_THE_WRONG * total
+    first = f"the pose of marker {', '.join(map(str, wrong))}, or else " if named else ""
+    outputs.warn(
+        f"{total} of {seen.total()} markers disagree with others, and {failed} times "
+        f"have no pose since they do: {first}poses or widths of markers, in {rig_path}, or poses "
+        f"of cameras, in {network_path}, may be wrong"
+    )
