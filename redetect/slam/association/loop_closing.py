@@ -180,7 +180,7 @@ def pairs_by_position(
 def consistent_matches(
     matches: Sequence[Match], closed: Sequence[Match], path: FloatArray, step_covariance: FloatArray
 ) -> list[Match]:
-    """Matches that neither odometry nor other matches contradict, since rooms may look alike.
+    """Matches that neither odometry nor other matches contradict, since places may look alike.
 
     Two loops form a third one: from the earlier frame of one to that of the other, across, and back
     along the later ones. It has to close as well as the odometry along it allows (J. G. Mangelson,

@@ -131,8 +131,8 @@ def _import_data_set(command: Import) -> None:
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
         run, response = data_sets.read_robot(file, **sigmas, calibrated=command.calibrated)
-        told = [] if response is None else [response.sentence()]
-        _write_run(command, run, "measurements", *told)
+        notes = [] if response is None else [response.sentence()]
+        _write_run(command, run, "measurements", *notes)
     elif file.name == data_sets.DRIVE:
         _write_run(command, data_sets.read_drive(file, **sigmas), "measurements")
     else:
@@ -142,14 +142,14 @@ def _import_data_set(command: Import) -> None:
         )
 
 
-def _write_run(command: Import, run: Recording, what: str, *told: str) -> None:
+def _write_run(command: Import, run: Recording, what: str, *notes: str) -> None:
     names = ("range_sigma", "bearing_sigma", "calibrated")
     settings = ", ".join(f"{name}: {getattr(command, name)}" for name in names)
     head = "\n".join(
-        [_made_by(command.file), *([settings] if what == "measurements" else []), *told]
+        [_made_by(command.file), *([settings] if what == "measurements" else []), *notes]
     )
     write_frames(command.output, frames_of_discs(run), head=head, overwrite=command.force)
-    print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *told]))
+    print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *notes]))
 
 
 def _write_path(command: Import, path: Path2D, note: str = "") -> None:

@@ -252,7 +252,7 @@ def response_of(
     """How a robot follows its commands, as the landmarks show it.
 
     From one sighting of a landmark to the next, range and bearing change as the robot moves. The
-    most likely response predicts these changes best; where they tell little, it is the usual one.
+    most likely response predicts these changes best; where they show little, it is the usual one.
 
     Parameters
     ----------
