@@ -75,8 +75,8 @@ def test_nor_does_what_a_tiff_says_of_it(
     picture = grey.astype(np.uint16) * 256 if deep else grey
     path = tmp_path / "a.tif"
     path.write_bytes(held_tiff(picture, orientation, order))
-    np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, (32, 24)), grey)
-    if not deep:  # those are brought to the full range
+    np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, (32, 24)), picture)
+    if not deep:  # those are stretched to the full range
         np.testing.assert_array_equal(read_grey(path, CameraError), grey)
 
 
