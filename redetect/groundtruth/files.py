@@ -47,10 +47,7 @@ def read_json(path: PathLike) -> dict[str, Any]:
 
 
 class JsonObject:
-    """An object of a JSON file, whose values are read by their names.
-
-    Missing or wrong values raise a `GroundTruthError` with place, value and what was expected.
-    """
+    """A JSON file's object; missing or wrong values raise `GroundTruthError` with their place."""
 
     def __init__(self, place: str, value: Any) -> None:
         if not isinstance(value, dict):
@@ -139,9 +136,8 @@ class JsonObject:
         return np.asarray(0.5 * (matrix + matrix.T))
 
     def uncertainty(self, size: int, sigmas: str = "sigmas") -> FloatArray:
-        """(size, size) covariance by `covariance` or standard deviations; else zeros.
-
-        The latter are named by `sigmas`; both are in the order of the covariance's rows.
+        """(size, size) covariance by `covariance`, or by standard deviations, named by `sigmas`, in
+        the order of its rows; else zeros.
         """
         if "covariance" in self and sigmas in self:
             raise GroundTruthError(

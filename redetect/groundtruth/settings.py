@@ -1,7 +1,4 @@
-"""Settings of all estimations, for the command line and library callers.
-
-Imports nothing heavy, so that `--help` is quick.
-"""
+"""Settings of all estimations; nothing heavy is imported, so that `--help` is quick."""
 
 from __future__ import annotations
 

@@ -247,8 +247,7 @@ def describe(
     segments = []
     for segment, front in sorted(track.fronts.items()):
         times = track.times_s[track.segment == segment].tolist()
-        visit = {"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front}
-        segments.append(visit)
+        segments.append({"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front})
     entries = []
     excess = tracking.excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):

@@ -71,26 +71,15 @@ def perform_rig(command: Rig) -> int:
     picture = command.output.with_suffix(".png")
     outputs.check_outputs((command.output, picture), command.force)
     network, groups = _input(command)
+    known = None if command.robot is None else session.read_rig(command.robot)
     estimate = estimate_rig(
-        groups,
-        network,
-        command.width_m,
-        command.settings,
-        reference=command.reference,
-        known=None if command.robot is None else session.read_rig(command.robot),
+        groups, network, command.width_m, command.settings, reference=command.reference, known=known
     )
-    frame = f"marker {estimate.reference}"
-    if command.robot is not None:
-        frame = f"robot, by {command.robot.name}"
-    rig = estimate.rig
-    views = [
-        [i for i, view in enumerate(estimate.views) if view.rig_index == index]
-        for index in range(len(rig.ids))
-    ]
-    table = [
-        {"marker": marker, **estimate.adjusted.residual_figures(own)}
-        for marker, own in zip(rig.ids, views)
-    ]
+    frame = f"robot, by {command.robot.name}" if command.robot else f"marker {estimate.reference}"
+    rig, table = estimate.rig, []
+    for index, marker in enumerate(rig.ids):
+        own = [i for i, view in enumerate(estimate.views) if view.rig_index == index]
+        table.append({"marker": marker, **estimate.adjusted.residual_figures(own)})
     pairs = [
         {
             "markers": [rig.ids[a], rig.ids[b]],
@@ -130,8 +119,7 @@ def _input(command: Rig) -> tuple[session.Network, list[tuple[session.MarkerFram
         return network, session.group_by_time(frames, command.settings.time_tolerance_s)
     count, files = len(command.runs), []
     for run in command.runs:
-        found = camera_file_in(run)
-        if found is None:
+        if (found := camera_file_in(run)) is None:
             raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
         files.append(found)
     network = session.Network(

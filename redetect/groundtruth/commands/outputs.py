@@ -39,13 +39,9 @@ def warn(text: str) -> None:
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
     """Metadata of a result: version, settings, and the files on which it depends."""
-    return {
-        "version": __version__,
-        "settings": settings,
-        "files": {
-            path.name: {"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files
-        },
-    }
+    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    of_files = {name: {"sha256": value} for name, value in hashes.items()}
+    return {"version": __version__, "settings": settings, "files": of_files}
 
 
 def progress(items: Sequence[T], label: str) -> Iterable[T]:

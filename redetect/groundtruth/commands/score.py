@@ -1,7 +1,4 @@
-"""The command ``groundtruth score``: errors of poses against the truth.
-
-In a module of its own, which loads no pictures.
-"""
+"""The command ``groundtruth score``: errors of poses against the truth; loads no pictures."""
 
 from __future__ import annotations
 

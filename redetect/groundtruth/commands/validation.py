@@ -24,10 +24,7 @@ from redetect.groundtruth.options import Report, Validate
 from redetect.groundtruth.report.inputs import gather
 from redetect.groundtruth.report.page import report_page
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
-from redetect.groundtruth.trajectories.streams import (
-    read_planar_poses,
-    write_planar_poses,
-)
+from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation import onboard, reference_poses, scoring
 from redetect.storage import write_bytes
 
@@ -202,9 +199,8 @@ def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
             warn(f"{error}: its scans are not used")
             continue
         # If a clock was set, times step back; the poses' own times are looked up.
-        on_board.append(
-            onboard.Onboard(scanner, read_scans(found, scanner.readings, ordered=False))
-        )
+        scans = read_scans(found, scanner.readings, ordered=False)
+        on_board.append(onboard.Onboard(scanner, scans))
         files.append(found)
     if not on_board:
         warn("no scans of a scanner on board: using distances only")

@@ -291,8 +291,7 @@ def _rms(values: Any) -> float | None:
 def read_ptpd(path: PathLike) -> PtpdLog:
     """Read a log of ptpd.
 
-    Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
-    the master.
+    Raises `GroundTruthError` if the file cannot be read, or reports no offset from the master.
     """
     rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}

@@ -87,9 +87,8 @@ class OffsetSearch:
         self._steps = np.arange(-largest, largest + 1)
 
     def offset_s(self, parts: Sequence[PlanarPoses], around_s: float) -> float:
-        """Robot time minus ground truth time for parts of the ground truth.
-
-        It is `around_s`, the expected one, unless another one fits their movements much better.
+        """Robot time minus ground truth time for parts of the ground truth: `around_s`, which is
+        expected, unless another one fits their movements much better.
         """
         compared = self._compared(parts)
         if compared is None:

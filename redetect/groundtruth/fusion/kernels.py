@@ -351,11 +351,10 @@ def filter_forward(
 
 
 def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
-    """Smooth a filter's history, from the last node to the first (Rauch, Tung, Striebel).
+    """States (N, d) and covariances (N, d, d) of a filter's history smoothed from the last node to
+    the first (Rauch, Tung, Striebel).
 
     Across a restart of the filter, only odometry's systematic errors are propagated backward.
-
-    Returns `states`, `covariances` (N, d), (N, d, d).
     """
     expected = history.predicted_covariance[1:].copy()
     # States without variance do not change.

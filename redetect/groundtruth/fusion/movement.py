@@ -55,18 +55,14 @@ def predicted_backward(
     mirror[_TURN_PER_METRE] = -1.0
     reverse = np.concatenate([np.zeros((1, 4)), -controls[:0:-1]])
     history = kernels.empty_history(count)
+    unmeasured = kernels.MeasuredPoses(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    uncut = np.zeros(count, dtype=np.bool_)
     kernels.filter_forward(
         kernels.Odometry(reverse, np.concatenate([np.zeros((1, 3)), variances[:0:-1]])),
         mirror * end,
         end_spread * mirror * mirror[:, None],
-        kernels.MeasuredPoses(
-            np.empty(0, dtype=np.int64),
-            np.empty((0, kernels.POSE)),
-            np.empty((0, kernels.POSE, kernels.POSE)),
-        ),
-        kernels.Gating(
-            math.inf, 1, np.ones(kernels.POSE), math.inf, np.zeros(count, dtype=np.bool_)
-        ),
+        unmeasured,
+        kernels.Gating(math.inf, 1, np.ones(kernels.POSE), math.inf, uncut),
         np.empty((1, kernels.STATE)),
         history,
     )
@@ -159,9 +155,8 @@ class MovementProblem:
         return replace(self, measured=measured, streams=self.streams[kept])
 
     def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone.
-
-        `slips` (N, 3): variances of movements that are added for slips.
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone, with the variances
+        `slips` (N, 3) of movements added.
         """
         history = kernels.empty_history(len(self.times_s))
         self.forward(self._variances(noise) + slips, history=history)
@@ -288,9 +283,8 @@ class MovementProblem:
 def movement_problem(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
 ) -> MovementProblem:
-    """Combine odometry and measured poses with covariances on common nodes.
-
-    The nodes are from the first measurement within the odometry's time to the last.
+    """Combine odometry and measured poses with covariances on common nodes, from the first
+    measurement within the odometry's time to the last.
     """
     found, names, repaired = inputs.measured_poses(odometry, streams)
     assert found.covariances is not None
@@ -298,13 +292,12 @@ def movement_problem(
     inside = odometry.times_s[odometry.during(found.times_s[0], found.times_s[-1])]
     node_times = np.union1d(inside, found.times_s)
     controls, unseen = inputs.movements(odometry, node_times)
+    nodes = np.searchsorted(node_times, found.times_s)
     return MovementProblem(
         times_s=node_times,
         controls=controls,
         unseen=unseen,
-        measured=kernels.MeasuredPoses(
-            np.searchsorted(node_times, found.times_s), found.poses, found.covariances
-        ),
+        measured=kernels.MeasuredPoses(nodes, found.poses, found.covariances),
         streams=names,
         repaired=repaired,
         settings=settings,

@@ -110,9 +110,8 @@ def _stretches(mask: BoolArray) -> list[tuple[int, int]]:
 
 
 def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
-    """Begin and end of long runs of rejections, after an accepted measurement.
-
-    The measurement at which the filter restarted belongs to the run.
+    """Begin and end of long runs of rejections after an accepted measurement, including the one at
+    which the filter restarted.
     """
     rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
     return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]

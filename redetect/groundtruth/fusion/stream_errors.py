@@ -68,9 +68,8 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
 
 def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
-    """Poses with covariances raised to their jitter, and the factor of the deviations.
-
-    The factor is 1, and the poses are unchanged, if their covariances can be right.
+    """Poses with covariances raised to their jitter, and the factor of the deviations: the same
+    poses, and 1, if their covariances can be right.
     """
     factor = jitter_ratio(poses)
     if factor <= _BELIEVED:
@@ -92,9 +91,8 @@ def read_common_covariance(stream: PathLike) -> FloatArray:
 
 
 def without_common(poses: PlanarPoses, common: FloatArray) -> tuple[PlanarPoses, FloatArray]:
-    """Poses without the common part (3, 3) of their covariances, and that part.
-
-    The part is zeros, and the poses are unchanged, if it is negligible.
+    """Poses without the common part (3, 3) of their covariances, and that part: the same poses, and
+    zeros, if it is negligible.
     """
     if poses.covariances is None or not len(poses):
         return poses, np.zeros((3, 3))

@@ -102,10 +102,8 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     groundtruth, _ = with_jitter_covered(groundtruth)
-    parts = [
-        groundtruth.only(part)
-        for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
-    ]
+    slices = segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
+    parts = [groundtruth.only(part) for part in slices]
     search = OffsetSearch(_smoothed(odometry), parts, bounds.largest_offset_s)
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
@@ -440,9 +438,5 @@ def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
     if not determined:
         return segments
     times, offsets = knots_of(determined)
-    return [
-        segment
-        if segment.is_determined
-        else replace(segment, offset_s=float(np.interp(segment.reference_s, times, offsets)))
-        for segment in segments
-    ]
+    between = np.interp([segment.reference_s for segment in segments], times, offsets).tolist()
+    return [s if s.is_determined else replace(s, offset_s=t) for s, t in zip(segments, between)]

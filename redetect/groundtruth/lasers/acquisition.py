@@ -178,9 +178,8 @@ def load_session(
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
     """Read fixed scanners, robot and scans, and learn the background.
 
-    Scanners whose readings of the empty area scatter far more than stated get that noise.
-
-    Raises `GroundTruthError` if a file is missing or does not fit the others.
+    Scanners whose readings of the empty area scatter far more than stated get that noise. Raises
+    `GroundTruthError` if a file is missing or does not fit the others.
     """
     scanners = read_scanners(calibration)
     robot = read_robot(folder / "robot.json")

@@ -281,10 +281,8 @@ def _whole_to_map(
 def icp_by_step(
     points: FloatArray, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
 ) -> FloatArray:
-    """(steps + 1,) root mean square distances (m) of the readings used from the map.
-
-    They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
-    (3,).
+    """(steps + 1,) rms distances (m) of the readings used from the map, after each step of an ICP
+    of a scanner's points (n, 2) to it, from a start (3,).
     """
     from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
     return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

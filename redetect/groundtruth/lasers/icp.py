@@ -142,9 +142,8 @@ def face_normals(faces: FloatArray) -> FloatArray:
 def nearest_on_segments(
     points: FloatArray, segments: FloatArray
 ) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Nearest points on (k, 4) segments x1, y1, x2, y2: (n, 2), their segments, squared distances.
-
-    If two segments are equally near, the first is used.
+    """Nearest points (n, 2) on (k, 4) segments x1, y1, x2, y2, the indices of these (of equally
+    near ones the first), and squared distances.
     """
     count = points.shape[0]
     nearest = np.empty((count, 2))
@@ -170,10 +169,7 @@ def nearest_on_segments(
 
 @kernel()
 def rigid_fit(points: FloatArray, target: FloatArray, used: BoolArray) -> FloatArray:
-    """Pose (3,) with the least sum of squared distances between the used pairs of points.
-
-    The closed form, in the plane, of the fit by singular values (Arun, Huang, Blostein 1987).
-    """
+    """Pose (3,) of least squares of the used pairs, in closed form (Arun, Huang, Blostein 1987)."""
     # Plain loops: NumPy's sums and parts of arrays take seconds to compile.
     n, px, py, qx, qy = 0, 0.0, 0.0, 0.0, 0.0
     for i in range(len(used)):
@@ -212,10 +208,7 @@ def fit_outline(
     points: FloatArray, faces: FloatArray, start: FloatArray, gate_m: float, kept: float,
     threshold_m: float, most_steps: int,
 ) -> tuple[FloatArray, float, int]:  # fmt: skip
-    """Trimmed ICP of segments to points: pose, root mean square error, number of pairs used.
-
-    The pose moves the segments onto the points.
-    """
+    """Trimmed ICP that moves segments onto points: pose, rms error, number of pairs used."""
     pose = start.copy()
     before = np.inf
     step = 0

@@ -87,11 +87,7 @@ class Scanner:
         return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
-        """Points (..., readings, 2) in the scanner's frame (m) of readings (..., readings) in
-        millimetres.
-
-        NaN if nothing was hit.
-        """
+        """Points (..., readings, 2) (m) in its frame of readings in mm; NaN if nothing was hit."""
         ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
         angles = self.angles_rad
         return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
@@ -172,10 +168,7 @@ def write_scanners(
 
 
 def read_robot(path: PathLike) -> Robot:
-    """Read a ``robot.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``robot.json``; raises `GroundTruthError` if the file or an entry is not valid."""
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
     if len(outline) < 3:

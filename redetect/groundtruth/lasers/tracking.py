@@ -370,10 +370,7 @@ class Tracker:
         return ahead
 
     def _scales(self, good: IntArray) -> FloatArray:
-        """Factors on the covariances if residuals are larger than the scanners' noise.
-
-        From the residuals of half a second, since one set's are too few.
-        """
+        """Factors on covariances if residuals exceed noise, over half a second: a set has few."""
         freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
         sets = 2 * round(0.5 * _RESIDUALS_S / max(_interval_s(self.sets.times_s), 1e-3)) + 1
         total, squared = (
@@ -448,9 +445,7 @@ def track_without_suspects(
             return track, left_out
         suggested = (track.corrections[worst], track.correction_sigma[worst])
         left_out[scanners[worst].name] = np.stack(suggested)
-        rows = sets.rows.copy()
-        rows[:, worst] = -1
-        sets = replace(sets, rows=rows)
+        sets = replace(sets, rows=np.where(np.arange(len(scanners)) == worst, -1, sets.rows))
 
 
 def excess_shifts(track: LaserTrack, scanners: tuple[Scanner, ...]) -> FloatArray:

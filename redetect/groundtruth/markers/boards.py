@@ -40,7 +40,6 @@ from redetect.storage.images import read_grey
 #: and far away here, so that blur and noise cause larger errors than the lens's distortion.
 _WINDOW = 0.4
 
-
 BOARDS_NAME = "boards.json"
 FIRST, SECOND, WORLD = "first", "second", "world"
 
@@ -86,8 +85,7 @@ class BoardsFile:
 def read_boards(path: Path) -> BoardsFile:
     """Read a ``boards.json``, or the one in a folder, and the calibrations of its cameras.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
-    missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file or an entry is not valid.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
     content = JsonObject.read(path)

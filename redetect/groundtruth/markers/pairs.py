@@ -60,10 +60,7 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
 
 
 def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
-    """The transform with which the most times agree.
-
-    `times`: from `pair_estimates`, one for each time at which both markers are seen.
-    """
+    """The transform with which most times agree, each with its estimates from `pair_estimates`."""
     poses = np.concatenate([time.poses for time in times])
     covariances = np.concatenate([time.covariances for time in times])
     costs = np.concatenate([time.costs - time.costs.min() for time in times])

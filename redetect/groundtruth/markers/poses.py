@@ -9,6 +9,7 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import cv2
@@ -92,11 +93,9 @@ def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> li
         for index in used:
             chosen = problem.seen.camera == index
             lens, pixels = problem.network.cameras[index], problem.seen.pixels[chosen]
-            try:
+            with suppress(GeometryError):
                 found = solve_camera(lens, problem.robot_points[chosen], pixels, solver)
-            except GeometryError:
-                continue
-            poses += [problem.network.world_from_camera[index] @ pose for pose in found]
+                poses += [problem.network.world_from_camera[index] @ pose for pose in found]
     return _best_first(
         poses,
         lambda pose: robot_rms_px(problem, pose),
@@ -232,11 +231,8 @@ def estimate_pose(problem: refinement.PoseProblem) -> PoseEstimate:
     inflation = max(1.0, best.cost / max(1, best.degrees_of_freedom))
     limit = best.cost + 2.0 * np.log(settings.ambiguity_odds) * inflation
     # The best minimum and those that it cannot exclude.
-    candidates = tuple(
-        pose
-        for pose in minima
-        if pose is best or (pose.cost <= limit and not _within_covariance(pose, best))
-    )
+    rivals = (p for p in minima[1:] if p.cost <= limit and not _within_covariance(p, best))
+    candidates = (best, *rivals)
     log_odds = tuple(0.5 * (c.cost - best.cost) / inflation for c in candidates)
     return PoseEstimate(candidates, views, log_odds)
 
@@ -273,15 +269,14 @@ def _distinct(minima: list[refinement.RefinedPose]) -> list[refinement.RefinedPo
     """Those that differ, the best first."""
     kept: list[refinement.RefinedPose] = []
     for pose in sorted(minima, key=lambda pose: pose.cost):
-        if np.abs(pose.world_from_robot).max() < _FARTHEST_M and not any(
-            _same(pose.world_from_robot, other.world_from_robot) for other in kept
-        ):
+        near = np.abs(pose.world_from_robot).max() < _FARTHEST_M
+        if near and not any(_same(pose, other) for other in kept):
             kept.append(pose)
     return kept
 
 
-def _same(a: FloatArray, b: FloatArray) -> bool:
-    apart = se3.inverse(a) @ b
+def _same(a: refinement.RefinedPose, b: refinement.RefinedPose) -> bool:
+    apart = se3.inverse(a.world_from_robot) @ b.world_from_robot
     turn = np.linalg.norm(se3.log(apart)[3:])
     return bool(np.linalg.norm(apart[:3, 3]) < _SAME_PLACE_M and turn < _SAME_ANGLE_RAD)
 

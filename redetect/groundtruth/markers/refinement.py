@@ -190,10 +190,7 @@ def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
 def predicted_errors(
     problem: PoseProblem, pose: FloatArray, pose_covariance: FloatArray
 ) -> FloatArray:
-    """(V,) normalised errors of all views at a pose that was estimated without them.
-
-    Infinite where a view cannot be seen from there.
-    """
+    """(V,) normalised errors of views at a pose estimated without them; infinite if not visible."""
     errors = np.full(problem.views, np.inf)
     for view in range(problem.views):
         alone = problem.only(np.arange(problem.views) == view)

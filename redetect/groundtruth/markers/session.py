@@ -87,8 +87,7 @@ def read_rig(path: PathLike) -> Rig:
 def read_network(path: PathLike) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
-    missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file or an entry is not valid.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))
@@ -207,10 +206,7 @@ class View:
 
 
 def find_runs(session: Path) -> list[Path]:
-    """The run folders of a session that contain detected markers.
-
-    Raises `GroundTruthError` if there are none.
-    """
+    """A session's runs with detected markers; raises `GroundTruthError` if there are none."""
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())

@@ -28,7 +28,7 @@ _REJECT_COST = 15.0
 # Most consecutive frames that are skipped, and rounding errors of costs.
 _MOST_LEFT_OUT = 3
 _ROUNDING = 1e-6
-_CHANCE = 1e-3
+_CHANCE = 1e-3  # Probability of larger residuals below which they are not due to chance
 
 _Step = tuple[int, int, float]
 
@@ -95,10 +95,7 @@ class Track:
 
 
 def excess_of(pose: RefinedPose) -> float:
-    """Factor by which a pose's covariance is too small for its residuals.
-
-    It is 1 unless they are larger than chance makes one in a thousand.
-    """
+    """Factor by which a pose's covariance is too small; 1 if its residuals may be so by chance."""
     freedom = pose.degrees_of_freedom
     if freedom < 1 or pose.cost <= chdtri(freedom, _CHANCE):
         return 1.0

@@ -44,10 +44,7 @@ _SCANS_PX, _ALIGNMENT_PX = (864, 237), (864, 274)
 
 
 def report_page(inputs: Inputs, version: str) -> bytes:
-    """The whole page, UTF-8; the same inputs give the same bytes.
-
-    `version`: of the program, for the page's foot.
-    """
+    """The whole page, UTF-8; the same inputs and `version` of the program give the same bytes."""
     sections = [
         Section("state", "Contents of the session", _state(inputs)),
         Section("building", "Drawing and fiducials", _building(inputs)),
@@ -408,10 +405,8 @@ def _settings(inputs: Inputs, version: str) -> list[Part]:
     for name, document in inputs.documents.items():
         # In a file of scanners, this is the version of the format.
         settings = _entry(document, "settings", dict).items()
-        content += [
-            Part("text", f"{name}: version {_value(document.get('version'))}"),
-            Part("list", rows=tuple((f"{k}: {_value(v)}",) for k, v in settings)),
-        ]
+        content.append(Part("text", f"{name}: version {_value(document.get('version'))}"))
+        content.append(Part("list", rows=tuple((f"{k}: {_value(v)}",) for k, v in settings)))
     content.append(Part("text", f"Page written by groundtruth report, version {version}."))
     return content
 

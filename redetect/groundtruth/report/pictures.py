@@ -387,9 +387,8 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
         "by the ground truth": refined + errors.error[kept],
     }
     with figure_file((13.5, 3.7), "png") as (figure, content):
-        for axes, (title, poses) in zip(
-            figure.subplots(1, 3, sharex=True, sharey=True), sets.items()
-        ):
+        maps = figure.subplots(1, 3, sharex=True, sharey=True)
+        for axes, (title, poses) in zip(maps, sets.items()):
             points = np.concatenate([plane.apply(p, cloud) for p, cloud in zip(poses, clouds)])
             squared = nearest_on_segments(points, building)[2]
             near = np.sqrt(squared[squared < OF_A_WALL_M**2])

@@ -132,10 +132,8 @@ def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArr
 def mean_pose(
     poses: Sequence[FloatArray] | FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Weighted mean of poses on SE(3) that are close to each other.
-
-    `poses`: (N, 4, 4); `covariances`: (N, 6, 6), of their right perturbations. Returns the mean
-    (4, 4), and its covariance (6, 6) for independent errors.
+    """Weighted mean (4, 4) of close poses (N, 4, 4) on SE(3), and its covariance (6, 6), from those
+    of their right perturbations (N, 6, 6), for independent errors.
     """
     stack = np.asarray(poses, dtype=np.float64)
     mean, information = stack[0], np.linalg.inv(covariances)

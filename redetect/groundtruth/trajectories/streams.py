@@ -54,11 +54,8 @@ class PlanarPoses:
         shape = (count, 3, 3) if self.covariances is None else self.covariances.shape
         if shape != (count, 3, 3):
             raise GroundTruthError(f"covariances of shape {shape}: expected ({count}, 3, 3)")
-        for name, values in (
-            ("times", self.times_s),
-            ("poses", self.poses),
-            ("covariances", self.covariances),
-        ):
+        columns = {"times": self.times_s, "poses": self.poses, "covariances": self.covariances}
+        for name, values in columns.items():
             if values is not None and not np.all(np.isfinite(values)):
                 raise GroundTruthError(f"{name} contain a number that is not finite")
         descending = np.flatnonzero(np.diff(self.times_s) < 0.0)

@@ -182,10 +182,8 @@ def refined_by_walls(
     """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
     prior, covariance = distances.pose, distances.covariance
     try:
-        free = np.eye(3) / _FREE_SIGMA**2
-        problem = MapProblem(
-            still.scans, prior[None], free, segments, wall_curves(segments), still.mounts
-        )
+        free, curves = np.eye(3) / _FREE_SIGMA**2, wall_curves(segments)
+        problem = MapProblem(still.scans, prior[None], free, segments, curves, still.mounts)
         found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:
         return _unrefined(distances, ScanUse.NO_SCANS, str(error))

@@ -71,10 +71,7 @@ class Distance:
 
 
 def read_survey(path: PathLike) -> Survey:
-    """Read a ``fiducials.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``fiducials.json``; raises `GroundTruthError` if the file or an entry is not valid."""
     content = JsonObject.read(path)
     content.demand_version()
     fiducials, robot_points = (_points(content, key) for key in ("fiducials", "robot_points"))

@@ -74,10 +74,7 @@ def compatible(
 
 @cache
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
-    """Chi-squared quantiles for the squared distances of 0, 1, 2, ... pairs.
-
-    Returns (most_pairs + 1,), not to be modified.
-    """
+    """(most_pairs + 1,) chi-squared quantiles for 0, 1, 2, ... pairs, not to be modified."""
     if not 0.0 < probability < 1.0:
         raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
     gates = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
@@ -122,9 +119,8 @@ def _append(
 def individual_distances(
     innovations: FloatArray, predicted: FloatArray, noise: FloatArray
 ) -> FloatArray:
-    """Squared Mahalanobis distance of each row from each landmark (n, m).
-
-    Infinite if a covariance is not positive definite or an innovation is not finite.
+    """(n, m) squared Mahalanobis distances of rows from landmarks, infinite if a covariance is not
+    positive definite or an innovation is not finite.
     """
     n, m, width = innovations.shape
     every = np.arange(m)

@@ -238,10 +238,8 @@ def lines_by_points(
     camera_xy: ArrayLike = (0.0, 0.0),
     disc_sigma_scale: float = 1.0,
 ) -> tuple[IntArray, FloatArray]:
-    """Labels of the rows of verticals, by the points in which their rays intersect.
-
-    Takes `path` (N + 1, 3), `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,); returns
-    `labels` (m,), `path` (N + 1, 3).
+    """Labels (m,) of the rows of verticals, by the points in which their rays intersect, and the
+    corrected path (N + 1, 3); from `circle_labels` (n,), `line_labels` (m,), `camera_xy` (2,).
     """
     sigma = _PATH_SIGMA_SCALE * recording.lines.sigma_rad
     scaled = replace(recording, lines=replace(recording.lines, sigma_rad=sigma))

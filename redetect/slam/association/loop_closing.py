@@ -137,10 +137,7 @@ def merge_labels(
 
 
 def in_order(labels: IntArray) -> IntArray:
-    """Renumber labels from 0 without gaps, in the order of their first rows; -1 stays.
-
-    Takes `labels` (n,); returns (n,).
-    """
+    """Renumber labels (n,) from 0 without gaps, in the order of their first rows; -1 stays."""
     names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     first[names < 0] = -1
     rank = np.empty(len(first), dtype=np.int64)
@@ -228,14 +225,12 @@ def consistent_matches(
 
 
 def closed_path(path: FloatArray, matches: Sequence[Match], lost: IntArray) -> FloatArray:
-    """A path that satisfies the matches, as a start for least squares over everything.
+    """A path (N + 1, 3) that satisfies the matches, as a start for least squares over everything.
 
     Headings first, then positions: each of the two problems is linear (L. Carlone, R. Aragues,
     J. A. Castellanos, B. Bona, "A fast and accurate approximation for planar pose graph
     optimization", International Journal of Robotics Research 33, 2014). So the path before may be
-    arbitrarily wrong.
-
-    Takes `path` (N + 1, 3), and the lost steps; returns (N + 1, 3).
+    arbitrarily wrong, and its `lost` steps unknown.
     """
     count = len(path) - 1
     first = np.array([m.earlier_frame + 1 for m in matches], dtype=np.int64)

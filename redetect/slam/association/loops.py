@@ -311,9 +311,8 @@ class Motion(NamedTuple):
 def motion_onto(
     moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray | None = None
 ) -> Motion:
-    """The motion under which most landmarks (n, 2) fall on those of another constellation.
-
-    With `besides` (3,), the best one that is not near this pose.
+    """The motion under which most landmarks (n, 2) fall on those of another constellation; with
+    `besides` (3,), the best one that is not near this pose.
     """
     centre = moved.sum(axis=0) / max(len(moved), 1)
     others = np.zeros((0, 3))
@@ -341,10 +340,7 @@ def refined_motion(
 
 
 def mutual_pairs(first: FloatArray, second: FloatArray, reach_m: float) -> IntArray:
-    """Points of two sets that are each other's nearest, and near.
-
-    Takes `first, second` (n, 2), (m, 2); returns (k, 2).
-    """
+    """(k, 2) indices of points (n, 2), (m, 2) that are each other's nearest, and within reach."""
     if len(first) == 0 or len(second) == 0:
         return np.zeros((0, 2), dtype=np.int64)
     distance = np.linalg.norm(first[:, None] - second[None], axis=2)

@@ -115,27 +115,18 @@ def associate_run(
         circle_labels = without_clutter(recording, labels, path, settings)
         if len(line_labels):
             report("verticals on the path of the discs")
+            scale = settings.sigma_scale
             line_labels, path_of_both = lines_by_points(
-                recording,
-                path,
-                labels,
-                line_labels,
-                camera_xy=camera_xy,
-                disc_sigma_scale=settings.sigma_scale,
+                recording, path, labels, line_labels, camera_xy=camera_xy, disc_sigma_scale=scale
             )
             line_labels = _merged_lines(recording, path_of_both, line_labels, settings, camera_xy)
     elif settings.map_level:
         run = _Run(recording, settings, camera_xy, report)
         closed = _closed_by_parts(run, line_labels)
         line_labels, path, matches = closed.at.labels, closed.at.path, closed.matches
-    return RunAssociation(
-        in_order(circle_labels),
-        in_order(line_labels),
-        in_order(local[0]),
-        in_order(local[1]),
-        matches,
-        path,
-    )
+    circle_labels, line_labels = in_order(circle_labels), in_order(line_labels)
+    local_circles, local_lines = map(in_order, local)
+    return RunAssociation(circle_labels, line_labels, local_circles, local_lines, matches, path)
 
 
 def _associated_locally(
@@ -203,24 +194,18 @@ class _Run(NamedTuple):
         if not self.by_discs:
             start = chain_steps(recording.steps) if path is None else path
             line_xy = intersect_bearings(recording, start, labels, camera_xy=self.camera_xy)
-        circle_labels, line_labels = (labels, none) if self.by_discs else (none, labels)
+        swayed, scale = _with_sway(recording, self.settings), self.settings.sigma_scale
+        discs, lines = (labels, none) if self.by_discs else (none, labels)
         found = solve_path(
-            _with_sway(recording, self.settings),
-            circle_labels,
-            line_labels,
-            path,
-            line_xy,
-            camera_xy=self.camera_xy,
-            sigma_scale=self.settings.sigma_scale,
+            swayed, discs, lines, path, line_xy, camera_xy=self.camera_xy, sigma_scale=scale
         )
         xy = found.circle_xy if self.by_discs else found.line_xy
         return _Solved(labels, found.path, xy, found.cost)
 
 
 def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
-    """Close loops in each part between lost steps of odometry, and then in the whole.
-
-    In between, the parts' maps are registered; the first one stays.
+    """Close loops in each part between lost steps of odometry, register the parts' maps in the
+    first one, and close loops in the whole.
     """
     recording, frames = run.recording, run.frames
     starts = [0, *recording.lost.tolist()]
@@ -348,9 +333,8 @@ def without_clutter(
 ) -> IntArray:
     """Labels of discs, -1 for outliers, and for rows of discs with too few rows.
 
-    Clutter kept some labels of one disc apart: without it, they are merged.
-
-    Takes `labels` (n,), numbered from 0 without gaps, and their `path` (N + 1, 3); returns (n,).
+    Clutter kept some labels of one disc apart: without it, they are merged. Takes `labels` (n,),
+    numbered from 0 without gaps, and their `path` (N + 1, 3); returns (n,).
     """
     gate = chdtri(2, 1.0 - settings.kept_probability)
     circles, frames = recording.circles, recording.circles.frame
