@@ -9,10 +9,7 @@ EXIT_FRAMES_FAILED = 3
 
 
 class DetectError(OneLineError, ValueError):
-    """A run or setting that cannot be processed.
-
-    The message names the file or the setting, its value and what was expected.
-    """
+    """An invalid run or setting; the message names file or setting, value and what was expected."""
 
 
 class FrameError(OneLineError, ValueError):

@@ -12,8 +12,7 @@ Calibration errors are common to all rows. With the covariance C of the calibrat
 (`camera.uncertainty`) and the derivatives J of a position by them, they contribute J C J^T to a
 covariance. If positions are levelled by verticals, the tilt from the same camera depends on the
 calibration, too: errors of the mounting's tilt cancel, and effects of the lens on verticals are
-added. Without C, the calibration is assumed to have an error of a fraction of a pixel everywhere
-(`CircleSettings.calibration_px`).
+added. Without C, an error of less than a pixel is assumed (`CircleSettings.calibration_px`).
 """
 
 from __future__ import annotations
@@ -44,9 +43,8 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
     Discs above the horizon of the levelled camera are dropped.
     """
-    floor_xy, covariance, down = level_discs(
-        camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
-    )
+    tilts = tilt_arrays([tilt])
+    floor_xy, covariance, down = level_discs(camera, found.floor_xy, found.covariance, *tilts)
     by = tilt.pitch, tilt.roll
     return replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by).where(down)
 

@@ -34,8 +34,7 @@ def image_positions(
 ) -> FloatArray:
     """(..., 2) pixels of positions (..., 2) on the floor (m); NaN where not visible.
 
-    `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
-    `raised_m` higher than calibrated.
+    `levelled_by` are pitch and roll (rad) of their levelling; the camera is raised by `raised_m`.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)

@@ -92,8 +92,7 @@ def count_votes(
         across[s], ahead[s] = radius[s] / table.cell, radius[s] / table.step
     least = np.float32((_SOBEL_GAIN * (1.0 + table.paired) * least_step) ** 2)
     lines = np.empty((3, width), np.int16)
-    along_u = np.empty(width, np.float32)
-    along_v = np.empty(width, np.float32)
+    along_u, along_v = np.empty(width, np.float32), np.empty(width, np.float32)
     square = np.empty(width, np.float32)
     for k in range(len(table.image_row)):
         for i in range(3):

@@ -1,10 +1,9 @@
 """Decides which candidates are discs: a glance, then the rim, by networks trained on known truth.
 
 The candidates come from the Hough transform (`detect.discs.hough`). Most are rejected at a glance
-at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare or a sun
-patch beside a disc, a cable across it or a door's edge in front of it, the rest of its rim still is
-on a circle of the right size. A small network (`detect.discs.rim_network`) then decides from the
-grey values around the candidate and from the rim.
+at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare beside a
+disc or a cable across it, the rest still is on a circle of the right size. A small network
+(`detect.discs.rim_network`) then decides from the grey values around the candidate and the rim.
 """
 
 from __future__ import annotations

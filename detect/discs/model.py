@@ -139,8 +139,7 @@ def arcsine(x: float) -> float:
     """Arcsine, within 7e-5; x is clipped to -1 and 1."""
     a = min(abs(x), _1)
     angle: float = _HALF_PI - math.sqrt(_1 - a) * (_A0 + a * (_A1 + a * (_A2 + a * _A3)))
-    signed: float = angle if x > _0 else -angle
-    return signed
+    return angle if x > _0 else -angle
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
@@ -163,15 +162,11 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         x = patch.x[i] - x0 + _ASIDE
         y = patch.y[i] - y0
         r = math.sqrt(x * x + y * y)
-        nx = x / r
-        ny = y / r
-        g1 = patch.x1[i] * nx + patch.y1[i] * ny
-        g2 = patch.x2[i] * nx + patch.y2[i] * ny
-        g1 = g1 * g1 * variance_1
-        g2 = g2 * g2 * variance_2
+        nx, ny = x / r, y / r
+        g1, g2 = patch.x1[i] * nx + patch.y1[i] * ny, patch.x2[i] * nx + patch.y2[i] * ny
+        g1, g2 = g1 * g1 * variance_1, g2 * g2 * variance_2
         per_g = _1 / math.sqrt(g1 + g2 + _TINY)
-        by_1 = g1 * optics_1 * per_g * per_g
-        by_2 = g2 * optics_2 * per_g * per_g
+        by_1, by_2 = g1 * optics_1 * per_g * per_g, g2 * optics_2 * per_g * per_g
         steps = patch.x1[i] * patch.y2[i] - patch.x2[i] * patch.y1[i]
         t = min(steps * steps * area * per_g * per_g * per_g * per_r0, _T_LIMIT)
         z_all = (r - r0) * per_g

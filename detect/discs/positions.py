@@ -45,8 +45,7 @@ def pixel_positions(
 ) -> tuple[FloatArray, FloatArray]:
     """Floor positions (N, 2) of (N, 2) pixels (u, v), and the published (N, 2, 2) covariances.
 
-    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2) is the floor position of every
-    pixel.
+    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2): floor position of each pixel.
     """
     position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
     for k in range(len(pixels)):
@@ -68,8 +67,7 @@ def refined_covariances(
 ) -> FloatArray:
     """(N, 2, 2) covariances of the fits, plus a systematic error in pixels and the camera's tilt.
 
-    `camera_numbers` as in `camera.kernels`; the variances are per axis, square pixels and square
-    radians.
+    `camera_numbers` as in `camera.kernels`; variances per axis, square pixels, square radians.
     """
     result = fitted.copy()
     for k in range(len(floor_xy)):

@@ -110,22 +110,20 @@ class Profiles(NamedTuple):
 
 
 @kernel()
-def profiles(
-    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
-) -> Profiles:
+def profiles(image: GreyImage, numbers: FloatArray, x: float, y: float, radius: float) -> Profiles:
     """Grey values along the directions from a point (x, y) on the floor, metres.
 
-    `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
+    `radius` is the nominal one; `numbers` as in `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
-    u0, v0 = project_floor_point(camera_numbers, x, y)
+    u0, v0 = project_floor_point(numbers, x, y)
     half = 0.5 * FARTHEST
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # A parabola approximates the image of a direction to well below a tenth of a pixel.
         dx, dy = radius * COS[k], radius * SIN[k]
-        u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
-        u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
+        u1, v1 = project_floor_point(numbers, x + half * dx, y + half * dy)
+        u2, v2 = project_floor_point(numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
         for m in range(STEPS):
             u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
@@ -203,11 +201,9 @@ def fit_circle(
     r_x = r_y = r_w = 0.0
     # No branches, so that the loop is vectorised.
     for k in range(np.uint64(len(x))):
-        dx = x[k] - circle.x
-        dy = y[k] - circle.y
+        dx, dy = x[k] - circle.x, y[k] - circle.y
         d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        dx /= d
-        dy /= d
+        dx, dy = dx / d, dy / d
         w = weight[k]
         off = w * (d - circle.radius)
         s_w += w
@@ -259,11 +255,9 @@ def _choose(
 
     Points with weight 0 are missing.
     """
-    count = 0
-    changed = 0
+    count = changed = 0
     for k in range(np.uint64(len(x))):
-        dx = x[k] - circle.x
-        dy = y[k] - circle.y
+        dx, dy = x[k] - circle.x, y[k] - circle.y
         off = abs(math.sqrt(dx * dx + dy * dy) - circle.radius)
         now = weight[k] if off < wide * tolerance[k] else 0.0
         count += 1 if now > 0.0 else 0
@@ -280,8 +274,7 @@ def best_circle(
 
     The points (DIRECTIONS,) are relative to the candidate, nominal radii; those with weight 0 are
     missing. Inliers are closer to the circle than their tolerance; `best_chosen` receives the
-    weights of the best circle's inliers, 0 for the others. The square of the offset has to be added
-    to the covariance of the centre.
+    weights of the best one's, 0 for others. The offset's square has to be added to the covariance.
     """
     points = 0
     for k in range(DIRECTIONS):
@@ -326,9 +319,7 @@ def best_circle(
 
 
 @kernel()
-def follow_rim(
-    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: float
-) -> Rim:
+def follow_rim(image: GreyImage, numbers: FloatArray, radial: Profiles, contrast: float) -> Rim:
     """Trace the rim in profiles from about a candidate's centre; `agreeing` is 0 without a circle.
 
     `contrast` is approximately that of the disc to the floor, grey levels.
@@ -353,11 +344,9 @@ def follow_rim(
     squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
-        u, v = project_floor_point(
-            camera_numbers,
-            x + radius * (best.x + best.radius * COS[k]),
-            y + radius * (best.y + best.radius * SIN[k]),
-        )
+        rim_x = x + radius * (best.x + best.radius * COS[k])
+        rim_y = y + radius * (best.y + best.radius * SIN[k])
+        u, v = project_floor_point(numbers, rim_x, rim_y)
         outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
