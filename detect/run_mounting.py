@@ -47,18 +47,17 @@ class Mounting:
     def sentences(self) -> list[str]:
         """The result in words."""
         (pitch, roll), sigmas = np.degrees(self.tilt_rad), np.degrees(self.sigma_rad)
-        lines = [
+        lean = (
             f"the camera leans {pitch:.2f} +- {sigmas[0]:.2f} degrees (pitch) and {roll:.2f} +- "
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
-        ]
+        )
         if math.isnan(self.raised_m):
-            lines.append("its height is unchanged: too few discs of that radius to estimate it")
-        else:
-            lines.append(
-                f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
-                f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
-            )
-        return lines
+            return [lean, "its height is unchanged: too few discs of that radius to estimate it"]
+        height = (
+            f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
+            f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
+        )
+        return [lean, height]
 
 
 def mounting_of_run(
@@ -66,9 +65,8 @@ def mounting_of_run(
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    From the calibrated height of the camera, the tilts of N frames, and the camera's pitch (N, 3)
-    from the outlines of discs with the height changed by each of `HEIGHT_STEPS`, relative to that
-    from verticals; NaN without either.
+    From the calibrated height, the tilts of N frames, and the camera's pitch (N, 3) from outlines
+    of discs, the height changed by `HEIGHT_STEPS`, minus that from verticals; NaN without either.
     """
     run = tilt_of_run(verticals)
     if run is None:
@@ -96,8 +94,7 @@ def mounting_of_run(
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
     """The camera as it is mounted, turned about the robot's origin on the floor.
 
-    If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
-    mounting's; the rest stays.
+    If it states its covariance, that of pitch, roll and height (if known) becomes the mounting's.
     """
     turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m

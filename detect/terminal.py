@@ -64,8 +64,7 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields a function to call after every frame.
 
-    That function raises an interrupt that was lost. The bar appears with the first frame, since
-    workers may print messages until then.
+    It raises a lost interrupt. The bar appears with the first frame: until then, workers may print.
     """
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted

@@ -184,9 +184,8 @@ def _draw_discs(canvas: _Canvas, match: FrameMatch, compared: bool) -> None:
         draw_curve(canvas.picture, canvas.scaled(edge), MISSED_COLOUR, closed=True)
     drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
-    drawn += [
-        (row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in zip(match.matched, error_px(match))
-    ]
+    matched = zip(match.matched, error_px(match))
+    drawn += [(row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in matched]
     radii = (settings.inner_radius_m, settings.radius_m, settings.outer_radius_m)
     rims = []
     for row, _, edge_colour in drawn:
@@ -235,9 +234,8 @@ def _draw_markers(canvas: _Canvas, found: Sequence[MarkerLandmark]) -> None:
         spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
         for ellipse in ellipses(corners, spreads, canvas.scale * _SIGMAS, _POINTS):
             draw_curve(canvas.picture, ellipse, LINE_COLOUR, closed=True)
-        draw_curve(
-            canvas.picture, corners[0] + 3.0 * canvas.times * circle, MISSED_COLOUR, closed=True
-        )
+        first = corners[0] + 3.0 * canvas.times * circle
+        draw_curve(canvas.picture, first, MISSED_COLOUR, closed=True)
         draw_text(canvas.picture, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
 

@@ -89,9 +89,7 @@ class FrameDetections:
 def search_of(
     camera: Camera, circles: CircleSettings, lean: Lean | None
 ) -> tuple[Camera, VoteTable | DiscTable]:
-    """The camera, including its lean, and the table for its search for discs, made or loaded once
-    per process.
-    """
+    """The camera with its lean, and its table for discs, made or loaded once per process."""
     leaning = camera if lean is None else leaning_camera(camera, lean)
     return leaning, disc_table(leaning, circles)
 
@@ -312,10 +310,7 @@ def _disc_rows(
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:
-    """The lean for the search for discs in a frame, from its own tilt, in coarse steps.
-
-    The steps limit the number of tables.
-    """
+    """The lean for a frame's search for discs, from its tilt, in coarse steps: for few tables."""
     pitch, roll = (
         math.radians(_FRAME_LEAN_DEG * round(math.degrees(angle) / _FRAME_LEAN_DEG))
         for angle in (tilt.pitch, tilt.roll)

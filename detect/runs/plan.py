@@ -41,8 +41,7 @@ from redetect.plane import rotation
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
 
-#: Factor by which a search with the camera's lean must increase the evidence of discs: all
-#: verticals of a building may lean.
+#: Factor by which a search with a lean must find more evidence: a building itself may lean.
 _MORE_EVIDENCE = 1.03
 
 #: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
@@ -154,8 +153,7 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: Whether discs are not levelled, levelled by the tilt of their own frame, or, after all frames
-    #: are processed, by that of the run.
+    #: Whether discs are levelled by the tilt of their frame, after all frames by the run's, or not.
     levelling: Levelling = "frame"
     #: Lean of the camera in the search for discs; set by `detect_run`.
     lean: Lean | None = None

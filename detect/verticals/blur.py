@@ -68,9 +68,6 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
 
 
 def median_sharpness(fits: LineFits) -> float:
-    """Median sharpness of all refined edges, lines or not; 1 if there are too few.
-
-    For an even number, the lower median.
-    """
+    """The (lower) median sharpness of all refined edges, lines or not; 1 if there are too few."""
     sharpness = np.sort(fits.sharpness[~np.isnan(fits.contrast)])
     return 1.0 if len(sharpness) < _LEAST_EDGES else float(sharpness[(len(sharpness) - 1) // 2])

@@ -38,19 +38,16 @@ class StartBand(NamedTuple):
     The filter is evaluated on row s (half its length) of R rows, and every `spacing` rows after it.
     """
 
-    #: (K, W) image row of each position at which the filter is evaluated; -1 where no track may
-    #: start
+    #: (K, W) image rows at which the filter is evaluated; -1 where no track may start
     row: NDArray[np.int32]
     #: (R, W) index into the flat image of the pixel on the left of each pixel of the band
     pixel: NDArray[np.int32]
-    #: (R, W) weights of this pixel and of the one on its right: of linear interpolation, and 0
-    #: beyond the ends of the vertical
+    #: (R, W) weights of this pixel and the next, for interpolation; 0 beyond the vertical's ends
     left: Float32Array
     right: Float32Array
     #: (K, W) one over the sum of the weights that are on the vertical; 0 if there are none
     scale: Float32Array
-    #: (K, 2, T) the filter's weights across the vertical, for the strip's columns, which are a
-    #: pixel apart on the horizon only
+    #: (K, 2, T) weights across the vertical: columns are a pixel apart on the horizon only
     across: Float32Array
     #: (L,) those along it. 2r + 1 and 2s + 1 weights are followed by zeros, as in `LineFilter`.
     along: Float32Array

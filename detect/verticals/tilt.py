@@ -1,9 +1,8 @@
 """Tilt consensus: the camera's tilt from the visible verticals, and its mean square error.
 
 A calibration gives the mounting of the camera on the robot, not the robot's tilt: the robot pitches
-and rolls on its springs, and the mounting itself drifts. Verticals determine the tilt. The plane
-through the camera's centre and a vertical line contains the vertical direction, so its normal n,
-rotated by the tilt, is level:
+and rolls on its springs, and the mounting itself drifts. Verticals determine the tilt: the plane of
+the camera's centre and a vertical has a normal n that is level when rotated by the tilt:
 
     (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
 
@@ -74,8 +73,7 @@ _GRID = _polar_grid(12, 10, math.radians(0.02), math.radians(6.0))
 class TiltEstimate(NamedTuple):
     """Pitch and roll of one frame."""
 
-    #: Rotation vector (pitch, roll, 0) about the robot's X and Y that levels measured directions
-    #: (rad)
+    #: Rotation vector (pitch, roll, 0) about the robot's X and Y (rad): levels directions
     pitch_rad: float
     roll_rad: float
     covariance: FloatArray  # (2, 2) of (pitch, roll) (rad^2)
@@ -85,8 +83,7 @@ class TiltEstimate(NamedTuple):
 class Verticals(NamedTuple):
     """Constraints of the tilt by lines that may be verticals."""
 
-    #: (N, 3) unit normals, in the calibrated robot frame, of the planes through the camera and each
-    #: line
+    #: (N, 3) unit normals, in the calibrated robot frame, of planes through camera and line
     normal: FloatArray
     variance: FloatArray  # (N,) of the normals' inclinations, for verticals (rad^2)
     #: (N,) largest inclinations with which the lines count as vertical (rad)
@@ -250,8 +247,7 @@ def group_around_strongest(
 ) -> IntArray:
     """Group lines of one kind around the strongest line that is in no group yet.
 
-    Parameters are (N,) positions, radii of the groups, strengths and kinds. Returns (N,) the first
-    line of each line's group.
+    From (N,) positions, radii, strengths and kinds, finds (N,) the first line of each one's group.
     """
     group = np.full(len(place), -1)
     for strongest in strongest_first(strength):
@@ -301,9 +297,8 @@ def _error_of_tilt(
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])
-    together = group_around_strongest(
-        bearing, np.full(count, TOGETHER_RAD), lines.weight, np.zeros(count)
-    )
+    reach, kind = np.full(count, TOGETHER_RAD), np.zeros(count)
+    together = group_around_strongest(bearing, reach, lines.weight, kind)
     edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
     xx, xy, yy = _stretch(groups, tilt, prior)
     n = grid.shape[1]
