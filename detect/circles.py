@@ -47,8 +47,7 @@ _LEAST_NOISE = 1.0
 #: The same in fits: that of rounded grey values.
 _ROUNDING_NOISE = 0.3
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
-#: Number of rows from which an image's noise is estimated.
-_NOISE_ROWS = 16
+_NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 #: Lowest gradient of an edge that votes, and in images full of edges, grey levels per pixel.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
 _EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from redetect.messages import OneLineError
 
-#: Exit code if some frames could not be processed; the others were.
-EXIT_FRAMES_FAILED = 3
+EXIT_FRAMES_FAILED = 3  #: Exit code if some frames could not be processed; the others were.
 
 
 class DetectError(OneLineError, ValueError):

@@ -12,7 +12,8 @@ Calibration errors are common to all rows. With the covariance C of the calibrat
 (`camera.uncertainty`) and the derivatives J of a position by them, they contribute J C J^T to a
 covariance. If positions are levelled by verticals, the tilt from the same camera depends on the
 calibration, too: errors of the mounting's tilt cancel, and effects of the lens on verticals are
-added. Without C, an error of less than a pixel is assumed (`CircleSettings.calibration_px`).
+added. Without C, the calibration is assumed to have an error of a fraction of a pixel everywhere
+(`CircleSettings.calibration_px`).
 """
 
 from __future__ import annotations
@@ -32,8 +33,7 @@ from detect.projection import level_positions
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames
 
-#: Step of central differences of levelled positions, metres and radians.
-_STEP = 1e-6
+_STEP = 1e-6  #: Step of central differences of levelled positions, metres and radians.
 
 _tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 

@@ -9,7 +9,8 @@ The stages of an image, each in its own function:
     again           doubtful tracks, followed along the verticals of that tilt
     lines           bearings; one line for each edge, close ones joined
 
-If all edges are blurred, all stages are repeated with wider filters (`detect.verticals.blur`).
+If all edges are blurred, everything is repeated with filters as wide as the blur
+(`detect.verticals.blur`).
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ from redetect.plane import chain_steps
 
 Tilt = tuple[float, float]
 
-#: Lower bound of the gate in the image, for small discs (px).
-LEAST_GATE_PX = 3.0
+LEAST_GATE_PX = 3.0  #: Lower bound of the gate in the image, for small discs (px).
 #: Deviations of the unknown tilt by which rows that are not levelled may be off from level ones.
 _TILT_GATE = 3.0
 _POINTS = 64
@@ -34,7 +33,8 @@ def image_positions(
 ) -> FloatArray:
     """(..., 2) pixels of positions (..., 2) on the floor (m); NaN where not visible.
 
-    `levelled_by` are pitch and roll (rad) of their levelling; the camera is raised by `raised_m`.
+    `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
+    `raised_m` higher than calibrated.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)

@@ -26,8 +26,7 @@ from redetect.array_types import FloatArray
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
-#: Number of neighbouring frames that see the same discs.
-_TOGETHER = 5.0
+_TOGETHER = 5.0  #: Number of neighbouring frames that see the same discs.
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
 _LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
@@ -94,7 +93,8 @@ def mounting_of_run(
 def remounted(camera: Camera, mounting: Mounting) -> Camera:
     """The camera as it is mounted, turned about the robot's origin on the floor.
 
-    If it states its covariance, that of pitch, roll and height (if known) becomes the mounting's.
+    If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
+    mounting's; the rest stays.
     """
     turn = level_matrix(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m

@@ -54,8 +54,7 @@ LASTING_SHARE, LASTING = 0.5, 0.9
 STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
 #: Share of frames with a momentary tilt (a wheel on a sill or a cable), and its size (rad).
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
-#: Least standard deviation of a frame's tilt (rad).
-_LEAST_RAD = math.radians(0.02)
+_LEAST_RAD = math.radians(0.02)  #: Least standard deviation of a frame's tilt (rad).
 
 
 class FrameTilts(NamedTuple):

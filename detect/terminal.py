@@ -64,7 +64,8 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[], None]]:
     """A progress bar with the rate, on a terminal; yields a function to call after every frame.
 
-    It raises a lost interrupt. The bar appears with the first frame: until then, workers may print.
+    That function raises an interrupt that was lost. The bar appears with the first frame, since
+    workers may print messages until then.
     """
     if not sys.stderr.isatty() or is_quiet():
         yield raise_if_interrupted

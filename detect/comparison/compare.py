@@ -55,8 +55,7 @@ from redetect.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
 _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
-# Files have six digits: a smaller sigma is meaningless.
-LEAST_SIGMA_RAD = 1e-12
+LEAST_SIGMA_RAD = 1e-12  # Files have six digits: a smaller sigma is meaningless.
 
 #: Deviation from whole pixels that rounding positions to six digits causes.
 _WHOLE_PX = 0.01

@@ -21,8 +21,7 @@ from redetect.tables import Table
 
 Kind = Literal["circles", "lines"]
 
-#: Number of worst frames to list.
-WORST_FRAMES = 10
+WORST_FRAMES = 10  #: Number of worst frames to list.
 
 
 class FrameMatch(NamedTuple):

@@ -42,8 +42,7 @@ Stage = Literal[
 _STAGES: dict[Fate, Stage] = {Fate.FEW_STEPS: "steps", Fate.GLANCE: "glance", Fate.NO_RIM: "rim"}
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
-#: Largest distance of a candidate from the given position, radii.
-_NEAR = 1.5
+_NEAR = 1.5  #: Largest distance of a candidate from the given position, radii.
 #: Relative deviation of the rims' median radius from the expected one that causes a suggestion.
 _OTHER_RADIUS = 0.04
 _FEWEST_RIMS = 5

@@ -74,12 +74,9 @@ _TERMS = 12
 
 #: Steps of the fit; the first ones reject no sector, since the start may be off.
 _STEPS, _EARLY = 12, 1
-#: The iteration stops after a shorter step, nominal radii.
-_ARRIVED = 5e-3
-#: Longest step, nominal radii (and log blur).
-_LONGEST, _LONGEST_BLUR = 0.2, 0.7
-#: Largest offset of a fit by parts from its start, radii.
-_MOST_OFF = 0.3
+_ARRIVED = 5e-3  #: The iteration stops after a shorter step, nominal radii.
+_LONGEST, _LONGEST_BLUR = 0.2, 0.7  #: Longest step, nominal radii (and log blur).
+_MOST_OFF = 0.3  #: Largest offset of a fit by parts from its start, radii.
 #: Bounds of the blur, pixels, and of the radius, nominal radii.
 _LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
 _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
@@ -97,7 +94,7 @@ _LEAST_SECTORS, _COUNTS = 5, 0.1
 _FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
 #: Offset of an edge at which its weight is one half, in the early steps, deviations.
 _FAR_EARLY = 2.0
-#: Residual at which a pixel's weight is 0, deviations; share of Gaussian variance that is left.
+#: Residual at which a pixel's weight is 0, deviations; share of Gaussian variance it leaves.
 _FAR_PIXEL, _SHARE_LEFT = 4.0, 0.77
 #: Lower bound of a pixel's weight, so that its residual can be recovered.
 _LEAST_TRUST = F32(1e-3)

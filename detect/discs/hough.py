@@ -37,8 +37,7 @@ _MOST_COMPARED = 600  #: Candidates that are compared with their neighbours, unl
 _MOST_PEAKS = 4000
 #: Least distance from a better candidate, radii; less than 2, for discs may touch.
 _APART = 0.6
-#: The Sobel kernel scales a gradient per pixel by this.
-_SOBEL_GAIN = 8.0
+_SOBEL_GAIN = 8.0  #: The Sobel kernel scales a gradient per pixel by this.
 
 
 class HoughCandidates(NamedTuple):

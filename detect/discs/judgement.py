@@ -48,18 +48,13 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.3
-#: Threshold of the log-odds of a glance.
-_LEAST_GLANCE = 0.0
-#: Least share of the rim that has to be on a circle.
-LEAST_RIM = 0.3
-#: Most likely radius of a rim, relative to the nominal one.
-RIM_RADIUS = 0.98
+_LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
+LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
+RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
 #: A rim is traced again, from its own centre, unless it is hopeless or its log-odds exceed this.
 _CERTAIN = 2.5
-#: The second trace may lose this share of the rim and still be preferred.
-_SLACK = 0.07
-#: Two rims closer than this share of the radius are the same.
-_SAME = 0.1
+_SLACK = 0.07  #: The second trace may lose this share of the rim and still be preferred.
+_SAME = 0.1  #: Two rims closer than this share of the radius are the same.
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 

@@ -102,8 +102,7 @@ _TINY = F32(1e-12)
 _PER_32 = F32(0.5 / 32.0)
 _E2, _E3, _E4, _E5 = F32(1 / 2), F32(1 / 6), F32(1 / 24), F32(1 / 120)
 _PER_ROOT_2PI = F32(1.0 / math.sqrt(2.0 * math.pi))
-#: Deviations beyond which the normal distribution is cut off.
-_FAR = F32(5.0)
+_FAR = F32(5.0)  #: Deviations beyond which the normal distribution is cut off.
 # Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
 _TAIL = F32(0.2316419)
 _B1, _B2, _B3 = F32(0.319381530), F32(-0.356563782), F32(1.781477937)

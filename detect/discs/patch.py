@@ -50,8 +50,7 @@ PATCH = np.dtype(
 #: Number of sectors around a disc's centre, and tangents of the angles that separate them.
 SECTORS = 16
 _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
-#: Sectors are padded to a multiple of this number of pixels.
-_SECTOR_WHOLE = 8
+_SECTOR_WHOLE = 8  #: Sectors are padded to a multiple of this number of pixels.
 
 #: Formula of the shares, and the axis of the chords: see `detect.discs.model`.
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
@@ -60,8 +59,7 @@ EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 #: semi-minor axis is shorter than this number of standard deviations of the blur.
 _MOST_CURVED = 0.25
 _LEAST_HALF_AXIS = 4.0
-#: Half width of the edge, standard deviations of the blur.
-_EDGE_BLURS = 2.0
+_EDGE_BLURS = 2.0  #: Half width of the edge, standard deviations of the blur.
 #: In windows of more pixels than this, those off the edge are subsampled.
 _DENSE_WINDOW = 2048
 #: Of this many neighbouring pixels at the edge, two are taken, so that their correlation is known:

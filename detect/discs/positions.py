@@ -15,8 +15,7 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
-#: Step of the central differences of the projection, metres.
-_STEP_M = 1e-5
+_STEP_M = 1e-5  #: Step of the central differences of the projection, metres.
 #: The published covariance: this standard deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M, PUBLISHED_PIXEL_VARIANCE = 0.04, 2.0
 

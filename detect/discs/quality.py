@@ -126,7 +126,8 @@ def find_centres(
 ) -> Centres:  # fmt: skip
     """Find the centres of a `lut.DiscTable` within some limits.
 
-    `grey` is the image in scan order, padded to at least `GROUP_COLUMNS` pixels; `outside`: H W.
+    `grey` is the image in scan order, H W pixels, padded to at least `GROUP_COLUMNS` pixels;
+    `outside` is H W.
     """
     least_part = _F32((1.0 - _ROUNDING) * limits.part_quality)
     both = _with_squares(grey, groups.begin, groups.end)

@@ -25,14 +25,11 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Directions from the centre of a candidate.
-DIRECTIONS = 32
-#: Steps along each of the `DIRECTIONS` in which the rim is searched.
-STEPS = 32
+DIRECTIONS = 32  #: Directions from the centre of a candidate.
+STEPS = 32  #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
-#: Least step of the grey value, as a share of the disc's contrast.
-LEAST_STEP = 0.35
+LEAST_STEP = 0.35  #: Least step of the grey value, as a share of the disc's contrast.
 #: Tolerance of a point on the circle: a share of the radius plus a number of pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 #: Relative standard deviation of the prior on the radius: for finding the circle (the calibrated
@@ -40,13 +37,11 @@ TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
-#: Least number of points on a circle.
-LEAST_POINTS = 6
+LEAST_POINTS = 6  #: Least number of points on a circle.
 #: Least number of points for placing a circle; its steps, and the deviations that make an outlier.
 LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
-#: Number of neighbouring points with a common error.
-_ALIKE = 1.5
+_ALIKE = 1.5  #: Number of neighbouring points with a common error.
 #: Distance of the circle's starts from the candidate, nominal radii; the first is the candidate.
 _START = 0.3
 _STARTS = 9
@@ -54,15 +49,12 @@ _START_X, _START_Y = (
     np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
     for of in (np.cos, np.sin)
 )
-#: Penalty, in points, for each squared deviation of the radius.
-_POINTS_PER_SIGMA = 0.5
-#: Log-odds that each point on a circle adds to it.
-_PER_POINT = 0.5
+_POINTS_PER_SIGMA = 0.5  #: Penalty, in points, for each squared deviation of the radius.
+_PER_POINT = 0.5  #: Log-odds that each point on a circle adds to it.
 #: Number of steps from each start, and the longest step, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
-#: Iteration stops at a shorter step with the same inliers, nominal radii.
-_ARRIVED = 1e-4
+_ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
@@ -274,7 +266,8 @@ def best_circle(
 
     The points (DIRECTIONS,) are relative to the candidate, nominal radii; those with weight 0 are
     missing. Inliers are closer to the circle than their tolerance; `best_chosen` receives the
-    weights of the best one's, 0 for others. The offset's square has to be added to the covariance.
+    weights of the best circle's inliers, 0 for the others. The square of the offset has to be added
+    to the covariance of the centre.
     """
     points = 0
     for k in range(DIRECTIONS):

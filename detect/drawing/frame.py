@@ -50,10 +50,8 @@ _WORDS_COLOUR: Colour = (230, 230, 230)
 _SUBPIXEL_BITS = 4
 # OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Text and strokes are enlarged in proportion to pictures of this width.
-_COLUMNS = 750
-# A label is moved down by at most this many of its heights.
-_LABELS_DOWN = 2
+_COLUMNS = 750  # Text and strokes are enlarged in proportion to pictures of this width.
+_LABELS_DOWN = 2  # A label is moved down by at most this many of its heights.
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)

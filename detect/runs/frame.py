@@ -65,10 +65,8 @@ FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgErro
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-#: Steps of the lean of a single frame, degrees.
-_FRAME_LEAN_DEG = 2.0
-#: Largest number of pixels that are decoded at once.
-PIXELS_AT_ONCE = 1 << 25
+_FRAME_LEAN_DEG = 2.0  #: Steps of the lean of a single frame, degrees.
+PIXELS_AT_ONCE = 1 << 25  #: Largest number of pixels that are decoded at once.
 
 
 @dataclass

@@ -38,8 +38,7 @@ _Tilted = tuple[str, int, FrameTilt | None]
 _LEAST_LEAN_DEG = 0.5
 #: Standard deviation of a tilt that is known exactly: covariances in files are positive definite.
 _LEAST_SIGMA_RAD = 1e-6
-#: Number of frames whose discs are levelled at once.
-_LEVELLED_AT_ONCE = 64
+_LEVELLED_AT_ONCE = 64  #: Number of frames whose discs are levelled at once.
 
 
 def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt | None, float]:

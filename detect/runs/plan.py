@@ -137,8 +137,7 @@ class MapByImage:
         return circle_landmarks(xy[near], np.zeros(len(near)), spread, self._discs.ids[near])
 
 
-#: Number of failures whose messages a summary keeps.
-KEPT_FAILURES = 100
+KEPT_FAILURES = 100  #: Number of failures whose messages a summary keeps.
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,8 @@ class FramePlan:
     circles: CircleSettings | None = None
     markers: MarkerSettings | None = None
     json: bool = False  # whether discs are written as JSON as well; set by `detect_run`
-    #: Whether discs are levelled by the tilt of their frame, after all frames by the run's, or not.
+    #: Whether discs are not levelled, levelled by the tilt of their own frame, or, after all frames
+    #: are processed, by that of the run.
     levelling: Levelling = "frame"
     #: Lean of the camera in the search for discs; set by `detect_run`.
     lean: Lean | None = None

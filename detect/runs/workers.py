@@ -45,10 +45,8 @@ _DEADLY_FRAMES = 10
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Number of frames for which starting another process pays off.
-FRAMES_PER_PROCESS = 500
-#: Largest number of processes: more than cores and memory are good for.
-_MOST_JOBS = 1000
+FRAMES_PER_PROCESS = 500  #: Number of frames for which starting another process pays off.
+_MOST_JOBS = 1000  #: Largest number of processes: more than cores and memory are good for.
 #: Frames per chunk.
 _TOGETHER = 16
 _WINDOW_PER_WORKER = 3

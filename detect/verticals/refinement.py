@@ -29,10 +29,8 @@ from redetect.compiled import kernel
 
 #: Sub-pixel positions for which weights are tabulated; between them, the derivative interpolates.
 SUBPIXELS = 64
-#: Standard deviations beyond which the Gaussian is negligible.
-_REACH = 4.4
-#: A step is not repeated if it moved all rows by less than this, pixels.
-_STILL_PX = 0.02
+_REACH = 4.4  #: Standard deviations beyond which the Gaussian is negligible.
+_STILL_PX = 0.02  #: A step is not repeated if it moved all rows by less than this, pixels.
 
 
 class LineFits(NamedTuple):

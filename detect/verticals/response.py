@@ -28,12 +28,10 @@ from redetect.compiled import kernel
 
 #: Subtracted from grey values, so that small variances are accurate in single precision.
 MIDDLE_GREY = np.float32(128.0)
-#: Rows of a stripe in which the response is evaluated.
-STRIPE_ROWS = 16
+STRIPE_ROWS = 16  #: Rows of a stripe in which the response is evaluated.
 #: Least number of columns in which it is evaluated; the stripe's width is a multiple of `_VECTOR`.
 _LEAST_COLUMNS, _VECTOR = 8, 8
-#: Weights along the path that are applied at a time.
-_TOGETHER = 7
+_TOGETHER = 7  #: Weights along the path that are applied at a time.
 
 
 class LineFilter(NamedTuple):

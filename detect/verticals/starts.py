@@ -28,8 +28,7 @@ from redetect.compiled import kernel
 _CROSSED = 3
 #: Largest distance of a chain's maxima on neighbouring rows of the band, columns.
 _APART = 1.5
-#: Least number of maxima of a chain if starts have to be on chains.
-_LEAST = 2
+_LEAST = 2  #: Least number of maxima of a chain if starts have to be on chains.
 
 
 class StartBand(NamedTuple):
@@ -42,12 +41,14 @@ class StartBand(NamedTuple):
     row: NDArray[np.int32]
     #: (R, W) index into the flat image of the pixel on the left of each pixel of the band
     pixel: NDArray[np.int32]
-    #: (R, W) weights of this pixel and the next, for interpolation; 0 beyond the vertical's ends
+    #: (R, W) weights of this pixel and of the one on its right: of linear interpolation, and 0
+    #: beyond the ends of the vertical
     left: Float32Array
     right: Float32Array
     #: (K, W) one over the sum of the weights that are on the vertical; 0 if there are none
     scale: Float32Array
-    #: (K, 2, T) weights across the vertical: columns are a pixel apart on the horizon only
+    #: (K, 2, T) the filter's weights across the vertical, for the strip's columns, which are a
+    #: pixel apart on the horizon only
     across: Float32Array
     #: (L,) those along it. 2r + 1 and 2s + 1 weights are followed by zeros, as in `LineFilter`.
     along: Float32Array

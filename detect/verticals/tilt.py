@@ -39,19 +39,16 @@ from redetect.compiled import kernel
 
 #: Number of times the tilt is estimated again from the lines that agree with it.
 REFINEMENTS = 6
-#: Scale of the Cauchy weights, standard deviations.
-SOFTENING = 2.0
+SOFTENING = 2.0  #: Scale of the Cauchy weights, standard deviations.
 
 #: Values of the scatter of verticals about the vertical (rad), and their prior probabilities.
 SCATTER_RAD = (math.radians(0.05), math.radians(0.2), math.radians(0.6))
 SCATTER_SHARE = (0.2, 0.4, 0.4)
-#: Lines whose bearings differ less than this lean together (rad).
-TOGETHER_RAD = 0.15
+TOGETHER_RAD = 0.15  #: Lines whose bearings differ less than this lean together (rad).
 #: Half width at half maximum of the inclinations of lines that are not vertical (rad).
 STRAY_RAD = math.radians(1.0)
 
-#: Least ratio of the axes of the stretched grid.
-_SLENDEREST = 0.1
+_SLENDEREST = 0.1  #: Least ratio of the axes of the stretched grid.
 
 
 def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) -> FloatArray:
@@ -73,7 +70,8 @@ _GRID = _polar_grid(12, 10, math.radians(0.02), math.radians(6.0))
 class TiltEstimate(NamedTuple):
     """Pitch and roll of one frame."""
 
-    #: Rotation vector (pitch, roll, 0) about the robot's X and Y (rad): levels directions
+    #: Rotation vector (pitch, roll, 0) about the robot's X and Y that levels measured directions
+    #: (rad)
     pitch_rad: float
     roll_rad: float
     covariance: FloatArray  # (2, 2) of (pitch, roll) (rad^2)
@@ -247,7 +245,8 @@ def group_around_strongest(
 ) -> IntArray:
     """Group lines of one kind around the strongest line that is in no group yet.
 
-    From (N,) positions, radii, strengths and kinds, finds (N,) the first line of each one's group.
+    Parameters are (N,) positions, radii of the groups, strengths and kinds. Returns (N,) the first
+    line of each line's group.
     """
     group = np.full(len(place), -1)
     for strongest in strongest_first(strength):
