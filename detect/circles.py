@@ -3,9 +3,8 @@
 The entry point is `detect_circles`. The published detector (DLR Spatial Cognition data set report,
 circle detection) needs only the quality of each centre: it accepts centres of sufficient quality
 and contrast, keeps the best within a disc's width, and reports the pixel with a covariance of one
-pixel and some centimetres. The default detector uses rims: edges vote for centres, the rim around
-each of the best is traced and classified, and fitting a disc through the camera model gives the
-position.
+pixel and some centimetres. The default detector uses rims: edges vote for centres, the rims around
+the best are traced and classified, and fits through the camera model give the positions.
 """
 
 from __future__ import annotations
@@ -48,8 +47,7 @@ _LEAST_NOISE = 1.0
 #: The same in fits: that of rounded grey values.
 _ROUNDING_NOISE = 0.3
 _SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
-#: Number of rows from which an image's noise is estimated.
-_NOISE_ROWS = 16
+_NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 #: Lowest gradient of an edge that votes, and in images full of edges, grey levels per pixel.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
 _EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.
@@ -156,15 +154,13 @@ def within_margins(
     """
     left, right = blank_margins(image)
     if left or right:
-        camera, table = _between_margins(camera, left, right, vote_shape(settings))
+        camera, table = _cropped(camera, left, right, vote_shape(settings))
         image = np.ascontiguousarray(image[:, left : left + camera.width])
     return image, camera, table, left
 
 
 @lru_cache(maxsize=8)
-def _between_margins(
-    camera: Camera, left: int, right: int, shape: VoteShape
-) -> tuple[Camera, VoteTable]:
+def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[Camera, VoteTable]:
     """The camera of an image without its margins, and its table."""
     width, offset_x = camera.width - left - right, camera.offset_x - left
     camera = replace(camera, width=width, offset_x=offset_x)

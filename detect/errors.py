@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from redetect.messages import OneLineError
 
-#: Exit code if some frames could not be processed; the others were.
-EXIT_FRAMES_FAILED = 3
+EXIT_FRAMES_FAILED = 3  #: Exit code if some frames could not be processed; the others were.
 
 
 class DetectError(OneLineError, ValueError):
-    """A run or setting that cannot be processed.
-
-    The message names the file or the setting, its value and what was expected.
-    """
+    """An invalid run or setting; the message names file or setting, value and what was expected."""
 
 
 class FrameError(OneLineError, ValueError):

@@ -10,8 +10,7 @@ from redetect.compiled import kernel
 
 #: If fewer pixels than this are neither black nor saturated, all are used for the noise.
 _LEAST_COUNTABLE = 100
-#: Bounds of the grey values that count.
-_DARK, _LIGHT = 2, 253
+_DARK, _LIGHT = 2, 253  #: Bounds of the grey values that count.
 #: The mask's absolute coefficients add up to 16, so no response is larger.
 _MOST_RESPONSE = 16 * 255
 
@@ -22,8 +21,7 @@ _LEAST_SHARE = 0.5  #: Of that column's pixels, with such a step.
 _COLUMNS = 8
 #: If a larger share of the width is blank, it is a blank scene, not a margin.
 _LARGEST_SHARE = 0.05
-#: Spacing of the rows in which margins are searched for.
-_ROWS_APART = 4
+_ROWS_APART = 4  #: Spacing of the rows in which margins are searched for.
 
 
 def plain_image(image: GreyImage, shape: tuple[int, int] | None = None) -> GreyImage:

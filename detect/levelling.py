@@ -33,8 +33,7 @@ from detect.projection import level_positions
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames
 
-#: Step of central differences of levelled positions, metres and radians.
-_STEP = 1e-6
+_STEP = 1e-6  #: Step of central differences of levelled positions, metres and radians.
 
 _tilt_by_parameters = lru_cache(maxsize=4)(tilt_by_parameters)
 
@@ -44,9 +43,8 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
 
     Discs above the horizon of the levelled camera are dropped.
     """
-    floor_xy, covariance, down = level_discs(
-        camera, found.floor_xy, found.covariance, *tilt_arrays([tilt])
-    )
+    tilts = tilt_arrays([tilt])
+    floor_xy, covariance, down = level_discs(camera, found.floor_xy, found.covariance, *tilts)
     by = tilt.pitch, tilt.roll
     return replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by).where(down)
 

@@ -135,13 +135,11 @@ class LineSettings:
 
     def __post_init__(self) -> None:
         demand_fields(self, DetectError)
-        for scale, farthest in self.refine_steps_px:
+        for scale, most in self.refine_steps_px:
             if not 0.3 <= scale < 20.0:
                 raise DetectError(f"refine_steps_px is {scale:g}: expected a width of 0.3 to 20")
-            if not farthest >= 0.0:
-                raise DetectError(
-                    f"refine_steps_px is {farthest:g}: expected a distance, 0 or more"
-                )
+            if not most >= 0.0:
+                raise DetectError(f"refine_steps_px is {most:g}: expected a distance, 0 or more")
 
     def least_points(self, row_aspect: float) -> int:
         """Least number of points of a line, given the height of a row in pixel widths."""

@@ -136,8 +136,7 @@ def carry_ids(
     """Detected lines of a frame with the IDs of unambiguously matching reference rows.
 
     A reference row whose bearing matches exactly one detected line (within half a degree or two
-    standard deviations) gives that line its IDs; a joined line can get several, and a line without
-    a match has -1.
+    standard deviations) gives it its IDs; a joined line can get several, one without a match -1.
     """
     alpha = np.array([row.alpha for row in rows])
     reach = np.maximum(_SAME_LINE_RAD, 2.0 * np.array([row.sigma for row in rows]))
@@ -146,6 +145,5 @@ def carry_ids(
         fits = np.flatnonzero(np.abs(wrap_angle(alpha - row.alpha)) <= reach)
         if len(fits) == 1:
             ids[fits[0]] += [i for i in row.ids if i >= 0]
-    return tuple(
-        replace(row, ids=tuple(dict.fromkeys(own)) if own else (-1,)) for row, own in zip(rows, ids)
-    )
+    carried = (tuple(dict.fromkeys(own)) or (-1,) for own in ids)
+    return tuple(replace(row, ids=own) for row, own in zip(rows, carried))

@@ -22,8 +22,7 @@ from redetect.plane import chain_steps
 
 Tilt = tuple[float, float]
 
-#: Lower bound of the gate in the image, for small discs (px).
-LEAST_GATE_PX = 3.0
+LEAST_GATE_PX = 3.0  #: Lower bound of the gate in the image, for small discs (px).
 #: Deviations of the unknown tilt by which rows that are not levelled may be off from level ones.
 _TILT_GATE = 3.0
 _POINTS = 64

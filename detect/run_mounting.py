@@ -26,8 +26,7 @@ from redetect.array_types import FloatArray
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
-#: Number of neighbouring frames that see the same discs.
-_TOGETHER = 5.0
+_TOGETHER = 5.0  #: Number of neighbouring frames that see the same discs.
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
 _LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
@@ -47,18 +46,17 @@ class Mounting:
     def sentences(self) -> list[str]:
         """The result in words."""
         (pitch, roll), sigmas = np.degrees(self.tilt_rad), np.degrees(self.sigma_rad)
-        lines = [
+        lean = (
             f"the camera leans {pitch:.2f} +- {sigmas[0]:.2f} degrees (pitch) and {roll:.2f} +- "
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
-        ]
+        )
         if math.isnan(self.raised_m):
-            lines.append("its height is unchanged: too few discs of that radius to estimate it")
-        else:
-            lines.append(
-                f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
-                f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
-            )
-        return lines
+            return [lean, "its height is unchanged: too few discs of that radius to estimate it"]
+        height = (
+            f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
+            f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
+        )
+        return [lean, height]
 
 
 def mounting_of_run(
@@ -66,9 +64,8 @@ def mounting_of_run(
 ) -> Mounting | None:
     """Estimate the mounting from a run; None if too few frames have a tilt from verticals.
 
-    From the calibrated height of the camera, the tilts of N frames, and the camera's pitch (N, 3)
-    from the outlines of discs with the height changed by each of `HEIGHT_STEPS`, relative to that
-    from verticals; NaN without either.
+    From the calibrated height, the tilts of N frames, and the camera's pitch (N, 3) from outlines
+    of discs, the height changed by `HEIGHT_STEPS`, minus that from verticals; NaN without either.
     """
     run = tilt_of_run(verticals)
     if run is None:

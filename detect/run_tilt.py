@@ -50,13 +50,11 @@ OUTLINE_PITCH_PER_HEIGHT = 0.45
 _UNSURE_STATED_RAD, _UNSURE_RAD = math.radians(0.5), _OFFSET_RAD
 #: Correlated share of the variance of a frame's error (a scene stays visible), and its correlation.
 LASTING_SHARE, LASTING = 0.5, 0.9
-#: Share of frames with an outlier of the tilt, and its standard deviation (rad): a consensus of
-#: lines that are not vertical.
+#: Share of frames with an outlier, a consensus of wrong lines, and its standard deviation (rad).
 STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
 #: Share of frames with a momentary tilt (a wheel on a sill or a cable), and its size (rad).
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
-#: Least standard deviation of a frame's tilt (rad).
-_LEAST_RAD = math.radians(0.02)
+_LEAST_RAD = math.radians(0.02)  #: Least standard deviation of a frame's tilt (rad).
 
 
 class FrameTilts(NamedTuple):
@@ -169,9 +167,7 @@ def usual_tilt(verticals: FrameTilts, outlines: FrameTilts) -> float:
     By the median square of those from verticals, or else from outlines, without the variance of
     their errors; the prior counts like as many frames as would determine it as well.
     """
-    tilt, variance = (
-        np.where(verticals.known[:, None], *both) for both in zip(verticals, outlines)
-    )
+    tilt, variance = (np.where(verticals.known[:, None], *of) for of in zip(verticals, outlines))
     # Half of two normal errors have a sum of squares below ln 4 times their variance.
     squares = np.sum(tilt**2, axis=1) / math.log(4.0) - np.mean(variance, axis=1)
     prior = np.full(round(0.25 / _LOG_SPREAD_SIGMA**2), _SPREAD_RAD**2)
@@ -187,9 +183,8 @@ def _tilt_by_outlines(
     What all outlines show may be the camera's lean or an error of the calibration: `unsure` is the
     standard deviation of either (rad).
     """
-    information = np.stack(
-        [np.where(of.known[:, None], 1.0 / of.variance, 0.0) for of in (verticals, outlines)]
-    )
+    both = verticals, outlines
+    information = np.stack([np.where(of.known[:, None], 1.0 / of.variance, 0.0) for of in both])
     total = information.sum(axis=0)
     weighted = (information * np.nan_to_num([verticals.tilt, outlines.tilt])).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -242,15 +237,11 @@ class _Series(NamedTuple):
     def smoothed(self, axis: _Axis) -> tuple[float, FloatArray, FloatArray]:
         """The log-likelihood of the parameters; deviations from the constant, their variances.
 
-        The weighted means of verticals and outlines, which are smoothed, and their differences
-        together contain all information.
+        Their weighted means, which are smoothed, and differences together contain all information.
         """
-        variance = np.stack(
-            [
-                axis.verticals_scale**2 * self.verticals_variance,
-                axis.outlines_scale**2 * self.outlines_variance,
-            ]
-        )
+        of_verticals = axis.verticals_scale**2 * self.verticals_variance
+        of_outlines = axis.outlines_scale**2 * self.outlines_variance
+        variance = np.stack([of_verticals, of_outlines])
         values = np.stack([self.verticals, self.outlines - axis.offset])
         information = np.where(np.isfinite(values), 1.0 / variance, 0.0)
         total = information.sum(axis=0)
@@ -296,9 +287,7 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
     # The logarithm of the verticals' factor, then each axis's parameters in the order of `axes_of`.
     of_axis = [math.inf, _LOG_SPREAD_SIGMA, _LOG_FRAMES_SIGMA, _LOG_FACTOR_SIGMA, math.inf]
     prior_sigma = np.array([_LOG_FACTOR_SIGMA] + of_axis * len(series))
-    is_free = np.array(
-        [has_outlines] + [True, True, True, has_outlines, has_outlines] * len(series)
-    )
+    is_free = np.array([has_outlines] + ([True] * 3 + [has_outlines] * 2) * len(series))
 
     def axes_of(unknowns: FloatArray) -> list[_Axis]:
         return [
@@ -372,8 +361,7 @@ def smooth_axis(
     standard deviation; both are first-order autoregressive, since wrong verticals (a tree, a
     curtain) stay visible. A measurement is x + a u + white noise, or an outlier. The two filtered
     densities are merged into a Gaussian with the same moments before the next frame. The smoothed
-    residual of a frame's measurement may be an outlier or a jump of the robot; mean and variance
-    are those of the mixture.
+    residual may be an outlier or a jump of the robot: mean and variance are the mixture's.
 
     From (N,) measured angles minus the lean (rad; NaN if missing), their standard deviations and
     that of x, and the correlation of x from frame to frame, returns the log-likelihood of the

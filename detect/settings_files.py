@@ -51,12 +51,9 @@ def read_settings(path: Path) -> SettingsFile:
     given = document.get("settings") if isinstance(document, dict) else None
     if not isinstance(given, dict):
         raise DetectError(f'{path}: no "settings": expected those of circles, lines or markers')
+    kinds = get_type_hints(SettingsFile).items()
     try:
-        return SettingsFile(
-            checked_settings("circles", given.get("circles", {}), CircleSettings),
-            checked_settings("lines", given.get("lines", {}), LineSettings),
-            checked_settings("markers", given.get("markers", {}), MarkerSettings),
-        )
+        return SettingsFile(**{n: checked_settings(n, given.get(n, {}), k) for n, k in kinds})
     except DetectError as error:
         raise DetectError(f"{path}: {error}") from None
 

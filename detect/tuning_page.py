@@ -92,6 +92,7 @@ class TuningSession:
             raise DetectError(str(frame.error))
         found = frame.discs
         explained = explain_discs(frame.image, self.run.camera, settings)
+        rows = zip(found.floor_xy, found.covariance, found.quality, found.evidence, strict=True)
         discs = [
             {
                 "x": float(xy[0]),
@@ -102,9 +103,7 @@ class TuningSession:
                 "outline": self._outline(xy, settings.radius_m),
                 "ellipse": ellipses(xy, c, _SIGMAS, _OUTLINE).tolist(),
             }
-            for xy, c, quality, evidence in zip(
-                found.floor_xy, found.covariance, found.quality, found.evidence, strict=True
-            )
+            for xy, c, quality, evidence in rows
         ]
         rejected = [
             {**row, "outline": self._outline((row["x_m"], row["y_m"]), settings.radius_m)}

@@ -55,8 +55,7 @@ from redetect.messages import excerpt
 
 # Edges of the ranges of forward distances (m).
 _EDGES_M = (-np.inf, 0.8, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, np.inf)
-# Files have six digits: a smaller sigma is meaningless.
-LEAST_SIGMA_RAD = 1e-12
+LEAST_SIGMA_RAD = 1e-12  # Files have six digits: a smaller sigma is meaningless.
 
 #: Deviation from whole pixels that rounding positions to six digits causes.
 _WHOLE_PX = 0.01
@@ -231,19 +230,15 @@ def compare_frames(
 
 def _at_whole_pixels(matches: Iterable[FrameMatch]) -> bool:
     """Whether all matched reference rows are at whole pixels, like those of the data set."""
-    of_frames = [
-        m.projection.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.projection
-    ]
-    px = np.concatenate([np.zeros((0, 2)), *of_frames])
+    seen = [m.projection.reference_px(circle_arrays(m.wanted).xy) for m in matches if m.projection]
+    px = np.concatenate([np.zeros((0, 2)), *seen])
     return len(px) > 0 and bool(np.abs(px - np.rint(px)).max() < _WHOLE_PX)
 
 
 def _image_cost(matches: Iterable[FrameMatch]) -> float:
     """Sum of squared distances of matched discs in the images, in gates, and unmatched rows."""
-    costs = [
-        len(m.missed) + np.fmin((error_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches
-    ]
-    return float(np.sum(costs))
+    cost = [len(m.missed) + np.fmin((error_px(m) / LEAST_GATE_PX) ** 2, 1.0).sum() for m in matches]
+    return float(np.sum(cost))
 
 
 def _levelled_xy(rows: Sequence[CircleLandmark], projection: DiscProjection | None) -> FloatArray:
@@ -274,10 +269,7 @@ def compare_line_frames(
     error_rad = wrap_angle(difference("alpha"))
     error_deg = np.degrees(np.abs(error_rad))
     variance = np.where(sigma_rad >= LEAST_SIGMA_RAD, sigma_rad**2, 0.0)
-    ends = [
-        np.hypot(difference(x), difference(y))
-        for x, y in (("xtop", "ytop"), ("xbottom", "ybottom"))
-    ]
+    ends = [np.hypot(difference(f"x{end}"), difference(f"y{end}")) for end in ("top", "bottom")]
     return LineComparison(
         **vars(run),
         normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
@@ -461,9 +453,8 @@ def pair_lines(
     The gate is the larger of the tolerance and a multiple of the detected row's sigma.
     """
     difference = _turns(reference, detected)
-    gate = np.maximum(
-        np.radians(options.tolerance_deg), numbers(detected, "sigma") * options.sigmas
-    )
+    by_sigma = numbers(detected, "sigma") * options.sigmas
+    gate = np.maximum(np.radians(options.tolerance_deg), by_sigma)
     return associate(difference**2, np.abs(difference) <= gate)
 
 

@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, number
+from detect.comparison.result import WORST_FRAMES, Comparison, DiscComparison, in_mm, number
 from redetect.messages import one_line
 
 
@@ -76,7 +76,7 @@ def _over_distance(c: DiscComparison) -> FigureTable:
             recall, precision = (number(value, 3) for value in (part.recall, part.precision))
             wanted, found = (part.reference, part.missed), (part.detected, part.extra)
             rates = (*map(str, wanted), recall, *map(str, found), precision)
-            rows.append((str(part), *rates, _mm(part.error_median_m)))
+            rows.append((str(part), *rates, in_mm(part.error_median_m)))
     return FigureTable("By forward distance (position error: median)", head, tuple(rows))
 
 
@@ -86,7 +86,7 @@ def floor_table(c: DiscComparison) -> FigureTable:
     for part in c.bins:
         if part.as_written.pairs and part.alike is not None:
             figures = [*astuple(part.as_written)[1:], *astuple(part.alike)[1:]]
-            rows.append((str(part), str(part.as_written.pairs), *map(_mm, figures)))
+            rows.append((str(part), str(part.as_written.pairs), *map(in_mm, figures)))
     caption = (
         "On the floor, mm: detected minus reference as they are written; the same levelled alike\n"
         "(along: farther away, across: to the left; medians)"
@@ -100,14 +100,10 @@ def worst_frames_table(c: Comparison, most: int) -> FigureTable:
     rows = []
     for match in c.worst_frames(most):
         largest = match.largest_error
-        error = _mm(largest) if c.unit == "m" else number(largest, 3)
+        error = in_mm(largest) if c.unit == "m" else number(largest, 3)
         rows.append((match.name, *(str(len(getattr(match, n))) for n in c.counts), error))
     unit = "mm" if c.unit == "m" else c.unit
     return FigureTable("Worst frames", ("image", *c.counts, f"largest error {unit}"), tuple(rows))
-
-
-def _mm(value_m: float | None) -> str:
-    return number(None if value_m is None else 1e3 * value_m, 1)
 
 
 def _rich_table(figures: FigureTable) -> Table:

@@ -21,8 +21,7 @@ from redetect.tables import Table
 
 Kind = Literal["circles", "lines"]
 
-#: Number of worst frames to list.
-WORST_FRAMES = 10
+WORST_FRAMES = 10  #: Number of worst frames to list.
 
 
 class FrameMatch(NamedTuple):
@@ -37,8 +36,7 @@ class FrameMatch(NamedTuple):
     missed: list[Any]
     extra: list[Any]
     set_aside: list[Any]  # detected rows that match something that does not count
-    #: Over all pairs: distance on the floor, both rows levelled alike (m), or difference in bearing
-    #: (deg).
+    #: Over all pairs: distance on the floor, both rows levelled alike (m), or of bearings (deg).
     largest_error: float | None
 
 
@@ -148,10 +146,7 @@ class RunMatch:
 
 @dataclass(frozen=True, eq=False)
 class Comparison(RunMatch, Table, ABC):
-    """How a run's detected rows compare with reference rows.
-
-    Figures are None if there are no rows to compute them from.
-    """
+    """How a run's detected rows compare with reference rows; figures are None without rows."""
 
     what: ClassVar[str]  # the landmarks that are compared
     unit: ClassVar[str]  # of `FrameMatch.largest_error`
@@ -221,8 +216,7 @@ class Comparison(RunMatch, Table, ABC):
     def figures(self) -> dict[str, Any]:
         """All figures by name, for JSON: always the same names in the same order.
 
-        Lengths are in metres, angles in degrees. The worst frames are listed, and frames that are
-        in only one file.
+        In metres and degrees. The worst frames are listed, and frames that are in only one file.
         """
         names = [each.name for each in fields(self)]
         # In files, the normalised error is before the frames.
@@ -277,13 +271,9 @@ class DiscComparison(Comparison):
         return f", {self.extra_beyond} of them farther away than any that is on one"
 
     def _errors(self) -> str:
-        median, most = (
-            None if value is None else 1000.0 * value
-            for value in (self.error_median_m, self.error_95_m)
-        )
         errors = (
-            f"Positions on the floor err by {number(median, 1)} mm (median), "
-            f"95 % of them by less than {number(most, 1)} mm."
+            f"Positions on the floor err by {in_mm(self.error_median_m)} mm (median), "
+            f"95 % of them by less than {in_mm(self.error_95_m)} mm."
         )
         if self.reference_level and not self.detected_levelled:
             errors += " They are not corrected for the robot's tilt, which `detect all` does."
@@ -324,6 +314,11 @@ def number(value: float | None, decimals: int) -> str:
     if value is None:
         return "-"
     return f"{round(value, decimals) + 0.0:.{decimals}f}"  # adding 0 makes -0 a 0
+
+
+def in_mm(value_m: float | None) -> str:
+    """A length as a figure in millimetres, with one decimal."""
+    return number(None if value_m is None else 1e3 * value_m, 1)
 
 
 def quantile(values: FloatArray, q: float = 0.5) -> float | None:

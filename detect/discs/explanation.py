@@ -39,15 +39,10 @@ Stage = Literal[
     "disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc", "outside"
 ]
 
-_STAGES: dict[Fate, Stage] = {
-    Fate.FEW_STEPS: "steps",
-    Fate.GLANCE: "glance",
-    Fate.NO_RIM: "rim",
-}
+_STAGES: dict[Fate, Stage] = {Fate.FEW_STEPS: "steps", Fate.GLANCE: "glance", Fate.NO_RIM: "rim"}
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
-#: Largest distance of a candidate from the given position, radii.
-_NEAR = 1.5
+_NEAR = 1.5  #: Largest distance of a candidate from the given position, radii.
 #: Relative deviation of the rims' median radius from the expected one that causes a suggestion.
 _OTHER_RADIUS = 0.04
 _FEWEST_RIMS = 5
@@ -125,12 +120,8 @@ class DiscExplanation(Table):
 
     def to_json(self) -> str:
         """The explanation as JSON, with candidates numbered from 1."""
-        content = {
-            "place": self.place,
-            "suggestions": list(self.suggestions),
-            "candidates": self.records(),
-        }
-        return json_text(content)
+        content = {"place": self.place, "suggestions": list(self.suggestions)}
+        return json_text({**content, "candidates": self.records()})
 
     def __str__(self) -> str:
         lines = [self.place] if self.place else []
@@ -175,10 +166,9 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
     scenes = (_Examined(image, camera, settings) for image in images)
     stages: Counter[Stage] = Counter(c.stage for scene in scenes for c in _candidates(scene))
     del stages["disc"]
+    searched = counted(len(images), "image")
     if not stages:
-        return (
-            f"There is no candidate in {counted(len(images), 'image')}: no edges lie on a circle."
-        )
+        return f"There is no candidate in {searched}: no edges lie on a circle."
     fates = (
         (stages["polarity"], f"are not {settings.polarity} (--polarity any)"),
         (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
@@ -186,9 +176,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
         (stages["evidence"], "do not look like a disc (--evidence)"),
     )
     failed = ", ".join(f"{count} {test}" for count, test in fates if count)
-    return (
-        f"Of {counted(stages.total(), 'candidate')} in {counted(len(images), 'image')}, {failed}."
-    )
+    return f"Of {counted(stages.total(), 'candidate')} in {searched}, {failed}."
 
 
 @dataclass(frozen=True)
@@ -230,9 +218,8 @@ def _candidates(scene: _Examined) -> Iterator[Candidate]:
     votes, judgement = scene.judgement
     evidence = adjusted_log_odds(judgement, settings)
     taken = np.zeros(len(votes), np.bool_)
-    for k, ((x, y), (u, v)) in enumerate(
-        zip(found.floor_xy.tolist(), camera.project_floor(found.floor_xy).tolist())
-    ):
+    found_px = camera.project_floor(found.floor_xy).tolist()
+    for k, ((x, y), (u, v)) in enumerate(zip(found.floor_xy.tolist(), found_px)):
         away = np.hypot(*(judgement.floor_xy - found.floor_xy[k]).T)
         taken |= away < 0.5 * settings.radius_m
         best = int(np.argmin(away - 1e-3 * (judgement.log_odds > 0.0)))

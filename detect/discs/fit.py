@@ -74,12 +74,9 @@ _TERMS = 12
 
 #: Steps of the fit; the first ones reject no sector, since the start may be off.
 _STEPS, _EARLY = 12, 1
-#: The iteration stops after a shorter step, nominal radii.
-_ARRIVED = 5e-3
-#: Longest step, nominal radii (and log blur).
-_LONGEST, _LONGEST_BLUR = 0.2, 0.7
-#: Largest offset of a fit by parts from its start, radii.
-_MOST_OFF = 0.3
+_ARRIVED = 5e-3  #: The iteration stops after a shorter step, nominal radii.
+_LONGEST, _LONGEST_BLUR = 0.2, 0.7  #: Longest step, nominal radii (and log blur).
+_MOST_OFF = 0.3  #: Largest offset of a fit by parts from its start, radii.
 #: Bounds of the blur, pixels, and of the radius, nominal radii.
 _LEAST_BLUR, _MOST_BLUR = 0.1, 8.0
 _LEAST_RADIUS, _MOST_RADIUS = 0.4, 2.0
@@ -97,8 +94,7 @@ _LEAST_SECTORS, _COUNTS = 5, 0.1
 _FAR_OFF, _LEAST_OFF_PX = 4.5, 0.05
 #: Offset of an edge at which its weight is one half, in the early steps, deviations.
 _FAR_EARLY = 2.0
-#: Residual of a pixel at which its weight is 0, deviations; the share of the variance of Gaussian
-#: errors that the weights leave.
+#: Residual at which a pixel's weight is 0, deviations; share of Gaussian variance it leaves.
 _FAR_PIXEL, _SHARE_LEFT = 4.0, 0.77
 #: Lower bound of a pixel's weight, so that its residual can be recovered.
 _LEAST_TRUST = F32(1e-3)
@@ -523,8 +519,7 @@ def _radius_information(normal: FloatArray) -> float:
     xx, xy, yy = normal[_X, _X, 0], normal[_Y, _X, 0], normal[_Y, _Y, 0]
     x, y = normal[_X, _RADIUS, 0], normal[_Y, _RADIUS, 0]
     by_centre = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
-    information: float = normal[_RADIUS, _RADIUS, 0] - by_centre
-    return information
+    return float(normal[_RADIUS, _RADIUS, 0] - by_centre)
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
@@ -551,8 +546,7 @@ def _correlated_area(patch: Any, rows: Float32Array, n: int, unknowns: FloatArra
         return 1.0
     # By chance alone the correlation of n residuals scatters by 1 / sqrt(n).
     correlation = min(max(2.0 * product / square - 1.5 / math.sqrt(pairs), 0.0), 0.8)
-    area: float = ((1.0 + correlation) / (1.0 - correlation)) ** 2
-    return area
+    return float(((1.0 + correlation) / (1.0 - correlation)) ** 2)
 
 
 @kernel(inline="always")
@@ -587,8 +581,7 @@ def _covariance_by_parts(
 
 def working_space() -> NDArray[Any]:
     """(1,) `WORK`: the working space of the calling thread's fits."""
-    space: NDArray[Any] | None = getattr(_kept, "space", None)
-    if space is None:
-        space = np.zeros(1, WORK)
-        _kept.space = space
+    if not hasattr(_kept, "space"):
+        _kept.space = np.zeros(1, WORK)
+    space: NDArray[Any] = _kept.space
     return space

@@ -37,8 +37,7 @@ _MOST_COMPARED = 600  #: Candidates that are compared with their neighbours, unl
 _MOST_PEAKS = 4000
 #: Least distance from a better candidate, radii; less than 2, for discs may touch.
 _APART = 0.6
-#: The Sobel kernel scales a gradient per pixel by this.
-_SOBEL_GAIN = 8.0
+_SOBEL_GAIN = 8.0  #: The Sobel kernel scales a gradient per pixel by this.
 
 
 class HoughCandidates(NamedTuple):
@@ -92,8 +91,7 @@ def count_votes(
         across[s], ahead[s] = radius[s] / table.cell, radius[s] / table.step
     least = np.float32((_SOBEL_GAIN * (1.0 + table.paired) * least_step) ** 2)
     lines = np.empty((3, width), np.int16)
-    along_u = np.empty(width, np.float32)
-    along_v = np.empty(width, np.float32)
+    along_u, along_v = np.empty(width, np.float32), np.empty(width, np.float32)
     square = np.empty(width, np.float32)
     for k in range(len(table.image_row)):
         for i in range(3):

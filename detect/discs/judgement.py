@@ -1,10 +1,9 @@
 """Decides which candidates are discs: a glance, then the rim, by networks trained on known truth.
 
 The candidates come from the Hough transform (`detect.discs.hough`). Most are rejected at a glance
-at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare or a sun
-patch beside a disc, a cable across it or a door's edge in front of it, the rest of its rim still is
-on a circle of the right size. A small network (`detect.discs.rim_network`) then decides from the
-grey values around the candidate and from the rim.
+at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare beside a
+disc or a cable across it, the rest still is on a circle of the right size. A small network
+(`detect.discs.rim_network`) then decides from the grey values around the candidate and the rim.
 """
 
 from __future__ import annotations
@@ -49,18 +48,13 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
 _LEAST_STEPS = 0.3
-#: Threshold of the log-odds of a glance.
-_LEAST_GLANCE = 0.0
-#: Least share of the rim that has to be on a circle.
-LEAST_RIM = 0.3
-#: Most likely radius of a rim, relative to the nominal one.
-RIM_RADIUS = 0.98
+_LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
+LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
+RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
 #: A rim is traced again, from its own centre, unless it is hopeless or its log-odds exceed this.
 _CERTAIN = 2.5
-#: The second trace may lose this share of the rim and still be preferred.
-_SLACK = 0.07
-#: Two rims closer than this share of the radius are the same.
-_SAME = 0.1
+_SLACK = 0.07  #: The second trace may lose this share of the rim and still be preferred.
+_SAME = 0.1  #: Two rims closer than this share of the radius are the same.
 #: Features of the rim, in the order of the network's weights.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 

@@ -102,8 +102,7 @@ _TINY = F32(1e-12)
 _PER_32 = F32(0.5 / 32.0)
 _E2, _E3, _E4, _E5 = F32(1 / 2), F32(1 / 6), F32(1 / 24), F32(1 / 120)
 _PER_ROOT_2PI = F32(1.0 / math.sqrt(2.0 * math.pi))
-#: Deviations beyond which the normal distribution is cut off.
-_FAR = F32(5.0)
+_FAR = F32(5.0)  #: Deviations beyond which the normal distribution is cut off.
 # Abramowitz and Stegun, 26.2.17: the normal distribution's tail, within 8e-8.
 _TAIL = F32(0.2316419)
 _B1, _B2, _B3 = F32(0.319381530), F32(-0.356563782), F32(1.781477937)
@@ -139,8 +138,7 @@ def arcsine(x: float) -> float:
     """Arcsine, within 7e-5; x is clipped to -1 and 1."""
     a = min(abs(x), _1)
     angle: float = _HALF_PI - math.sqrt(_1 - a) * (_A0 + a * (_A1 + a * (_A2 + a * _A3)))
-    signed: float = angle if x > _0 else -angle
-    return signed
+    return angle if x > _0 else -angle
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
@@ -163,15 +161,11 @@ def edge_shares(patch: Any, n: int, disc: Disc, blur: Blur) -> None:
         x = patch.x[i] - x0 + _ASIDE
         y = patch.y[i] - y0
         r = math.sqrt(x * x + y * y)
-        nx = x / r
-        ny = y / r
-        g1 = patch.x1[i] * nx + patch.y1[i] * ny
-        g2 = patch.x2[i] * nx + patch.y2[i] * ny
-        g1 = g1 * g1 * variance_1
-        g2 = g2 * g2 * variance_2
+        nx, ny = x / r, y / r
+        g1, g2 = patch.x1[i] * nx + patch.y1[i] * ny, patch.x2[i] * nx + patch.y2[i] * ny
+        g1, g2 = g1 * g1 * variance_1, g2 * g2 * variance_2
         per_g = _1 / math.sqrt(g1 + g2 + _TINY)
-        by_1 = g1 * optics_1 * per_g * per_g
-        by_2 = g2 * optics_2 * per_g * per_g
+        by_1, by_2 = g1 * optics_1 * per_g * per_g, g2 * optics_2 * per_g * per_g
         steps = patch.x1[i] * patch.y2[i] - patch.x2[i] * patch.y1[i]
         t = min(steps * steps * area * per_g * per_g * per_g * per_r0, _T_LIMIT)
         z_all = (r - r0) * per_g

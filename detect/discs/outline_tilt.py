@@ -29,10 +29,8 @@ from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
-#: Least number of directions in which the rim is on the ellipse.
-LEAST_DIRECTIONS = 24
-#: Least semi-minor axis of the ellipse, pixels.
-LEAST_AXIS_PX = 1.2
+LEAST_DIRECTIONS = 24  #: Least number of directions in which the rim is on the ellipse.
+LEAST_AXIS_PX = 1.2  #: Least semi-minor axis of the ellipse, pixels.
 #: Least contrast, grey levels.
 LEAST_CONTRAST = 8.0
 POINT_SIGMA_PX = 0.25  #: Standard deviation of a rim point, pixels.
@@ -42,10 +40,8 @@ DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 
 _STEP_RAD = 1e-4
 _ITERATIONS = 7
-#: Degrees of freedom of Student's t distribution of the discs' tilts.
-_FREEDOM = 4.0
-#: A pivot below this share of its diagonal entry counts as zero.
-_LEAST_PIVOT = 1e-13
+_FREEDOM = 4.0  #: Degrees of freedom of Student's t distribution of the discs' tilts.
+_LEAST_PIVOT = 1e-13  #: A pivot below this share of its diagonal entry counts as zero.
 
 
 def tilt_of_outlines(

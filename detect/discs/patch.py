@@ -3,9 +3,8 @@
 Pixels are used if they are within some radii of the initial disc, or within some pixels or standard
 deviations of the blur of its edge. All of them are taken for small discs; for large ones, all at
 the edge, which locate the disc, and a subset of the others, which give the grey levels; for huge
-ones, pairs all along the edge. A pixel's distance from the edge is approximated to first order,
-with the floor's steps J at the candidate: ``|r - R| r / |J^T p|`` pixels for a floor position p,
-r = ``|p|``.
+ones, pairs all along the edge. To first order, with the floor's steps J at the candidate, a pixel
+is ``|r - R| r / |J^T p|`` pixels from the edge, for its floor position p, r = ``|p|``.
 """
 
 from __future__ import annotations
@@ -51,8 +50,7 @@ PATCH = np.dtype(
 #: Number of sectors around a disc's centre, and tangents of the angles that separate them.
 SECTORS = 16
 _TAN_1, _TAN_3 = F32(math.tan(math.pi / 8.0)), F32(math.tan(3.0 * math.pi / 8.0))
-#: Sectors are padded to a multiple of this number of pixels.
-_SECTOR_WHOLE = 8
+_SECTOR_WHOLE = 8  #: Sectors are padded to a multiple of this number of pixels.
 
 #: Formula of the shares, and the axis of the chords: see `detect.discs.model`.
 EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
@@ -61,8 +59,7 @@ EDGE, CHORDS_ALONG_V, CHORDS_ALONG_U = range(3)
 #: semi-minor axis is shorter than this number of standard deviations of the blur.
 _MOST_CURVED = 0.25
 _LEAST_HALF_AXIS = 4.0
-#: Half width of the edge, standard deviations of the blur.
-_EDGE_BLURS = 2.0
+_EDGE_BLURS = 2.0  #: Half width of the edge, standard deviations of the blur.
 #: In windows of more pixels than this, those off the edge are subsampled.
 _DENSE_WINDOW = 2048
 #: Of this many neighbouring pixels at the edge, two are taken, so that their correlation is known:
@@ -106,8 +103,7 @@ class View(NamedTuple):
 def floor_steps(floor_xy: Float32Array, u0: int, v0: int) -> tuple[float, float, float, float]:
     """Floor steps from pixel to pixel: of x, y by u, and by v, as central differences."""
     height, width = floor_xy.shape[:2]
-    u = min(max(u0, 1), width - 2)
-    v = min(max(v0, 1), height - 2)
+    u, v = min(max(u0, 1), width - 2), min(max(v0, 1), height - 2)
     return (
         0.5 * (floor_xy[v, u + 1, 0] - floor_xy[v, u - 1, 0]),
         0.5 * (floor_xy[v, u + 1, 1] - floor_xy[v, u - 1, 1]),
@@ -128,8 +124,7 @@ def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio
     area = abs(xu * yv - xv * yu)
     if not area > 1e-10:
         return View(EDGE, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0))
-    along_u = math.hypot(xv, yv) / area
-    along_v = math.hypot(xu, yu) / area
+    along_u, along_v = math.hypot(xv, yv) / area, math.hypot(xu, yu) / area
     # In the metric in which the blur is round, the ellipse has the semi-axes a and b.
     variance_u = candidate.blur * candidate.blur + PIXEL_VARIANCE
     variance_v = candidate.blur * candidate.blur * ratio * ratio + PIXEL_VARIANCE
@@ -138,8 +133,7 @@ def view_of(floor_xy: Float32Array, candidate: Candidate, relative: float, ratio
     uv = math.sqrt(variance_u * variance_v) * (xu * xv + yu * yv)
     steepest = 0.5 * (uu + vv) + math.hypot(0.5 * (uu - vv), uv)
     flattest = variance_u * variance_v * area * area / steepest
-    b = 1.0 / math.sqrt(steepest)
-    a = 1.0 / math.sqrt(flattest)
+    a, b = 1.0 / math.sqrt(flattest), 1.0 / math.sqrt(steepest)
     shape = EDGE
     if a > _MOST_CURVED * b * b or b < _LEAST_HALF_AXIS:
         shape = CHORDS_ALONG_V if along_v <= along_u else CHORDS_ALONG_U
@@ -279,14 +273,12 @@ def _choose(
 
 
 @kernel(forceinline=True, fastmath=FASTMATH)
-def _take(
-    length: int, blur: float, blur_ratio: float, reach: Reach, view: View, patch: Any
-) -> None:
+def _take(length: int, blur: float, ratio: float, reach: Reach, view: View, patch: Any) -> None:
     """Decide which pixels of a row may be taken: those at the edge, and others within reach."""
     xu, yu, xv, yv = (
         F32(view.steps[0]), F32(view.steps[1]), F32(view.steps[2]), F32(view.steps[3]),
     )  # fmt: skip
-    blur_u_2, blur_v_2 = blur**2, (blur * blur_ratio) ** 2
+    blur_u_2, blur_v_2 = blur**2, (blur * ratio) ** 2
     reach_radii, reach_px = F32(reach.radii), F32(reach.px**2)
     reach_u, reach_v = F32(reach.blurs**2 * blur_u_2), F32(reach.blurs**2 * blur_v_2)
     edge_u = F32(_EDGE_BLURS**2 * (blur_u_2 + PIXEL_VARIANCE))
@@ -297,10 +289,8 @@ def _take(
         r = math.sqrt(r_2)
         # Distance from the edge, and the floor's steps across it, times the distance.
         off_2 = (r_2 - r) * (r_2 - r)
-        gu = xu * x + yu * y
-        gv = xv * x + yv * y
-        gu = gu * gu
-        gv = gv * gv
+        gu, gv = xu * x + yu * y, xv * x + yv * y
+        gu, gv = gu * gu, gv * gv
         within = (
             (r <= reach_radii)
             | (off_2 <= reach_px * (gu + gv))

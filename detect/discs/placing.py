@@ -44,8 +44,7 @@ _AT_BOUND = 0.98  #: If the blur reaches this share of a patch's bound, the fit 
 _MOST_REFITS = 2  #: Largest number of repetitions, each in a wider patch.
 #: Stages of fits: whole discs, up to as often; then parts of discs; then again with a better size.
 _PARTS, _LAST = _MOST_REFITS + 1, _MOST_REFITS + 2
-#: Initial blur, pixels.
-_BLUR_PX = 1.0
+_BLUR_PX = 1.0  #: Initial blur, pixels.
 #: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
 

@@ -15,8 +15,7 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
-#: Step of the central differences of the projection, metres.
-_STEP_M = 1e-5
+_STEP_M = 1e-5  #: Step of the central differences of the projection, metres.
 #: The published covariance: this standard deviation in every direction, and two pixels squared.
 PUBLISHED_FLOOR_M, PUBLISHED_PIXEL_VARIANCE = 0.04, 2.0
 
@@ -45,8 +44,7 @@ def pixel_positions(
 ) -> tuple[FloatArray, FloatArray]:
     """Floor positions (N, 2) of (N, 2) pixels (u, v), and the published (N, 2, 2) covariances.
 
-    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2) is the floor position of every
-    pixel.
+    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2): floor position of each pixel.
     """
     position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
     for k in range(len(pixels)):
@@ -68,8 +66,7 @@ def refined_covariances(
 ) -> FloatArray:
     """(N, 2, 2) covariances of the fits, plus a systematic error in pixels and the camera's tilt.
 
-    `camera_numbers` as in `camera.kernels`; the variances are per axis, square pixels and square
-    radians.
+    `camera_numbers` as in `camera.kernels`; variances per axis, square pixels, square radians.
     """
     result = fitted.copy()
     for k in range(len(floor_xy)):

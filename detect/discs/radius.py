@@ -24,8 +24,7 @@ from redetect.array_types import GreyImage
 #: Range of the radii tried, metres, and the factor from one to the next.
 SMALLEST_M, LARGEST_M = 0.02, 0.5
 FACTOR = 1.1
-#: Least number of discs at the best radius.
-LEAST_DISCS = 3
+LEAST_DISCS = 3  #: Least number of discs at the best radius.
 
 
 class RadiusEstimate(NamedTuple):

@@ -25,14 +25,11 @@ from camera.kernels import project_floor_point
 from redetect.array_types import FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Directions from the centre of a candidate.
-DIRECTIONS = 32
-#: Steps along each of the `DIRECTIONS` in which the rim is searched.
-STEPS = 32
+DIRECTIONS = 32  #: Directions from the centre of a candidate.
+STEPS = 32  #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
-#: Least step of the grey value, as a share of the disc's contrast.
-LEAST_STEP = 0.35
+LEAST_STEP = 0.35  #: Least step of the grey value, as a share of the disc's contrast.
 #: Tolerance of a point on the circle: a share of the radius plus a number of pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 #: Relative standard deviation of the prior on the radius: for finding the circle (the calibrated
@@ -40,13 +37,11 @@ TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
 RADIUS_SIGMA, PLACING_SIGMA = 0.06, 0.03
 #: Standard deviation of a point of the rim along its direction, pixels.
 POINT_SIGMA_PX = 0.25
-#: Least number of points on a circle.
-LEAST_POINTS = 6
+LEAST_POINTS = 6  #: Least number of points on a circle.
 #: Least number of points for placing a circle; its steps, and the deviations that make an outlier.
 LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
-#: Number of neighbouring points with a common error.
-_ALIKE = 1.5
+_ALIKE = 1.5  #: Number of neighbouring points with a common error.
 #: Distance of the circle's starts from the candidate, nominal radii; the first is the candidate.
 _START = 0.3
 _STARTS = 9
@@ -54,15 +49,12 @@ _START_X, _START_Y = (
     np.append(0.0, _START * of(2.0 * np.pi * np.arange(_STARTS - 1) / (_STARTS - 1)))
     for of in (np.cos, np.sin)
 )
-#: Penalty, in points, for each squared deviation of the radius.
-_POINTS_PER_SIGMA = 0.5
-#: Log-odds that each point on a circle adds to it.
-_PER_POINT = 0.5
+_POINTS_PER_SIGMA = 0.5  #: Penalty, in points, for each squared deviation of the radius.
+_PER_POINT = 0.5  #: Log-odds that each point on a circle adds to it.
 #: Number of steps from each start, and the longest step, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
-#: Iteration stops at a shorter step with the same inliers, nominal radii.
-_ARRIVED = 1e-4
+_ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
@@ -110,22 +102,20 @@ class Profiles(NamedTuple):
 
 
 @kernel()
-def profiles(
-    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
-) -> Profiles:
+def profiles(image: GreyImage, numbers: FloatArray, x: float, y: float, radius: float) -> Profiles:
     """Grey values along the directions from a point (x, y) on the floor, metres.
 
-    `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
+    `radius` is the nominal one; `numbers` as in `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
-    u0, v0 = project_floor_point(camera_numbers, x, y)
+    u0, v0 = project_floor_point(numbers, x, y)
     half = 0.5 * FARTHEST
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # A parabola approximates the image of a direction to well below a tenth of a pixel.
         dx, dy = radius * COS[k], radius * SIN[k]
-        u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
-        u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
+        u1, v1 = project_floor_point(numbers, x + half * dx, y + half * dy)
+        u2, v2 = project_floor_point(numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
         for m in range(STEPS):
             u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
@@ -203,11 +193,9 @@ def fit_circle(
     r_x = r_y = r_w = 0.0
     # No branches, so that the loop is vectorised.
     for k in range(np.uint64(len(x))):
-        dx = x[k] - circle.x
-        dy = y[k] - circle.y
+        dx, dy = x[k] - circle.x, y[k] - circle.y
         d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        dx /= d
-        dy /= d
+        dx, dy = dx / d, dy / d
         w = weight[k]
         off = w * (d - circle.radius)
         s_w += w
@@ -259,11 +247,9 @@ def _choose(
 
     Points with weight 0 are missing.
     """
-    count = 0
-    changed = 0
+    count = changed = 0
     for k in range(np.uint64(len(x))):
-        dx = x[k] - circle.x
-        dy = y[k] - circle.y
+        dx, dy = x[k] - circle.x, y[k] - circle.y
         off = abs(math.sqrt(dx * dx + dy * dy) - circle.radius)
         now = weight[k] if off < wide * tolerance[k] else 0.0
         count += 1 if now > 0.0 else 0
@@ -326,9 +312,7 @@ def best_circle(
 
 
 @kernel()
-def follow_rim(
-    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: float
-) -> Rim:
+def follow_rim(image: GreyImage, numbers: FloatArray, radial: Profiles, contrast: float) -> Rim:
     """Trace the rim in profiles from about a candidate's centre; `agreeing` is 0 without a circle.
 
     `contrast` is approximately that of the disc to the floor, grey levels.
@@ -353,11 +337,9 @@ def follow_rim(
     squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
-        u, v = project_floor_point(
-            camera_numbers,
-            x + radius * (best.x + best.radius * COS[k]),
-            y + radius * (best.y + best.radius * SIN[k]),
-        )
+        rim_x = x + radius * (best.x + best.radius * COS[k])
+        rim_y = y + radius * (best.y + best.radius * SIN[k])
+        u, v = project_floor_point(numbers, rim_x, rim_y)
         outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius

@@ -50,10 +50,8 @@ _WORDS_COLOUR: Colour = (230, 230, 230)
 _SUBPIXEL_BITS = 4
 # OpenCV's fixed-point coordinates have 32 bits; curves far outside are not drawn.
 _FARTHEST_PX = 1e6
-# Text and strokes are enlarged in proportion to pictures of this width.
-_COLUMNS = 750
-# A label is moved down by at most this many of its heights.
-_LABELS_DOWN = 2
+_COLUMNS = 750  # Text and strokes are enlarged in proportion to pictures of this width.
+_LABELS_DOWN = 2  # A label is moved down by at most this many of its heights.
 # Narrower images are drawn at double scale.
 _SMALL_PX = 1200
 _CANDIDATE_COLOUR: Colour = (255, 150, 40)
@@ -184,9 +182,8 @@ def _draw_discs(canvas: _Canvas, match: FrameMatch, compared: bool) -> None:
         draw_curve(canvas.picture, canvas.scaled(edge), MISSED_COLOUR, closed=True)
     drawn = [(row, "", SIGMA_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else SIGMA_COLOUR) for row in match.extra]
-    drawn += [
-        (row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in zip(match.matched, error_px(match))
-    ]
+    matched = zip(match.matched, error_px(match))
+    drawn += [(row, f" {px:.1f}px", SIGMA_COLOUR) for row, px in matched]
     radii = (settings.inner_radius_m, settings.radius_m, settings.outer_radius_m)
     rims = []
     for row, _, edge_colour in drawn:
@@ -235,9 +232,8 @@ def _draw_markers(canvas: _Canvas, found: Sequence[MarkerLandmark]) -> None:
         spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
         for ellipse in ellipses(corners, spreads, canvas.scale * _SIGMAS, _POINTS):
             draw_curve(canvas.picture, ellipse, LINE_COLOUR, closed=True)
-        draw_curve(
-            canvas.picture, corners[0] + 3.0 * canvas.times * circle, MISSED_COLOUR, closed=True
-        )
+        first = corners[0] + 3.0 * canvas.times * circle
+        draw_curve(canvas.picture, first, MISSED_COLOUR, closed=True)
         draw_text(canvas.picture, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
 

@@ -65,10 +65,8 @@ FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgErro
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-#: Steps of the lean of a single frame, degrees.
-_FRAME_LEAN_DEG = 2.0
-#: Largest number of pixels that are decoded at once.
-PIXELS_AT_ONCE = 1 << 25
+_FRAME_LEAN_DEG = 2.0  #: Steps of the lean of a single frame, degrees.
+PIXELS_AT_ONCE = 1 << 25  #: Largest number of pixels that are decoded at once.
 
 
 @dataclass
@@ -89,9 +87,7 @@ class FrameDetections:
 def search_of(
     camera: Camera, circles: CircleSettings, lean: Lean | None
 ) -> tuple[Camera, VoteTable | DiscTable]:
-    """The camera, including its lean, and the table for its search for discs, made or loaded once
-    per process.
-    """
+    """The camera with its lean, and its table for discs, made or loaded once per process."""
     leaning = camera if lean is None else leaning_camera(camera, lean)
     return leaning, disc_table(leaning, circles)
 
@@ -312,10 +308,7 @@ def _disc_rows(
 
 
 def lean_of_frame(tilt: FrameTilt) -> Lean | None:
-    """The lean for the search for discs in a frame, from its own tilt, in coarse steps.
-
-    The steps limit the number of tables.
-    """
+    """The lean for a frame's search for discs, from its tilt, in coarse steps: for few tables."""
     pitch, roll = (
         math.radians(_FRAME_LEAN_DEG * round(math.degrees(angle) / _FRAME_LEAN_DEG))
         for angle in (tilt.pitch, tilt.roll)

@@ -38,8 +38,7 @@ _Tilted = tuple[str, int, FrameTilt | None]
 _LEAST_LEAN_DEG = 0.5
 #: Standard deviation of a tilt that is known exactly: covariances in files are positive definite.
 _LEAST_SIGMA_RAD = 1e-6
-#: Number of frames whose discs are levelled at once.
-_LEVELLED_AT_ONCE = 64
+_LEVELLED_AT_ONCE = 64  #: Number of frames whose discs are levelled at once.
 
 
 def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt | None, float]:
@@ -47,9 +46,8 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt |
     (rad). None if few of them have a tilt.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
-    found = tilt_of_run(
-        verticals, outlines, common_tilt_variance(camera), camera_pitch_weights(camera)
-    )
+    common = common_tilt_variance(camera)
+    found = tilt_of_run(verticals, outlines, common, camera_pitch_weights(camera))
     return found, found.usual_rad if found else usual_tilt(verticals, outlines)
 
 
@@ -83,8 +81,7 @@ def level_run(
 
     If too few frames have a tilt (`detect.settings.LEAST_FRAMES`), each frame is levelled by its
     own; unknown tilts have the standard deviation of the settings, or of the known ones. It or the
-    tilt of the run is stored in the summary. `read` returns the rows of all frames before
-    levelling, and is called twice.
+    tilt of the run is stored in the summary. `read`, called twice, returns all rows unlevelled.
     """
     frames, verticals, outlines = _tilts_of(read())
     common = common_tilt_variance(camera)

@@ -1,8 +1,7 @@
 """The output files of a run, each with kind, path, head and rows; and the log.
 
 The log, ``<output>.log.json``, contains the program and its settings, the failed frames with
-reasons, and the number of detections. It does not depend on the time of day or the workers: the
-same run writes the same bytes.
+reasons, and the number of detections. It is the same at any time and with any workers.
 """
 
 from __future__ import annotations
@@ -105,15 +104,13 @@ def frames_tilt_place(tilt: Path) -> Path:
 def _circles_text(job: Job) -> list[str]:
     plan = job.plan
     assert plan.circles is not None
-    position = (
-        "fitted to the grey values" if plan.circles.refine else "that of the pixel in the middle"
-    )
+    how = "fitted to the grey values" if plan.circles.refine else "that of the pixel in the middle"
     levelled = plan.levelling != "none" and (plan.lines or job.known.tilts is not None)
     return [
         f"Discs on the floor, detected by redetect {__version__}.",
         *(_ROBOT, _STEP, *_source_text(job.run)),
         "LANDMARK_C <pX> <pY> <quality> <cXX> <cXY> <cYY> <ID>",
-        f"  position {position}; quality is Otsu's, 0 to 1; ID -1: unknown",
+        f"  position {how}; quality is Otsu's, 0 to 1; ID -1: unknown",
         *([f"  positions are {LEVELLED}: # levelled <pitch> <roll>"] if levelled else []),
         *([f"  {lean_sentence(plan.lean)}"] if plan.lean else []),
         *_calibration_text(plan.camera, plan.circles),

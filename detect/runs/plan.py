@@ -41,8 +41,7 @@ from redetect.plane import rotation
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
 
-#: Factor by which a search with the camera's lean must increase the evidence of discs: all
-#: verticals of a building may lean.
+#: Factor by which a search with a lean must find more evidence: a building itself may lean.
 _MORE_EVIDENCE = 1.03
 
 #: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
@@ -138,8 +137,7 @@ class MapByImage:
         return circle_landmarks(xy[near], np.zeros(len(near)), spread, self._discs.ids[near])
 
 
-#: Number of failures whose messages a summary keeps.
-KEPT_FAILURES = 100
+KEPT_FAILURES = 100  #: Number of failures whose messages a summary keeps.
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@
 
     frames of the run  ->  tasks  ->  workers (`detect.runs.workers`)  ->  rows in order  ->  files
 
-The files have the same bytes with any number of workers; they appear together at the end, or not at
-all.
+The files have the same bytes with any number of workers; at the end, all of them appear or none.
 
 The rows of each finished frame are appended to the journal, a text file beside the results that is
 locked during the run (`redetect.storage.parts`). Each line consists of a digest, of its record and
@@ -14,8 +13,7 @@ lines after them, are ignored.
 However a run ends (a signal, a full disk, lost workers), the journal remains, and a resumed run
 continues after its frames, provided that program, settings, camera and frames are the same. When
 all frames are done, the results are written from the journal to part files and flushed to disk, the
-journal records that, and they are renamed. If the process is killed in between, the next run does
-the renaming.
+journal records that, and they are renamed, by the next run if the process is killed before.
 """
 
 from __future__ import annotations

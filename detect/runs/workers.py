@@ -5,8 +5,7 @@ cluster. Frames are sent in chunks. Only a window of chunks is pending at any ti
 does not grow with the run, and a slow frame delays the others only when they are a window ahead.
 
 If a worker dies, killed or out of memory, no other frame is lost: all pending frames are processed
-again, one at a time, until the frame that kills its worker is isolated; it is reported like an
-image that cannot be read.
+again, one at a time, until the one that kills its worker is found; it is reported as unreadable.
 """
 
 from __future__ import annotations
@@ -46,10 +45,8 @@ _DEADLY_FRAMES = 10
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Number of frames for which starting another process pays off.
-FRAMES_PER_PROCESS = 500
-#: Largest number of processes: more than cores and memory are good for.
-_MOST_JOBS = 1000
+FRAMES_PER_PROCESS = 500  #: Number of frames for which starting another process pays off.
+_MOST_JOBS = 1000  #: Largest number of processes: more than cores and memory are good for.
 #: Frames per chunk.
 _TOGETHER = 16
 _WINDOW_PER_WORKER = 3
@@ -73,10 +70,7 @@ class Workers:
 
 
 class WorkerPool:
-    """The workers of a run, started when they are needed, and replaced when one of them has died.
-
-    `close` ends them.
-    """
+    """The workers of a run: started when needed, replaced when one has died, ended by `close`."""
 
     _plan: FramePlan  # how they process frames
 
@@ -267,9 +261,8 @@ class _InProcess(Executor):
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # If no process can be started, this one compiles all kernels.
         with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
-            path, later = [
-                started.enter_context(_ProcessPool(1, self._plan, show=False)) for _ in range(2)
-            ]
+            pools = (_ProcessPool(1, self._plan, show=False) for _ in range(2))
+            path, later = map(started.enter_context, pools)
             # The stages after the judgement of discs take nearly as long to compile as all others.
             done: list[Future[Any]] = [
                 path.submit(work_on_chunk, lines, self._chunk),

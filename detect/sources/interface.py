@@ -39,8 +39,7 @@ _BIT_DEPTHS = (8, 10, 12, 14, 16)  # of cameras
 #: Number of images by which a run's bit depth is found, and their largest spacing in a bag.
 _DEPTH_IMAGES = 32
 _DEPTH_SPACING = 20
-#: Largest share of values that a bit depth need not hold: hot pixels.
-_HOT_PIXELS = 1e-4
+_HOT_PIXELS = 1e-4  #: Largest share of values that a bit depth need not hold: hot pixels.
 # Limit of a file's size: uncompressed pixels, 16 bits in four channels, times two for formats that
 # expand, plus thumbnails and other metadata of cameras.
 _BYTES_PER_PIXEL = 16

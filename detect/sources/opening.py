@@ -32,8 +32,7 @@ def open_run(
     name : path
         A run folder, a folder, image or pattern of images, a video, a bag, or ``camera:0``.
     camera : Camera, or path, optional
-        The calibration; by default the one beside the images (``<run>.cam`` if a run folder has
-        several).
+        By default the calibration beside the images (``<run>.cam`` if a run folder has several).
     options : SourceOptions, optional
 
     Raises

@@ -26,8 +26,7 @@ from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), so that products of two remain finite.
 FARTHEST = 1e12
-#: Longest interval between poses that is interpolated (s).
-LARGEST_GAP_S = 1.0
+LARGEST_GAP_S = 1.0  #: Longest interval between poses that is interpolated (s).
 # A movement that is faster (m/s), and this many times as long as the one before, is a jump of the
 # odometry, as if it was reset. Steps over it have this covariance.
 _FASTEST_M_S, _LONGER = 50.0, 100.0
@@ -38,8 +37,7 @@ DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0],
 # A step's covariance is invalid if its smallest eigenvalue is below one of these shares:
 _INDEFINITE = 1e-8  # of its largest
 _ROUNDING = 1e-12  # of the pose's own covariance: rounding errors
-# Tolerance of the length of a trajectory's quaternions.
-_UNIT = 1e-2
+_UNIT = 1e-2  # Tolerance of the length of a trajectory's quaternions.
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
 

@@ -16,12 +16,9 @@ import numpy as np
 from detect.line_settings import LineSettings
 from detect.verticals.refinement import LineFits
 
-#: Least width of the filter, as a share of the blur's width.
-_WIDE_ENOUGH = 0.68
-#: Largest filter width of a refinement step, pixels.
-_WIDEST_STEP_PX = 19.0
-#: Least number of edges from which the blur of an image is estimated.
-_LEAST_EDGES = 3
+_WIDE_ENOUGH = 0.68  #: Least width of the filter, as a share of the blur's width.
+_WIDEST_STEP_PX = 19.0  #: Largest filter width of a refinement step, pixels.
+_LEAST_EDGES = 3  #: Least number of edges from which the blur of an image is estimated.
 #: Settings that scale with the width of the filter: pixels across an edge. They include a line's
 #: standard deviation, since other edges within the blur displace it in proportion.
 _ACROSS = (
@@ -68,9 +65,6 @@ def widened(settings: LineSettings, width: float) -> LineSettings:
 
 
 def median_sharpness(fits: LineFits) -> float:
-    """Median sharpness of all refined edges, lines or not; 1 if there are too few.
-
-    For an even number, the lower median.
-    """
+    """The (lower) median sharpness of all refined edges, lines or not; 1 if there are too few."""
     sharpness = np.sort(fits.sharpness[~np.isnan(fits.contrast)])
     return 1.0 if len(sharpness) < _LEAST_EDGES else float(sharpness[(len(sharpness) - 1) // 2])

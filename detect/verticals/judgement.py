@@ -3,8 +3,7 @@
 A track's evidence is its response summed over its length in pixel widths, times the square of its
 sharpness: soft edges are more often shadows and glare than edges of the building. A line at an
 angle b to the vertical is accepted if b^2 is at most the sum of the squares of the largest lean, a
-number of standard deviations of its noise, and some pixels over its length
-(`detect.line_settings.LineSettings`).
+number of standard deviations of its noise, and some pixels over its length (`LineSettings`).
 """
 
 from __future__ import annotations
@@ -62,8 +61,7 @@ class JudgedTracks(NamedTuple):
     """Lines through tracks, and their fates."""
 
     fits: LineFits  # a line for each track, unless that is too short or too faint
-    #: (T,) response summed over the track's length in pixel widths, times the square of its
-    #: sharpness
+    #: (T,) response summed over the length in pixel widths, times the square of the sharpness
     evidence: FloatArray
     #: (T,) indices of `FATES`; lines that disagree with the tilt are "not vertical"
     fate: NDArray[np.int8]

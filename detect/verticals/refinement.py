@@ -29,10 +29,8 @@ from redetect.compiled import kernel
 
 #: Sub-pixel positions for which weights are tabulated; between them, the derivative interpolates.
 SUBPIXELS = 64
-#: Standard deviations beyond which the Gaussian is negligible.
-_REACH = 4.4
-#: A step is not repeated if it moved all rows by less than this, pixels.
-_STILL_PX = 0.02
+_REACH = 4.4  #: Standard deviations beyond which the Gaussian is negligible.
+_STILL_PX = 0.02  #: A step is not repeated if it moved all rows by less than this, pixels.
 
 
 class LineFits(NamedTuple):
@@ -98,10 +96,8 @@ def gaussian_steps(sigma: float, half: int) -> FloatArray:
     """(3, SUBPIXELS, 2 half) weights of a step's height, and of its derivatives times sigma^2."""
     d = np.arange(-half + 1, half + 1) - (np.arange(SUBPIXELS)[:, None] + 0.5) / SUBPIXELS
     q = (d / sigma) ** 2
-    gaussian = np.exp(-0.5 * q)
-    weights = np.stack(
-        [d / sigma**2 * gaussian, (q - 1.0) * gaussian, (q - 3.0) * d / sigma**2 * gaussian]
-    )
+    g = np.exp(-0.5 * q)
+    weights = np.stack([d / sigma**2 * g, (q - 1.0) * g, (q - 3.0) * d / sigma**2 * g])
     # Windows that are cut off must not depend on the image's brightness.
     return np.asarray(weights - weights.mean(axis=-1, keepdims=True))
 

@@ -28,12 +28,10 @@ from redetect.compiled import kernel
 
 #: Subtracted from grey values, so that small variances are accurate in single precision.
 MIDDLE_GREY = np.float32(128.0)
-#: Rows of a stripe in which the response is evaluated.
-STRIPE_ROWS = 16
+STRIPE_ROWS = 16  #: Rows of a stripe in which the response is evaluated.
 #: Least number of columns in which it is evaluated; the stripe's width is a multiple of `_VECTOR`.
 _LEAST_COLUMNS, _VECTOR = 8, 8
-#: Weights along the path that are applied at a time.
-_TOGETHER = 7
+_TOGETHER = 7  #: Weights along the path that are applied at a time.
 
 
 class LineFilter(NamedTuple):
@@ -50,8 +48,7 @@ class LineFilter(NamedTuple):
 class Strip(NamedTuple):
     """A table of verticals in the layout for kernels, vertical by vertical."""
 
-    #: (W, H) column at which each vertical crosses each row, and the tangent of the elevation
-    #: there; NaN where it is not visible
+    #: (W, H) column of each vertical in each row, and the elevation's tangent; NaN if not visible
     column: Float32Array
     rise: Float32Array
     #: (W,) of their bearings
@@ -69,8 +66,7 @@ class Stripe(NamedTuple):
     """A stripe of C columns and B rows, and its intermediate results."""
 
     window: LineFilter
-    #: (B + 2s,) image columns at which the path crosses rows, from s rows above the first one on;
-    #: NaN where it is not visible
+    #: (B + 2s,) columns at which the path crosses rows, from s above the first; NaN if not visible
     path: FloatArray
     #: (2, (B + L) C) grey values relative to the middle grey and their squares, row by row
     samples: Float32Array

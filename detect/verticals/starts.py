@@ -28,8 +28,7 @@ from redetect.compiled import kernel
 _CROSSED = 3
 #: Largest distance of a chain's maxima on neighbouring rows of the band, columns.
 _APART = 1.5
-#: Least number of maxima of a chain if starts have to be on chains.
-_LEAST = 2
+_LEAST = 2  #: Least number of maxima of a chain if starts have to be on chains.
 
 
 class StartBand(NamedTuple):
@@ -38,8 +37,7 @@ class StartBand(NamedTuple):
     The filter is evaluated on row s (half its length) of R rows, and every `spacing` rows after it.
     """
 
-    #: (K, W) image row of each position at which the filter is evaluated; -1 where no track may
-    #: start
+    #: (K, W) image rows at which the filter is evaluated; -1 where no track may start
     row: NDArray[np.int32]
     #: (R, W) index into the flat image of the pixel on the left of each pixel of the band
     pixel: NDArray[np.int32]

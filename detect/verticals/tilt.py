@@ -1,9 +1,8 @@
 """Tilt consensus: the camera's tilt from the visible verticals, and its mean square error.
 
 A calibration gives the mounting of the camera on the robot, not the robot's tilt: the robot pitches
-and rolls on its springs, and the mounting itself drifts. Verticals determine the tilt. The plane
-through the camera's centre and a vertical line contains the vertical direction, so its normal n,
-rotated by the tilt, is level:
+and rolls on its springs, and the mounting itself drifts. Verticals determine the tilt: the plane of
+the camera's centre and a vertical has a normal n that is level when rotated by the tilt:
 
     (R n)_z = 0,    R = exp([pitch, roll, 0]x)    (robot frame: X left, Y backward, Z up)
 
@@ -40,19 +39,16 @@ from redetect.compiled import kernel
 
 #: Number of times the tilt is estimated again from the lines that agree with it.
 REFINEMENTS = 6
-#: Scale of the Cauchy weights, standard deviations.
-SOFTENING = 2.0
+SOFTENING = 2.0  #: Scale of the Cauchy weights, standard deviations.
 
 #: Values of the scatter of verticals about the vertical (rad), and their prior probabilities.
 SCATTER_RAD = (math.radians(0.05), math.radians(0.2), math.radians(0.6))
 SCATTER_SHARE = (0.2, 0.4, 0.4)
-#: Lines whose bearings differ less than this lean together (rad).
-TOGETHER_RAD = 0.15
+TOGETHER_RAD = 0.15  #: Lines whose bearings differ less than this lean together (rad).
 #: Half width at half maximum of the inclinations of lines that are not vertical (rad).
 STRAY_RAD = math.radians(1.0)
 
-#: Least ratio of the axes of the stretched grid.
-_SLENDEREST = 0.1
+_SLENDEREST = 0.1  #: Least ratio of the axes of the stretched grid.
 
 
 def _polar_grid(directions: int, radii: int, nearest: float, farthest: float) -> FloatArray:
@@ -85,8 +81,7 @@ class TiltEstimate(NamedTuple):
 class Verticals(NamedTuple):
     """Constraints of the tilt by lines that may be verticals."""
 
-    #: (N, 3) unit normals, in the calibrated robot frame, of the planes through the camera and each
-    #: line
+    #: (N, 3) unit normals, in the calibrated robot frame, of planes through camera and line
     normal: FloatArray
     variance: FloatArray  # (N,) of the normals' inclinations, for verticals (rad^2)
     #: (N,) largest inclinations with which the lines count as vertical (rad)
@@ -301,9 +296,8 @@ def _error_of_tilt(
     bearing = np.empty(count)
     for k in range(count):
         bearing[k] = math.atan2(lines.normal[k, 1], lines.normal[k, 0])
-    together = group_around_strongest(
-        bearing, np.full(count, TOGETHER_RAD), lines.weight, np.zeros(count)
-    )
+    reach, kind = np.full(count, TOGETHER_RAD), np.zeros(count)
+    together = group_around_strongest(bearing, reach, lines.weight, kind)
     edges, groups = merge_lines(lines, edge), merge_lines(lines, together)
     xx, xy, yy = _stretch(groups, tilt, prior)
     n = grid.shape[1]

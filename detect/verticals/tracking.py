@@ -10,8 +10,7 @@ of a straight line fitted to n points by least squares,
 
 down to constants (alpha-beta filter: P. R. Kalata, The Tracking Index, IEEE Transactions on
 Aerospace and Electronic Systems 20, 1984). So a track follows leaning verticals without knowing the
-tilt, and does not leave them where other edges cross. The response is evaluated in stripes along
-the predictions.
+tilt, even where other edges cross. The response is evaluated in stripes along the predictions.
 
 Where an edge ends and another one continues beside it, such a track bends. Once the tilt is known,
 the lean of verticals is known, too: rejected tracks can be followed again along the verticals,
@@ -158,9 +157,8 @@ def follow_edges(
             v = top if direction < 0 else bottom
             points = 0 if vertical else edge.points
             edge = _Edge(column[v], edge.lean, points, vertical)
-            end, edge = _follow(
-                image, strip, stripe, numbers, (v, direction, sign), edge, column, score
-            )
+            begin = v, direction, sign
+            end, edge = _follow(image, strip, stripe, numbers, begin, edge, column, score)
             first, last = min(first, end), max(last, end)
         for row in range(first, last + 1):
             if score[row] > 0.0:
