@@ -102,20 +102,22 @@ class Profiles(NamedTuple):
 
 
 @kernel()
-def profiles(image: GreyImage, numbers: FloatArray, x: float, y: float, radius: float) -> Profiles:
+def profiles(
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
+) -> Profiles:
     """Grey values along the directions from a point (x, y) on the floor, metres.
 
-    `radius` is the nominal one; `numbers` as in `camera.kernels.camera_numbers`.
+    `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
     """
     grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
-    u0, v0 = project_floor_point(numbers, x, y)
+    u0, v0 = project_floor_point(camera_numbers, x, y)
     half = 0.5 * FARTHEST
     right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # A parabola approximates the image of a direction to well below a tenth of a pixel.
         dx, dy = radius * COS[k], radius * SIN[k]
-        u1, v1 = project_floor_point(numbers, x + half * dx, y + half * dy)
-        u2, v2 = project_floor_point(numbers, x + FARTHEST * dx, y + FARTHEST * dy)
+        u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
+        u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
         for m in range(STEPS):
             u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
@@ -312,7 +314,9 @@ def best_circle(
 
 
 @kernel()
-def follow_rim(image: GreyImage, numbers: FloatArray, radial: Profiles, contrast: float) -> Rim:
+def follow_rim(
+    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: float
+) -> Rim:
     """Trace the rim in profiles from about a candidate's centre; `agreeing` is 0 without a circle.
 
     `contrast` is approximately that of the disc to the floor, grey levels.
@@ -339,7 +343,7 @@ def follow_rim(image: GreyImage, numbers: FloatArray, radial: Profiles, contrast
     for k in range(DIRECTIONS):
         rim_x = x + radius * (best.x + best.radius * COS[k])
         rim_y = y + radius * (best.y + best.radius * SIN[k])
-        u, v = project_floor_point(numbers, rim_x, rim_y)
+        u, v = project_floor_point(camera_numbers, rim_x, rim_y)
         outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius

@@ -1,7 +1,7 @@
 """The output files of a run, each with kind, path, head and rows; and the log.
 
 The log, ``<output>.log.json``, contains the program and its settings, the failed frames with
-reasons, and the number of detections. It is the same at any time and with any workers.
+reasons, and the number of detections. The same run writes the same bytes, whatever the workers.
 """
 
 from __future__ import annotations
