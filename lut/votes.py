@@ -21,8 +21,7 @@ _CELL_RADII = 0.25  #: Width of a cell, radii.
 _CELL_PX = 0.8  #: Its least length ahead, pixels.
 #: Resolution of the lookup from distance ahead to row of cells, steps per radius.
 _STEPS_PER_RADIUS = 16.0
-#: If every disc is this wide (pixels), columns are added in pairs; if it is this high, every second
-#: row votes, and so on.
+#: If every disc is this wide (pixels), columns are added in pairs; if this high, rows are skipped.
 _WIDE_PX, _HIGH_PX = 9.0, 6.0
 
 

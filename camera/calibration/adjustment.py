@@ -156,10 +156,7 @@ class _Problem:
 def project_estimate(
     estimate: Estimate, points: Points
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels of all points, and their derivatives.
-
-    Returns `pixels` (N, 2), `by_intrinsics` (N, 2, 14), `by_pose` (N, 2, 6).
-    """
+    """Pixels of all points (N, 2), derivatives by intrinsics (N, 2, 14) and by pose (N, 2, 6)."""
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
     pixels, by_intrinsics, by_point = model.project_points(

@@ -38,8 +38,7 @@ _WORTH = 4.0
 # fitted from the fullest fit, if their residuals are this many times as large as its.
 _STUCK, _CAN_BE_STUCK = 3.0, 2
 # The two tangential terms must lower it by `_TANGENTIAL_WORTH` variances and differ from 0 by
-# `_TANGENTIAL_SIGNIFICANCE` variances: small systematic errors of a board's points can look like
-# decentering.
+# `_TANGENTIAL_SIGNIFICANCE`: small systematic errors of a board can look like decentring.
 _TANGENTIAL_WORTH = 20.0
 _TANGENTIAL_SIGNIFICANCE = 50.0
 # The same for the polynomial, compared with a rational function with as many coefficients.

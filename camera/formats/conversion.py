@@ -47,8 +47,7 @@ class Converted:
     """A converted camera."""
 
     camera: AnyCamera
-    # Largest distance, over the image, between the pixels of a ray in the source and in the target
-    # (target's pixels).
+    # Largest distance over the image (target's pixels) of a ray's pixels in source and target.
     deviation_px: float
     at: tuple[float, float]  # the target's pixel where it is largest
 

@@ -83,8 +83,7 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
     covariance : (..., n, n) array_like
         Symmetric matrices.
     least : float
-        The smallest eigenvalue of the correlation matrix must be above this; otherwise quantities
-        are linearly dependent.
+        Bound of the correlation matrix's eigenvalues; below it, quantities are linearly dependent.
 
     Returns
     -------

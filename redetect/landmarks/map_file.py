@@ -100,8 +100,7 @@ def write_map(
     comments : sequence of str
         Lines for the head.
     overwrite : bool
-        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
-        raised.
+        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError`.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))

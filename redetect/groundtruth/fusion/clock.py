@@ -165,8 +165,7 @@ def _extended(
 def read_clock(path: PathLike) -> ClockModel:
     """Read a clock file that `groundtruth sync` wrote.
 
-    Raises `GroundTruthError` if the file cannot be read or a value is missing or impossible; the
-    message names it.
+    Raises `GroundTruthError` if the file or a value in it is unusable; the message names it.
     """
     rows = JsonObject.read(path).rows("segments")
     segments = tuple(map(_segment, rows))
@@ -291,8 +290,7 @@ def _rms(values: Any) -> float | None:
 def read_ptpd(path: PathLike) -> PtpdLog:
     """Read a log of ptpd.
 
-    Raises `GroundTruthError` if the file cannot be read, or no line of it reports an offset from
-    the master.
+    Raises `GroundTruthError` if it cannot be read, or no line reports an offset from the master.
     """
     rows: list[list[float]] = []  # Time, offset (s) and drift (ppb) of each report
     columns: dict[str, int] = {}

@@ -43,8 +43,7 @@ _NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LONGEST_GAP_TO_LEARN_FROM_S = 20.0
 _LEARNING_ROUNDS = 2
-# Number of rounds for the factor of variances over seconds, and significance level for too small
-# ones.
+# Rounds for the factor of variances over seconds, and significance level for too small ones.
 _LOOSENING_ROUNDS = 3
 _DOUBT = 0.001
 # Akaike's criterion: by chance, an estimate fits its own measurements better by this.

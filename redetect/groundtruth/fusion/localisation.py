@@ -5,8 +5,7 @@ those of the ground truth after a rigid motion, plus stationary errors: an Ornst
 process for x, y and the heading, each with a deviation and a correlation time (Rasmussen and
 Williams, Gaussian Processes for Machine Learning, 2006, appendix B). The process is Markov: in a
 gap between measurements the errors depend only on those at its two ends, in closed form. Odometry
-is treated as a localisation if that model predicts the measurements better than the movements
-between its poses.
+is treated as a localisation if that model predicts the measurements better than its movements.
 """
 
 from __future__ import annotations
@@ -38,13 +37,11 @@ _FEWEST = 10
 _LEAST_EXTENT_M = 0.01
 _LEAST_GAP_S = 20.0
 _MOST_TO_LEARN_FROM = 500
-# Prior mean and deviation of the logarithm of the correlation time, which a few visits hardly
-# determine.
+# Prior mean and deviation of the correlation time's logarithm: a few visits hardly determine it.
 _USUAL_CORRELATION_S = 10.0
 _LOG_CORRELATION_SIGMA = 0.7
 _LEVEL_SIGMA = 10.0  # Prior deviation of unknowns (m, rad)
-# Differences this many times the median are gross errors, of which there is one in 10000, anywhere
-# within 10 m by 10 m.
+# Differences this many times the median are gross errors: one in 10000, anywhere in 10 m by 10 m.
 _USUAL = 6.0
 _TRIMMINGS = 5
 _OUTLIER_DEVIANCE = -2.0 * math.log(1e-4 / (100.0 * 2.0 * math.pi))

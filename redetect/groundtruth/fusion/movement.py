@@ -89,8 +89,7 @@ class MovementProblem:
 
     times_s: FloatArray  # (N,): the nodes
     # (N, 4): odometry's movement to each node: distance forward, distance to the left (m) and turn
-    # (rad), each accumulated in the robot's turning frame; and the turn again if it is a distinct
-    # one, else 0.
+    # (rad), each accumulated in the robot's turning frame; and the turn again if distinct, else 0.
     controls: FloatArray
     # (N, 4): more distance (m) and turn (rad) that pauses may hide, and, of a movement to a
     # measurement within a pause, additional variances (m^2, rad^2)

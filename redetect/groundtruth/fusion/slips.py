@@ -28,8 +28,7 @@ _LEAST_RUN, _LEAST_LAST_RUN = 10, 20
 # A squared innovation beyond this share of the gate is no return to the predicted path.
 _NO_RETURN = 1.0 / 3.0
 # Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried,
-# with the cost of a measurement: one that contradicts nothing any more costs about as much as a
-# rejected one.
+# with the cost of a measurement: one that contradicts nothing costs about as much as a rejection.
 _TRIED_LENGTHS, _TRIED_RATES = (1, 2, 4, 8, 16, 32), {1.0: 20.0, 100.0: 50.0}
 # The run's squared errors must become smaller by this factor.
 _LEAST_GAIN = 0.8

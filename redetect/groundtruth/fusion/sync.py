@@ -314,8 +314,7 @@ def _parabola(
     """Minimum (2,) of minus twice the log-likelihood of two unknowns, and deviations (2,).
 
     Between samples odometry's path is interpolated, so that the likelihood has kinks: the parabola
-    is fitted over a range in which it rises by much more than these. What it leaves is included in
-    the deviations.
+    is fitted over a range in which it rises by much more; the remainder is in the deviations.
     """
     here, steps = deviance(at), np.minimum(step, _WIDEST * largest)
     for k, axis in enumerate(np.eye(2)):

@@ -1,7 +1,6 @@
 """Sets of scans, the scanners' static background, and global localisation of the robot in a set.
 
-Readings nearer than the background are new and are clustered; at each cluster the outline is fitted
-from every heading.
+Readings nearer than the background are clustered; the outline is fitted there from every heading.
 """
 
 from __future__ import annotations

@@ -283,8 +283,7 @@ def icp_by_step(
 ) -> FloatArray:
     """(steps + 1,) root mean square distances (m) of the readings used from the map.
 
-    They are those after each step of an ICP of a scanner's points (n, 2) to the map, from a start
-    (3,).
+    After each step of an ICP of a scanner's points (n, 2) to the map, from a start (3,).
     """
     from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
     return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])

@@ -172,10 +172,7 @@ def write_scanners(
 
 
 def read_robot(path: PathLike) -> Robot:
-    """Read a ``robot.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``robot.json``; raises `GroundTruthError` if it cannot be read or is not valid."""
     content = JsonObject.read(path)
     outline = content.numbers("outline", None, 2)
     if len(outline) < 3:

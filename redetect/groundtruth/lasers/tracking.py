@@ -50,8 +50,7 @@ _PRIOR_M = 0.02
 # standard deviation, and at most by this share of its radius.
 _OUTLINE_M, _MOST_MOVED, _TRIMMED, _OUTLINE_ROUNDS = 0.003, 0.25, 0.1, 6
 _SAMPLE = 60
-# A scanner is suspect if the others contradict its pose by more, in standard deviations and in m
-# and rad.
+# Suspect are scanners whose pose the others contradict by more (standard deviations; m, rad).
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
 #: Sets farther apart than this are not of one block (s).
 LARGEST_GAP_S = 0.05
@@ -138,8 +137,7 @@ class Tracker:
     def run(self) -> LaserTrack:
         """Track, resolve the front, and compute the poses again with their motion known."""
         pose, motion = np.zeros(3), np.zeros(3)
-        # Times of the last set, the last pose, the last one determined in all directions, and the
-        # last search.
+        # Times of the last set, the last pose, the last fully determined one, and the last search.
         before_s = posed_s = determined_s = searched_s = -math.inf
         segment, begun, tracked = -1, 0, False
         coast_s = max(self.settings.coast_s, _COASTED_SETS * _interval_s(self.sets.times_s))

@@ -86,8 +86,7 @@ class BoardsFile:
 def read_boards(path: Path) -> BoardsFile:
     """Read a ``boards.json``, or the one in a folder, and the calibrations of its cameras.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read or an entry is
-    missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file or an entry cannot be used.
     """
     path = path / BOARDS_NAME if path.is_dir() else path
     content = JsonObject.read(path)
@@ -121,8 +120,7 @@ def calibration_of(camera: str) -> str:
 def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """Find the corners of the board in an image.
 
-    Raises `GroundTruthError` if the image cannot be read, its size differs from the calibration's,
-    or no board is found.
+    Raises `GroundTruthError` if the image is unreadable, of a wrong size, or shows no board.
     """
     grey = read_grey(image.image, GroundTruthError)
     if grey.shape != (camera.height, camera.width):

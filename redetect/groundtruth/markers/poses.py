@@ -2,8 +2,7 @@
 
 The chosen solver (of OpenCV or pycolmap) gives initial poses, which are refined by least squares
 over all corners. If all markers agree, their mirror image is tested, which may explain the corners,
-too. If not, the hypothesis of a single marker with which most others agree determines the wrong
-ones.
+too. If not, the hypothesis of one marker with which most others agree determines wrong ones.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Estimates the poses of markers on a robot, from images that show several of them.
 
 The steps: pairs of markers seen together, a consensus for each pair, a tree over the best supported
-pairs (markers never seen together are connected by a third), and one bundle adjustment of all
-markers and all times.
+pairs (markers never seen together are connected by a third), and one bundle adjustment of all.
 """
 
 from __future__ import annotations

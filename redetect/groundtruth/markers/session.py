@@ -87,8 +87,7 @@ def read_rig(path: PathLike) -> Rig:
 def read_network(path: PathLike) -> Network:
     """Read a ``network.json`` and its cameras' calibrations; cameras are sorted by name.
 
-    Raises `GroundTruthError` or `camera.CameraError` if a file cannot be read, or an entry is
-    missing or impossible.
+    Raises `GroundTruthError` or `camera.CameraError` if a file or an entry cannot be used.
     """
     content = JsonObject.read(path)
     cameras = dict(sorted(content.objects("cameras").items()))
@@ -207,10 +206,7 @@ class View:
 
 
 def find_runs(session: Path) -> list[Path]:
-    """The run folders of a session that contain detected markers.
-
-    Raises `GroundTruthError` if there are none.
-    """
+    """The run folders of a session with detected markers; `GroundTruthError` if there are none."""
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     runs = sorted(p for p in session.iterdir() if (p / DETECTED_NAME).is_file())
@@ -225,8 +221,7 @@ def find_runs(session: Path) -> list[Path]:
 def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[MarkerFrame]:
     """The markers found in a run's images, in the file's order, and the images' times.
 
-    The run folder contains ``detected.markers`` and ``<name>.times``. Frames are numbered instead
-    if not `timed`.
+    The folder has ``detected.markers`` and ``<name>.times``; frames are numbered if not `timed`.
     """
     times_path = run / f"{run.resolve().name}.times"
     times = read_times(times_path) if timed else {}

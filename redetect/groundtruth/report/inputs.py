@@ -67,10 +67,7 @@ class Inputs:
 
 
 def gather(session: Path, truth: Path | None = None) -> Inputs:
-    """Read the files of a session.
-
-    `truth`: true poses; by default ``truth.csv`` in the session, if it exists.
-    """
+    """Read the files of a session; `truth` (true poses) is by default its ``truth.csv``, if any."""
     if not session.is_dir():
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     inputs = Inputs(session.resolve().name)

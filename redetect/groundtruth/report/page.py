@@ -44,10 +44,7 @@ _SCANS_PX, _ALIGNMENT_PX = (864, 237), (864, 274)
 
 
 def report_page(inputs: Inputs, version: str) -> bytes:
-    """The whole page, UTF-8; the same inputs give the same bytes.
-
-    `version`: of the program, for the page's foot.
-    """
+    """The page in UTF-8, the same for the same inputs; its foot names the version."""
     sections = [
         Section("state", "Contents of the session", _state(inputs)),
         Section("building", "Drawing and fiducials", _building(inputs)),

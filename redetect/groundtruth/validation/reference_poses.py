@@ -71,10 +71,7 @@ class Distance:
 
 
 def read_survey(path: PathLike) -> Survey:
-    """Read a ``fiducials.json``.
-
-    Raises `GroundTruthError` if the file cannot be read, or an entry is missing or impossible.
-    """
+    """Read a ``fiducials.json``; raises `GroundTruthError` if that fails or it is not valid."""
     content = JsonObject.read(path)
     content.demand_version()
     fiducials, robot_points = (_points(content, key) for key in ("fiducials", "robot_points"))
@@ -84,8 +81,7 @@ def read_survey(path: PathLike) -> Survey:
 def read_distances(path: PathLike, survey: Survey) -> list[Distance]:
     """Read a ``distances.csv``, which may contain only the survey's points, in the file's order.
 
-    Raises `GroundTruthError` if the file cannot be read, a row is malformed or names an unknown
-    point.
+    Raises `GroundTruthError` if it cannot be read, a row is malformed or a point is unknown.
     """
     rows = []
     for line, names, (pose, time_s, distance_m) in read_table(path, DISTANCES_HEAD, _ENDS):

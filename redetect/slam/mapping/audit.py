@@ -4,8 +4,7 @@ Suspects are the rows that a robust map rejects. Each of them is then compared w
 others: the squared error of measurements added to a least-squares problem is
 ``r^T (I + J P J^T)^-1 r`` with r and J their whitened errors and Jacobians and P the covariance
 before (Y. Bar-Shalom, X. Li, T. Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, section 5.4). The same number decides whether another landmark, or a new one,
-explains rows better.
+Navigation, 2001, section 5.4). It also decides if another or a new landmark explains rows better.
 """
 
 from __future__ import annotations
