@@ -138,11 +138,8 @@ class _Problem:
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         poses = step.reshape(-1, 6)
-        return Estimate(
-            at.intrinsics + self.span @ shared,
-            rotation_of(poses[:, :3]) @ at.rotations,
-            at.translations + poses[:, 3:],
-        )
+        turned = rotation_of(poses[:, :3]) @ at.rotations
+        return Estimate(at.intrinsics + self.span @ shared, turned, at.translations + poses[:, 3:])
 
     def _prior(self, at: Estimate) -> tuple[FloatArray, FloatArray]:
         """Residuals (14, 1) of the prior, and their weights (per unit of coefficient)."""

@@ -53,10 +53,8 @@ def perform_lasers(options: Lasers) -> int:
     stated = scanners.read_scanners(by_hand)
     map_file = find_building(session)
     building = read_building(map_file)
-    empties = [
-        scanners.read_scans(scanners.find_scans(session / "empty", s.name), s.readings)
-        for s in stated
-    ]
+    empty = session / "empty"
+    empties = [scanners.read_scans(scanners.find_scans(empty, s.name), s.readings) for s in stated]
     measured = scanners.with_measured_noise(stated, empties)
     for text in scanners.noise_warnings(stated, measured, by_hand):
         warn(text)
@@ -247,8 +245,7 @@ def describe(
     segments = []
     for segment, front in sorted(track.fronts.items()):
         times = track.times_s[track.segment == segment].tolist()
-        visit = {"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front}
-        segments.append(visit)
+        segments.append({"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front})
     entries = []
     excess = tracking.excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):

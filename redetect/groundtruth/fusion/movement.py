@@ -190,10 +190,8 @@ class MovementProblem:
         states, covariances = kernels.smooth_backward(history)
         good = nodes[innovations.accepted]
         # The nodes of the last measurement before and the first one after each gap that was cut.
-        gaps = [
-            (int(good[np.searchsorted(good, end) - 1]), int(end))
-            for end in np.flatnonzero(innovations.restarted == kernels.WHERE_LOST)
-        ]
+        lost = np.flatnonzero(innovations.restarted == kernels.WHERE_LOST)
+        gaps = [(int(good[np.searchsorted(good, end) - 1]), int(end)) for end in lost]
         carried = cuts.copy()
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):

@@ -102,10 +102,8 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     groundtruth, _ = with_jitter_covered(groundtruth)
-    parts = [
-        groundtruth.only(part)
-        for part in segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
-    ]
+    spans = segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
+    parts = [groundtruth.only(span) for span in spans]
     search = OffsetSearch(_smoothed(odometry), parts, bounds.largest_offset_s)
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
@@ -198,8 +196,7 @@ def _segment(
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
-            part = segment.only(which)
-            parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
+            parts += _segment(odometry, segment.only(which), bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
     offset_s, drift = best.clock.tolist()

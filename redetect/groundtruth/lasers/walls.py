@@ -352,10 +352,8 @@ class MapProblem(NamedTuple):
         count, rows = poses.size, np.arange(len(on.error_m))
         columns = [*(3 * on.body + c for c in range(3)), count + 2 * index, count + 2 * index + 1]
         values = [*on.by_pose.T, on.share - 1.0, -on.share]
-        jacobian = csr_array(
-            (np.concatenate(values), (np.tile(rows, 5), np.concatenate(columns))),
-            shape=(len(rows), count + 2 * len(seen)),
-        )
+        entries = np.concatenate(values), (np.tile(rows, 5), np.concatenate(columns))
+        jacobian = csr_array(entries, shape=(len(rows), count + 2 * len(seen)))
         weighted = jacobian.multiply(on.weight[:, None]).T.tocsr()
         h, g = (weighted @ jacobian).toarray(), weighted @ on.error_m
         root = np.linalg.cholesky(self._alike(seen))

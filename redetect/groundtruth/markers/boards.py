@@ -105,10 +105,8 @@ def read_boards(path: Path) -> BoardsFile:
             entry = content.inner("first_from_second")
             double = DoubleBoard(parse_pose(entry), entry.uncertainty(6))
     images = tuple(_image(row, path, boards) for row in content.rows("images"))
-    cameras = {
-        name: read_camera(_inside(path, calibration_of(name)))
-        for name in sorted({image.camera for image in images})
-    }
+    names = sorted({image.camera for image in images})
+    cameras = {name: read_camera(_inside(path, calibration_of(name))) for name in names}
     return BoardsFile(boards, world, double, cameras, images)
 
 

@@ -96,11 +96,8 @@ def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> li
             except GeometryError:
                 continue
             poses += [problem.network.world_from_camera[index] @ pose for pose in found]
-    return _best_first(
-        poses,
-        lambda pose: robot_rms_px(problem, pose),
-        f"{solver} found no pose with all corners in front of their cameras",
-    )
+    reason = f"{solver} found no pose with all corners in front of their cameras"
+    return _best_first(poses, lambda pose: robot_rms_px(problem, pose), reason)
 
 
 def _best_first(
@@ -147,8 +144,7 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
     both = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
     try:
         found = cv2.solvePnPGeneric(*both, np.eye(3), None, flags=flags[solver])
-        turns_and_shifts = zip(*found[1:3])
-        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in turns_and_shifts]
+        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in zip(*found[1:3])]
     except cv2.error as error:
         raise GeometryError(f"{solver} found no pose: {error.err}") from None
     return [pose for pose in poses if np.all(np.isfinite(pose))]

@@ -161,10 +161,8 @@ def _stages(inputs: Inputs) -> list[Part]:
     if len(streams) < 2 or not inputs.visits:
         return [Part("note", "Fewer than two streams of poses: no stages.")]
     number = int(np.argmax([b - a for a, b in inputs.visits]))
-    stages = [
-        _track(name, in_visits(poses, [inputs.visits[number]]), inputs)
-        for name, poses in streams.items()
-    ]
+    visit = [inputs.visits[number]]
+    stages = [_track(name, in_visits(poses, visit), inputs) for name, poses in streams.items()]
     stages = [stage for stage in stages if len(stage.poses)]
     words = f"Visit {number + 1}: " + ", ".join(stage.label for stage in stages)
     words += f"; grey: {stages[-1].label}." if stages else "nothing."
