@@ -103,8 +103,7 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
 class Association:
     """Pairs of rows of two sets; no row is in two pairs."""
 
-    #: (M,) the pairs: row `first[k]` of the first set matches row `second[k]` of the second.
-    #: `first` is in ascending order.
+    #: (M,) pairs: row `first[k]`, ascending, of the first set matches row `second[k]` of the second
     first: IndexArray
     second: IndexArray
     #: The unmatched rows of each set, in ascending order

@@ -1,8 +1,7 @@
 """Model of the robot's clock relative to the ground truth's: a straight line per segment.
 
 Within a segment ``robot_time = time + offset + (rate - 1) (time - reference)``, `time` being the
-ground truth's; between segments the offset is interpolated, before the first and after the last
-their lines are extrapolated.
+ground truth's; between segments the offset is interpolated, beyond them lines are extrapolated.
 
 Logs of ptpd contain offset and drift from the clocks' own synchronisation. Two layouts are read:
 comma-separated statistics under a head with the names of the columns, and debug messages, of which

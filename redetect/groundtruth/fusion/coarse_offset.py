@@ -188,9 +188,7 @@ class _Compared:
         return np.asarray(np.where(known, np.square(apart) @ self.weights, np.inf))
 
     def errors(self, steps: IntArray) -> FloatArray:
-        """(K,) mean squared normalised errors at offsets `steps` (K,) of the grid; infinite where
-        too few movements are compared.
-        """
+        """(K,) mean squared normalised errors at grid offsets (K,); infinite with few movements."""
         single = self.single_errors(steps)
         known = np.isfinite(single)
         compared = known.sum(axis=1)

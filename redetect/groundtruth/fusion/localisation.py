@@ -31,8 +31,7 @@ from redetect.groundtruth.trajectories.streams import (
 )
 from redetect.landmarks import wrap_angle
 
-# Both models of odometry are compared on thinned measurements, if there are enough, and only if a
-# longer gap has to be bridged.
+# Both models of odometry are compared on enough thinned measurements, with a longer gap to bridge.
 _FEWEST = 10
 _LEAST_EXTENT_M = 0.01
 _LEAST_GAP_S = 20.0

@@ -19,8 +19,7 @@ from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 # Median of the absolute value of a standard normal number.
 _MEDIAN_OF_NORMAL = 0.6745
-# Order of the differences that are compared with covariances: fifth ones cancel the motion even at
-# four poses a second, the fewest.
+# Order of the differences of poses: fifth ones cancel the motion even at the fewest, four a second.
 _ORDER = 5
 _LEAST_RATE_HZ = 4.0
 _FEWEST = 50

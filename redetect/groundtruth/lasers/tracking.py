@@ -313,8 +313,7 @@ class Tracker:
     def _front(self, rows: IntArray, velocity: FloatArray) -> str:
         """Choose among the poses that the outline hardly distinguishes; returns the criterion.
 
-        First by the readings themselves, in a sample of the sets; if they are ambiguous, by the
-        motion: robots drive forward.
+        By the readings in a sample of the sets; if ambiguous, by the motion: robots drive forward.
         """
         if len(self.body.symmetries) == 0:
             return "outline"

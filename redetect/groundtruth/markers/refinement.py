@@ -226,8 +226,7 @@ def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
 def _common(jacobian: FloatArray, index: IntArray, covariance: FloatArray) -> FloatArray:
     """G C G^T (2 N, 2 N), where corner i depends on the pose `index[i]` only.
 
-    Products of small blocks: G is mostly zeros, and large products would wake BLAS' threads, which
-    takes longer than the work.
+    By small blocks: G is mostly zeros, and BLAS' threads for large products would take longer.
     """
     count = len(index)
     of_pose = covariance.reshape(-1, 6, len(covariance))

@@ -136,9 +136,7 @@ def ellipses(poses: PlanarPoses, inches_per_m: float, count: int) -> tuple[Float
 def _area(
     tracks: Sequence[Track], building: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Corners of the drawn area: the paths with a margin, or else the whole building; and inches
-    on the page per metre.
-    """
+    """Corners of the drawn area (paths with a margin, or the building), and inches per metre."""
     places = [track.poses.poses[:, :2] for track in tracks if len(track.poses)]
     if not places:
         places = [np.array([[0.0, 0.0]]) if building is None else building.reshape(-1, 2)]

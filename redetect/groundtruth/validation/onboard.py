@@ -45,8 +45,7 @@ _WEAK_SIGMA_M = 0.05
 _FREE_SIGMA = 0.5
 # Distances and walls disagree if the probability of their difference is below this.
 _DISAGREEMENT_PROBABILITY = 1e-4
-#: Readings farther than this from the wall that their beam meets, and points farther from every
-#: wall, are of other objects (m).
+#: Readings farther from their beam's wall, and points from every wall, are of other objects (m).
 OF_A_WALL_M = 0.2
 #: Ends of the bins of incidence (deg).
 INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)

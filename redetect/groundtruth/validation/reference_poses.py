@@ -195,9 +195,7 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
 
 
 def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:
-    """Measured minus expected distances (..., K) (m) of poses (..., 3), and their derivatives by
-    the poses (..., K, 3).
-    """
+    """(..., K) measured minus expected distances (m) of poses (..., 3); derivatives (..., K, 3)."""
     arm = measured.levers @ np.swapaxes(rotation(pose[..., 2]), -1, -2)
     apart = pose[..., None, :2] + arm - measured.fiducials
     length = np.hypot(apart[..., 0], apart[..., 1])

@@ -22,8 +22,7 @@ RowErrors = Literal["corrected", "recorded"]
 #: Rotation about robot x, y, z, and position in robot x, y, z.
 MOUNTING = 6
 
-#: Standard deviation of the prior of the camera's horizontal position (m), for runs with too little
-#: rotation to determine it.
+#: Sigma of the prior of the camera's horizontal position (m), for runs with too little rotation.
 PLACE_PRIOR_M = 0.1
 
 #: Standard deviation of lines' priors, if there are any (m).
