@@ -2,9 +2,8 @@
 
 The grammar is the data set's, read tolerantly: any white space, commas or none, keys in any order,
 ``#`` comments. Unknown keys are kept and written back. Three keys are specific to this project:
-``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, each written only for a lens that has
-such terms, and ``covariance: { ... }``, the lower triangle of the parameters' covariance
-(`camera.uncertainty`).
+``tangential: { p1 p2 }`` and ``polynomial: { k1 k2 k3 }``, written only for a lens with such terms,
+and ``covariance: { ... }``, the lower triangle of the parameters' one (`camera.uncertainty`).
 """
 
 from __future__ import annotations

@@ -158,8 +158,7 @@ def undistorted_radius(
     """Inverse of g on [0, r_max], to 1e-12 relative to the larger of 1 and r; NaN beyond.
 
     (At the fold itself g' vanishes, so there r is only as good as the last digit of g allows, 1e-8;
-    g of the result is always right to the last digits.) Newton's method, kept inside the cell of a
-    table of g.
+    g of the result is right to the last digits.) Newton's method, within the cell of a table of g.
     """
     target = np.asarray(distorted, dtype=np.float64)
     table_g, table_r = inverse_table(coef, polynomial)

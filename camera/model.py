@@ -68,8 +68,7 @@ class Camera:
     ------
     CameraError
         If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
-        distortion folds so that less than half of the image sees anything. The message uses the
-        file's names.
+        distortion folds so that less than half of the image sees anything; names are the file's.
 
     References
     ----------
@@ -195,10 +194,7 @@ class Camera:
     # -- camera frame <-> pixels ------------------------------------------------------------
 
     def distort(self, normalised: ArrayLike) -> FloatArray:
-        """(..., 2) pixels of (..., 2) undistorted normalised coordinates px/pz, py/pz.
-
-        Both NaN past the distortion's fold.
-        """
+        """(..., 2) pixels of (..., 2) undistorted coordinates px/pz, py/pz; NaN past the fold."""
         (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
         factor = distortion.radial_factor(radius, self.coef, self.polynomial)
         pixels = scale * xy * factor[..., None]
@@ -239,10 +235,7 @@ class Camera:
         return np.stack([u, v], axis=-1)
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 3) directions (x, y, 1) in the camera frame that (..., 2) pixels see.
-
-        All NaN past the fold.
-        """
+        """(..., 3) camera-frame directions (x, y, 1) of (..., 2) pixels; NaN past the fold."""
         xy = self.undistort(pixels)
         ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
         return np.concatenate([xy, ones], axis=-1)

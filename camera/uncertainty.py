@@ -2,8 +2,7 @@
 
 The parameters are the intrinsics (`camera.calibration.model.INTRINSICS`) and the pose: position (m)
 and a small rotation from the left about the robot's axes (rad). Errors of a calibration are the
-same in all images: they are the common part of covariances, which does not average out over
-landmarks.
+same in all images: the common part of covariances, which does not average out over landmarks.
 """
 
 from __future__ import annotations

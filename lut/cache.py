@@ -53,8 +53,7 @@ def cache_folder() -> Path:
 def cached_disc_table(camera: Camera, shape: DiscShape, folder: Path | None = None) -> DiscTable:
     """The disc table of a camera, from the cache if valid, else computed and cached.
 
-    Result, parameters and errors as for `lut.build_disc_table`; `folder` is the cache, by default
-    `cache_folder`.
+    All else is as for `lut.build_disc_table`; `folder` is the cache, by default `cache_folder`.
     """
     return _cached(DiscTable, "discs", (camera, shape), build_disc_table, folder)
 

@@ -48,11 +48,9 @@ class DiscShape:
     border_px: int = 12  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: float = 0.05
-    #: Least number of sample pairs (an inner and an outer one) inside the image; 0: samples are
-    #: counted singly.
+    #: Least number of pairs (inner and outer sample) inside the image; 0: samples count singly.
     least_pairs: int = 0
-    #: Samples of a pair on the same pixel are moved inwards and outwards by the length on the floor
-    #: of this many image rows.
+    #: Samples of a pair on the same pixel are moved inwards and outwards by this many rows' length.
     apart_px: float = 0.0
     #: Least distance of usable centres in a row, converted to pixels by the length of an image row
     #: on the floor and rounded up; 0: every pixel is a centre.

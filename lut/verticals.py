@@ -4,8 +4,7 @@ A vertical plane through the camera's centre appears as one curve, all points of
 bearing. It is identified by the pixel at which it crosses the horizon: the table has, for each
 image column, the row of the horizon and the vertical through that point, as a column for each row,
 including distortion (DLR Spatial Cognition data set report, line detection). For a camera that does
-not see the horizon, a line of constant elevation near the image border replaces it; both are called
-*anchor*.
+not see the horizon, a line of constant elevation near the border replaces it: the *anchor*.
 """
 
 from __future__ import annotations

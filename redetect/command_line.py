@@ -56,8 +56,7 @@ _STANDARD_OUTPUT = Path("-")
 
 
 def exit_code_of(work: Callable[[], int]) -> int:
-    """Run a command and report its errors on one line; returns its exit code, or one of those
-    above.
+    """Run a command, report its errors on one line, and return its exit code or one of those above.
 
     All packages raise `OneLineError`, the system raises OSError, libraries raise ValueError.
     Anything else is a bug and shows its traceback.

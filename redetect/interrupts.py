@@ -65,10 +65,7 @@ def _hands_over(frame: FrameType) -> bool:
 
 @contextmanager
 def interrupts_call(note: Handler) -> Iterator[None]:
-    """Have interrupts call something during a block, but not in kernels.
-
-    Outside the main thread it does nothing.
-    """
+    """In the main thread, have interrupts call something during a block, but not in kernels."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,8 +1,7 @@
 """JSON of results and files, all of it with the same types.
 
 Entries keep their order. Arrays and tuples are lists, records are objects, and paths are text.
-Numbers that are not finite, which JSON does not have, are null; others have the shortest form that
-gives the same float64.
+Numbers that are not finite are null, since JSON has none; others are exact in the shortest form.
 """
 
 from __future__ import annotations

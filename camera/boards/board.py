@@ -237,12 +237,8 @@ def pdf_of(sheet: Sheet) -> bytes:
     bottom = -0.5 * height + _MARGIN_M
     left = -0.5 * width + _MARGIN_M
     axes.add_patch(Rectangle((left, bottom), _RULER_M, 0.002, **_INK))
-    axes.text(
-        left,
-        bottom + 0.004,
-        f"{sheet.text}; the bar is {1e3 * _RULER_M:g} mm long: measure it, and print at 100 %",
-        fontsize=7,
-    )
+    text = f"{sheet.text}; the bar is {1e3 * _RULER_M:g} mm long: measure it, and print at 100 %"
+    axes.text(left, bottom + 0.004, text, fontsize=7)
     stream = io.BytesIO()
     # Without a date, the same board gives the same bytes.
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Producer": None})

@@ -138,11 +138,8 @@ class _Problem:
 
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         poses = step.reshape(-1, 6)
-        return Estimate(
-            at.intrinsics + self.span @ shared,
-            rotation_of(poses[:, :3]) @ at.rotations,
-            at.translations + poses[:, 3:],
-        )
+        turned = rotation_of(poses[:, :3]) @ at.rotations
+        return Estimate(at.intrinsics + self.span @ shared, turned, at.translations + poses[:, 3:])
 
     def _prior(self, at: Estimate) -> tuple[FloatArray, FloatArray]:
         """Residuals (14, 1) of the prior, and their weights (per unit of coefficient)."""
@@ -156,10 +153,7 @@ class _Problem:
 def project_estimate(
     estimate: Estimate, points: Points
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels of all points, and their derivatives.
-
-    Returns `pixels` (N, 2), `by_intrinsics` (N, 2, 14), `by_pose` (N, 2, 6).
-    """
+    """Pixels of all points (N, 2), derivatives by intrinsics (N, 2, 14) and by pose (N, 2, 6)."""
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
     pixels, by_intrinsics, by_point = model.project_points(

@@ -139,8 +139,7 @@ class Calibration:
     names: tuple[str, ...]  #: The views' names
     outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
-    #: RMS reprojection error (u and v together) in held-out views, by the sets of free coefficients
-    #: that were tried
+    #: RMS reprojection error (u and v together) in held-out views, by the lenses that were tried
     holdout_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 

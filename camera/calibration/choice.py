@@ -140,11 +140,8 @@ def _fitted(
                 adjusted, seen = again, seen_again
         estimate = adjusted.estimate
         # A lens with a pole is good for the next start, but useless where there are no points.
-        error = (
-            float("inf")
-            if has_pole(estimate.intrinsics, points.width, points.height)
-            else holdout_error(estimate, seen, settings, lens)
-        )
+        pole = has_pole(estimate.intrinsics, points.width, points.height)
+        error = float("inf") if pole else holdout_error(estimate, seen, settings, lens)
         tried[lens] = Candidate(adjusted, seen, error)
     return tried
 

@@ -128,12 +128,7 @@ def _fitted(
         residuals[~used[points.views]] = residuals_of(posed, rest)
     typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))
     far = max(_FAR * np.median(typical[used]), _LEAST_FAR_PX)
-    return Consensus(
-        fit=fit,
-        estimate=found,
-        rms_px=rms,
-        agree=(typical <= far) & np.isfinite(rms),
-    )
+    return Consensus(fit=fit, estimate=found, rms_px=rms, agree=(typical <= far) & np.isfinite(rms))
 
 
 def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> FloatArray:

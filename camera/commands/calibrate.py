@@ -281,9 +281,7 @@ def calibration_files(inputs: Sequence[Path], most: int) -> dict[str, Path]:
 
 
 def calibration_images(inputs: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage]]:
-    """Names and grey images of the `calibration_files`, one after the other; at most `most` frames
-    of each video, evenly spaced.
-    """
+    """Names and grey images of `calibration_files`; of a video at most `most`, evenly spaced."""
     for name, path in calibration_files(inputs, most).items():
         if path.suffix.lower() in VIDEO_SUFFIXES:
             yield from _frames(path, name, most)

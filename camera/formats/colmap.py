@@ -87,8 +87,7 @@ def _from_parameters(
         )
     fx, fy = parameters[0], parameters[focals - 1]
     cx, cy = (value - _HALF_PIXEL for value in parameters[focals : focals + 2])
-    coefficients = parameters[focals + 2 :]
-    return foreign(where, model, width, height, (fx, fy, cx, cy), coefficients)
+    return foreign(where, model, width, height, (fx, fy, cx, cy), parameters[focals + 2 :])
 
 
 def colmap_parameters(camera: ForeignCamera) -> tuple[str, list[float]]:

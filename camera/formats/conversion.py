@@ -47,8 +47,7 @@ class Converted:
     """A converted camera."""
 
     camera: AnyCamera
-    # Largest distance, over the image, between the pixels of a ray in the source and in the target
-    # (target's pixels).
+    # Largest distance over the image (target's pixels) of a ray's pixels in source and target.
     deviation_px: float
     at: tuple[float, float]  # the target's pixel where it is largest
 
@@ -291,8 +290,7 @@ def _grid(source: AnyCamera, rows: Rows, size: tuple[int, int]) -> tuple[FloatAr
     u, v = np.meshgrid(axes[0] * (width - 1), axes[1] * (height - 1))
     pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
     # Line v of the even lines is line 2 v of all.
-    in_source = pixels / [1.0, _FACTORS[rows]]
-    rays = source.undistort(in_source)
+    rays = source.undistort(pixels / [1.0, _FACTORS[rows]])
     seen = np.isfinite(rays[:, 0])
     area = np.outer(*(np.gradient(axis) for axis in reversed(axes))).ravel()
     share = area[seen].sum() / area.sum()

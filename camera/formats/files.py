@@ -14,8 +14,7 @@ from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded
 
-#: The models of each format, the simplest first, and their number of coefficients: some formats
-#: lack k3.
+#: The models of each format, the simplest first, with their numbers of coefficients: some lack k3.
 MODELS: dict[str, dict[Model, int]] = {
     "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
     "ros": {"radtan": 5, "rational": 8, "fisheye": 4},

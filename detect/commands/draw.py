@@ -70,8 +70,7 @@ def draw_run(
     """Draw rows into the images of a run, to PNG files in a folder, and to a video.
 
     With the plan of their detection, verticals are drawn as tracks, and markers with the rejected
-    candidates. Returns the numbers of pictures, and of those without rows, and the reasons why
-    frames have none.
+    candidates. Returns the numbers of pictures and of those without rows, and why frames have none.
     """
     drawn, blank, failures = 0, 0, list[str]()
     projection = rows.projection(run.camera) if isinstance(run, Run) else None

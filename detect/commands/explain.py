@@ -35,8 +35,7 @@ def perform(command: Explain) -> int:
             "above, or one named by --camera"
         )
     frame = RunFrame(still("image"), command.image, bit_depth=command.bit_depth)
-    image = read_image(frame, camera)
-    found = explain_discs(image, camera, command.detector, command.at)
+    found = explain_discs(read_image(frame, camera), camera, command.detector, command.at)
     _print(found)
     if command.output is not None:
         write_bytes(command.output, png_of(draw_explanation(found)), overwrite=command.force)

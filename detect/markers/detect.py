@@ -148,8 +148,7 @@ def detect_markers(
     image : (H, W) uint8
     settings : MarkerSettings
     camera : Camera, optional
-        The calibration, whose distortion bends the markers' edges; without one they are assumed to
-        be straight in the image.
+        The calibration, whose distortion bends markers' edges; without one they count as straight.
 
     Raises
     ------

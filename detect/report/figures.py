@@ -284,8 +284,7 @@ def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatA
 def whitened(comparison: DiscComparison | LineComparison) -> FloatArray:
     """(M,) errors in units of their covariances: standard normal if these are right.
 
-    Two independent components for each disc with a positive definite covariance; one for each line
-    with a positive sigma.
+    Two for each disc with a positive definite covariance, one for each line with a positive sigma.
     """
     if isinstance(comparison, LineComparison):
         usable = comparison.pairs.sigma_rad >= LEAST_SIGMA_RAD

@@ -8,7 +8,8 @@ standard deviation that of the mixture.
 A line's row holds its ends in undistorted normalised image coordinates. The plane through the
 camera's centre and both ends has a unit normal n in the robot frame; beta = asin(n_z). alpha is the
 bearing of the horizontal direction in the plane with normal R n, where R undoes the tilt
-(`detect.verticals.tilt`). The data set's own rows were made with R's inverse, which doubles it.
+(`detect.verticals.tilt`). The data set's own rows were made with R's inverse, which adds the tilt
+instead of removing it.
 """
 
 from __future__ import annotations

@@ -83,8 +83,7 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
     covariance : (..., n, n) array_like
         Symmetric matrices.
     least : float
-        The smallest eigenvalue of the correlation matrix must be above this; otherwise quantities
-        are linearly dependent.
+        Bound of the correlation matrix's eigenvalues; below it, quantities are linearly dependent.
 
     Returns
     -------
@@ -104,8 +103,7 @@ def is_positive_definite(covariance: ArrayLike, least: float = 1e-12) -> BoolArr
 class Association:
     """Pairs of rows of two sets; no row is in two pairs."""
 
-    #: (M,) the pairs: row `first[k]` of the first set matches row `second[k]` of the second.
-    #: `first` is in ascending order.
+    #: (M,) pairs: row `first[k]`, ascending, of the first set matches row `second[k]` of the second
     first: IndexArray
     second: IndexArray
     #: The unmatched rows of each set, in ascending order

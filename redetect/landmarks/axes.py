@@ -7,8 +7,7 @@ Rz T Rz^-1, that is, its position is rotated and its angle is unchanged. Covaria
 Rz C Rz^T; if only the means were rotated, ellipses would have the wrong orientation. Bearings are
 0 forward, positive to the left, in both.
 
-Only numbers and signs are exchanged: nothing is rounded, and the conversion back gives the same
-bits.
+Only numbers and signs are exchanged, without rounding: the conversion back gives the same bits.
 """
 
 from __future__ import annotations

@@ -100,8 +100,7 @@ def write_map(
     comments : sequence of str
         Lines for the head.
     overwrite : bool
-        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError` is
-        raised.
+        Whether an existing file may be replaced; else `redetect.storage.OutputExistsError`.
     """
     rows = [
         (kind, int(number), *map(float, (*xy, c[0, 0], c[0, 1], c[1, 1])), int(count))
@@ -202,11 +201,8 @@ def read_path(path: FilePath) -> Path2D:
         prefixes.append(words[0])
         numbers.append(_finite(path, line, PATH_COLUMNS[1:], words[1:]))
     table = np.array(numbers, dtype=np.float64)
-    return Path2D(
-        prefixes=tuple(prefixes),
-        poses=table[:, :3].copy(),
-        covariance=table[:, 3:].reshape(-1, 3, 3) if table.shape[1] > 3 else None,
-    )
+    covariance = table[:, 3:].reshape(-1, 3, 3) if table.shape[1] > 3 else None
+    return Path2D(tuple(prefixes), table[:, :3].copy(), covariance)
 
 
 def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:

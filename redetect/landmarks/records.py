@@ -174,8 +174,7 @@ class Frame:
 
     step: Step
     landmarks: tuple[Landmark, ...] = ()
-    #: Pitch and roll (rad) by which the positions of its discs were levelled; None if they were
-    #: not
+    #: Pitch and roll (rad) by which its discs' positions were levelled; None if they were not
     levelled_by: tuple[float, float] | None = None
 
     @property

@@ -96,8 +96,7 @@ def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, 
 def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
     """Measurement model of a disc: its centre in the robot frame.
 
-    Takes `pose` (..., 3) of the robot in the map, `disc_xy` (..., 2), the centre in the map;
-    returns (..., 2).
+    Takes `pose` (..., 3) of the robot and `disc_xy` (..., 2), both in the map; returns (..., 2).
     """
     robot = np.asarray(pose, dtype=np.float64)
     offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
@@ -119,10 +118,7 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 
 
 def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
-    """Derivative of apparent floor positions by a small tilt of the robot.
-
-    Takes `disc_xy` (n, 2); returns (n, 2, 2).
-    """
+    """(n, 2, 2) derivatives of apparent floor positions (n, 2) by a small tilt of the robot."""
     x, y = disc_xy.T
     rows = (x * y / height_m, -height_m - x**2 / height_m)
     others = (height_m + y**2 / height_m, -x * y / height_m)

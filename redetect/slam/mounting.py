@@ -54,8 +54,7 @@ def rows_as_recorded(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows, written with the calibration, of discs seen by the camera as mounted.
 
-    The lens cancels: the ray of a disc is intersected with the floor from the camera's calibrated
-    pose.
+    The lens cancels: the ray of a disc meets the floor as from the camera's calibrated pose.
 
     Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
     its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter by the numbers that

@@ -35,8 +35,7 @@ def read_bounded(path: FilePath, largest_bytes: int, *, own: bool = False) -> by
     """The content of a regular file, or a link to one, of at most `largest_bytes`.
 
     Pipes and devices are rejected, never waited for; if it must be the user's `own`, so are links,
-    and files that another user may have written to. Raises an OSError whose `strerror` states the
-    reason.
+    and files that another user may have written to. Raises an OSError; `strerror` is the reason.
     """
     try:
         links = os.O_NOFOLLOW if own else 0

@@ -111,9 +111,7 @@ def _tiff_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _tiff_numbers(content: bytes) -> Iterator[tuple[int, str | None, int]]:
-    """The tags of the first directory, each with the `struct` format of its number (None if it is
-    not a number) and its offset.
-    """
+    """The first directory's tags: `struct` format (None if not a number) and offset of each."""
     order = "<" if content.startswith(b"II") else ">"
     big = content[2:4] in (b"+\0", b"\0+")
     offset_type, count_type, entry_bytes = ("Q", "Q", 20) if big else ("I", "H", 12)

@@ -49,9 +49,7 @@ def demand_place(path: Path, *, overwrite: bool) -> None:
 
 
 def demand_writable(path: Path) -> None:
-    """Reject a path in a folder without write permission; for a folder yet to be created, that of
-    the nearest existing one above it.
-    """
+    """Reject a path if its folder, or the nearest existing one above, has no write permission."""
     above = next(place for place in Path(os.path.realpath(path)).parents if place.exists())
     if not above.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(above))

@@ -49,14 +49,8 @@ def perform(options: Associate) -> int:
         seconds = time.perf_counter() - began
         _progress("")
         scores = score_run(recording, found)
-        tries.append(
-            {
-                "noise": factor,
-                "seconds": round(seconds, 2),
-                "loop_matches": len(found.matches),
-                "scores": scores,
-            }
-        )
+        figures = {"seconds": round(seconds, 2), "loop_matches": len(found.matches)}
+        tries.append({"noise": factor, **figures, "scores": scores})
         print("\n".join(score_lines(factor, seconds, scores)))
         if factor == 0.0:
             result = found

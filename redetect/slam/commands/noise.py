@@ -15,7 +15,6 @@ def perform(options: Noise) -> int:
     noise, lines = options.noise, options.lines
     (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
     target = options.output or source.with_name(f"noisy{source.suffix}")
-    rows = noisy_rows(read_rows(source), noise)
-    write_rows(target, rows, overwrite=options.force)
+    write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
     print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
     return 0

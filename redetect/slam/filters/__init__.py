@@ -1,5 +1,4 @@
 """Filters: localisation in a known map (`localizer`), EKF-SLAM (`ekf_slam`).
 
-Both process a recording frame by frame; `base` has the measurement models, and pairs rows without
-identifiers with landmarks.
+Both process a recording frame by frame; `base` has the measurement models, and associates rows.
 """

@@ -211,8 +211,7 @@ class Filter(ABC):
     def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
         """Lines as homogeneous points (e, 3): the position is x / w, y / w.
 
-        Takes their numbers of the state (e, k), and also returns the derivatives (e, 3, k) by
-        these.
+        Takes their numbers of the state (e, k); also returns the derivatives (e, 3, k) by these.
         """
         points = np.insert(self._state[numbers], 2, 1.0, axis=1)
         return points, np.tile(np.eye(3, 2), (len(numbers), 1, 1))
@@ -280,8 +279,7 @@ class Filter(ABC):
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rows of one kind against m landmarks of that kind, as input of `compatible`.
 
-        Returns innovations (n, m, d) and the covariances of the predictions (m d, m d) and of the
-        rows (n, d, d).
+        Returns innovations (n, m, d), covariances of predictions (m d, m d) and of rows (n, d, d).
         """
         if isinstance(rows, LineRows):
             prediction = self.predicted([], [self.line_slots[i] for i in names.tolist()])

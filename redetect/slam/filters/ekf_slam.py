@@ -57,8 +57,7 @@ class EkfSlam(base.Filter):
     start, start_covariance, camera_xy, common_tilt_variance : array_like
         As in `Filter`.
     tilt_sigma_rad : float
-        Standard deviation of the robot's sway about both axes of the floor, in addition to the
-        rows' covariances.
+        Standard deviation of the robot's sway about the floor's axes, added to rows' covariances.
     """
 
     line_size = 4
@@ -249,8 +248,7 @@ def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> 
     discs not seen for long, and begins again after a lost step.
 
     Takes the first pose (3,) (m, m, rad); returns the start and the pose after each step (N + 1, 3)
-    as estimated at the time, theta not wrapped. Raises `SlamError` if covariances contradict each
-    other.
+    as estimated at the time, theta not wrapped; a `SlamError` if covariances are contradictory.
     """
     lost = set(recording.lost.tolist())
     poses = np.empty((len(recording) + 1, 3))

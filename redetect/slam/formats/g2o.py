@@ -62,8 +62,7 @@ def graph_of_run(recording: Recording) -> RunGraph:
     """A run's steps and identified discs; poses as by odometry, discs where first seen."""
     graph = graph_of_recording(recording)
     estimate = first_sight(graph)
-    rows = recording.circles.only(recording.circles.identified)
-    run = replace(recording, circles=rows)
+    run = replace(recording, circles=recording.circles.only(recording.circles.identified))
     return RunGraph(run, estimate.poses, graph.disc_ids, estimate.disc_xy)
 
 

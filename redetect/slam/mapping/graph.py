@@ -71,10 +71,7 @@ class Estimate:
 
 
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
-    """The problem of a run's odometry and discs; `with_lines` adds lines.
-
-    Rows without an identifier are ignored.
-    """
+    """The problem of odometry and identified discs; `with_lines` adds lines."""
     circles = recording.circles
     known = circles.ids >= 0
     ids, index = np.unique(circles.ids[known], return_inverse=True)

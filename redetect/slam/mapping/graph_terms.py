@@ -22,8 +22,7 @@ RowErrors = Literal["corrected", "recorded"]
 #: Rotation about robot x, y, z, and position in robot x, y, z.
 MOUNTING = 6
 
-#: Standard deviation of the prior of the camera's horizontal position (m), for runs with too little
-#: rotation to determine it.
+#: Sigma of the prior of the camera's horizontal position (m), for runs with too little rotation.
 PLACE_PRIOR_M = 0.1
 
 #: Standard deviation of lines' priors, if there are any (m).
@@ -153,10 +152,7 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 def _disc_rows(
     graph: Graph, estimate: Estimate, weighting: Weighting
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(n, 2) predicted minus measured rows of discs (m).
-
-    Also their derivatives (n, 2, k) by pose, disc and mounting.
-    """
+    """(n, 2) predicted minus measured discs (m); derivatives (n, 2, k) by pose, disc, mounting."""
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
     seen, (by_pose, by_disc) = models.disc_in_robot(pose, disc), models.disc_jacobians(pose, disc)
     if estimate.mounting is None:

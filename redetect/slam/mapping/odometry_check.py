@@ -4,8 +4,7 @@ The factor of a map, chi-squared over its expectation, may be near 1 although od
 than its covariances state: most numbers are those of rows. So the expectation is divided: that of
 odometry is the sum of its redundancies, the share of each number that the others check (W.
 Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, chapter 4). Systematic errors of all
-steps, as of a wheel's radius or a unit, are estimated as further unknowns, from the minimum without
-them.
+steps, as of a wheel's radius or a unit, are further unknowns, from the minimum without them.
 """
 
 from __future__ import annotations

@@ -220,8 +220,7 @@ def map_run(
     Raises
     ------
     SlamError
-        If no row has an identifier, the run is disconnected, a calibration is missing, or there is
-        no minimum.
+        If no row has an identifier, the run is disconnected, or there is no calibration or minimum.
     """
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
