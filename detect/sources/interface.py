@@ -110,6 +110,7 @@ class Source(Frames):
     output_base: Path  # path of results without their extensions
     beside: tuple[Path, str] | None = None  # folder and stem of a ``.cam`` file beside it
     has_times = True  # whether the times of the images are known
+    is_8_bit = False  # whether no image can have more
 
     def calibration(self, *, posed: bool) -> Camera | None:
         """The calibration beside the source, or contained in it; None if there is none.

@@ -79,7 +79,7 @@ def open_source(
         frames, odometry = _frames(source, options)
         has_times = source.has_times
     bit_depth = options.bit_depth
-    if bit_depth is None and not isinstance(source, VideoFile | LiveCamera):  # these have 8 bits
+    if bit_depth is None and not source.is_8_bit:
         # Errors in the poses are those of the run.
         bit_depth = bit_depth_of(source if isinstance(frames, FramesAlongPoses) else frames, camera)
     if options.frames or bit_depth:

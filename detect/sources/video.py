@@ -29,6 +29,8 @@ _log = logging.getLogger("redetect")
 class VideoFile(Source):
     """Frames of a video file, named ``<stem>.0000`` and so on; times count from its beginning."""
 
+    is_8_bit = True
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.name, self.beside = str(path), (path.parent, path.stem)
@@ -65,6 +67,8 @@ class VideoFile(Source):
 
 class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
+
+    is_8_bit = True
 
     def __init__(self, index: int) -> None:
         self.name = f"camera:{index}"

@@ -262,21 +262,21 @@ def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int 
     timed = np.isfinite(log.times_s)
     times, offsets = log.times_s[timed], log.offset_s[timed]
     groundtruth = times - offsets
-    inside = np.zeros(len(times), dtype=np.bool_)
+    within = np.zeros(len(times), dtype=np.bool_)
     bends = []
     for segment in determined:
         here = (groundtruth >= segment.from_s) & (groundtruth <= segment.to_s)
-        inside |= here
+        within |= here
         if np.count_nonzero(here) >= 3:
             t = groundtruth[here] - segment.reference_s
             line = np.polyfit(t, offsets[here], 1)
             bends.append(offsets[here] - np.polyval(line, t))
-    expected = model.robot_times(groundtruth[inside]) - groundtruth[inside]
-    difference = offsets[inside] - expected
+    expected = model.robot_times(groundtruth[within]) - groundtruth[within]
+    difference = offsets[within] - expected
     drift = log.drift[np.isfinite(log.drift)]
     return {
         "reports": len(log.offset_s),
-        "reports_in_segments": int(np.count_nonzero(inside)),
+        "reports_in_segments": int(np.count_nonzero(within)),
         "rms_difference_s": _rms(difference),
         "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
         "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),

@@ -118,9 +118,7 @@ def perform_import(command: Import) -> int:
 def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
-    file = command.file
-    stated = {"sigma_m": command.range_sigma, "sigma_rad": command.bearing_sigma}
-    sigmas = {name: sigma for name, sigma in stated.items() if sigma is not None}
+    file, sigmas = command.file, (command.range_sigma, command.bearing_sigma)
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
         write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
@@ -130,11 +128,11 @@ def _import_data_set(command: Import) -> None:
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
-        run, response = data_sets.read_robot(file, **sigmas, calibrated=command.calibrated)
+        run, response = data_sets.read_robot(file, *sigmas, calibrated=command.calibrated)
         notes = [] if response is None else [response.sentence()]
         _write_run(command, run, "measurements", *notes)
     elif file.name == data_sets.DRIVE:
-        _write_run(command, data_sets.read_drive(file, **sigmas), "measurements")
+        _write_run(command, data_sets.read_drive(file, *sigmas), "measurements")
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "

@@ -50,15 +50,15 @@ _DEPTH_SCALE = 1.033
 _WIDEST_RAD = 1.2
 #: Errors of these ranges, metres and as a share; for how long they are alike; errors of bearings.
 _USUAL_SIGMA_M, _USUAL_SHARE, _ALIKE_S, _USUAL_SIGMA_RAD = 0.03, 0.02, 5.0, 0.02
-#: The same without calibration.
+#: The same without calibration, and of Victoria Park's trees.
 _RAW_SIGMA_M, _RAW_SIGMA_RAD = 0.1, 0.03
 #: Zeros between commands that last less than this are ignored, seconds.
 _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
 #: of a landmark that show it, seconds.
 _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
-#: Added to a response while it is estimated: steps of derivatives are relative to it.
-_FROM_0 = (1.0, 0.0, 0.0)
+#: Step of the derivatives of residuals by a response.
+_STEP = 1e-3
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
 _LATE_S = 0.08
 
@@ -272,7 +272,7 @@ def response_of(
     place = seen.range_m[before, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
 
     def residuals(numbers: ArrayLike) -> FloatArray:
-        response = Response(*np.subtract(numbers, _FROM_0).tolist())
+        response = Response(*np.asarray(numbers).tolist())
         poses = _driven_by(velocity, response).poses(seen.times)
         moved = between(poses[seen.frame[before]], poses[seen.frame[after]])
         x, y = apply(invert(moved), place).T
@@ -283,11 +283,16 @@ def response_of(
         robust = np.copysign(np.sqrt(np.arctan(changes**2)), changes)
         return np.concatenate([robust, np.subtract(response, Response()) / _RESPONSE_SIGMA])
 
-    starts = [np.add(Response(lag_s), _FROM_0) for lag_s in _LAGS_S]
-    first = min(starts, key=lambda numbers: float(np.sum(residuals(numbers) ** 2)))
-    least, most = np.add([(_LAGS_S[0], 0.5, 0.5), (_LAGS_S[-1], 2.0, 2.0)], _FROM_0)
-    found = least_squares(residuals, first, bounds=(least - 1e-9, most + 1e-9), diff_step=1e-3)
-    return Response(*np.subtract(found.x, _FROM_0).tolist())
+    def jacobian(numbers: FloatArray) -> FloatArray:
+        # Not by `least_squares`, whose steps are relative to the numbers: the lag may be 0.
+        steps = _STEP * np.eye(len(numbers))
+        changes = [residuals(numbers + step) - residuals(numbers - step) for step in steps]
+        return np.stack(changes, axis=1) / (2.0 * _STEP)
+
+    starts = [Response(lag_s) for lag_s in _LAGS_S.tolist()]
+    first = min(starts, key=lambda response: float(np.sum(residuals(response) ** 2)))
+    bounds = (_LAGS_S[0] - 1e-9, 0.5, 0.5), (_LAGS_S[-1] + 1e-9, 2.0, 2.0)
+    return Response(*least_squares(residuals, first, jacobian, bounds).x.tolist())
 
 
 def _alike(seen: _Sightings) -> FloatArray:
@@ -399,7 +404,9 @@ def _table(path: Path, names: str) -> FloatArray:
     return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
 
 
-def read_drive(drive: Path, sigma_m: float = 0.1, sigma_rad: float = 0.03) -> Recording:
+def read_drive(
+    drive: Path, sigma_m: float | None = None, sigma_rad: float | None = None
+) -> Recording:
     """The car's log, with the trees found in its scans as discs; see `read_robot`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
@@ -417,7 +424,9 @@ def read_drive(drive: Path, sigma_m: float = 0.1, sigma_rad: float = 0.03) -> Re
     found = [trees_of(scan) for scan in scans]
     trees = np.concatenate([np.zeros((0, 2)), *found])
     frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
-    rows = discs_of_ranges(trees[:, 0], trees[:, 1], sigma_m, sigma_rad)
+    of_ranges = _RAW_SIGMA_M if sigma_m is None else sigma_m
+    of_bearings = _RAW_SIGMA_RAD if sigma_rad is None else sigma_rad
+    rows = discs_of_ranges(trees[:, 0], trees[:, 1], of_ranges, of_bearings)
     log = _driven(time / 1000.0, speed, steering)
     steps = log.steps(np.append(log.times[0], times))
     return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
