@@ -104,6 +104,7 @@ _STRETCH, _INFLATION = 3, 1.6
 
 _MIDDLES = 2.0 * np.pi * (np.arange(SECTORS) + 0.5) / SECTORS
 _COSINES, _SINES = np.cos(_MIDDLES), np.sin(_MIDDLES)
+_CHUNK = 256  #: Pixels of which products are summed at a time.
 
 #: Working space of fits, reused from one to the next. Its contents need not be initialised.
 WORK = np.dtype([("patch", PATCH), ("rows", np.float32, (_TERMS, CAPACITY))])
@@ -217,10 +218,11 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         most_blur = min(_MOST_GROWTH * start.blur_px + _MOST_GROWTH_PX, _MOST_BLUR)
     usual = Edge(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
     edge = Edge(begin.x, begin.y, begin.radius, _blur_of(shape, start.blur_px, scene.blur_ratio))
-    groups = SECTORS if by_parts else 1
+    parts = ends if by_parts else ends[::SECTORS].copy()
+    groups = len(parts) - 1
     zeros = np.zeros((5, groups))
     levels = Levels(zeros[0], zeros[1], zeros[2], zeros[3], zeros[4])
-    products, normal = np.zeros((_TERMS, _TERMS, SECTORS)), np.zeros((_TERMS, _TERMS, 1))
+    grouped, normal = np.zeros((_TERMS, _TERMS, groups)), np.zeros((_TERMS, _TERMS, 1))
     movement = np.zeros(_TERMS)
     patch.trust[: ends[SECTORS]] = 1.0
     for step in range(_STEPS):
@@ -230,8 +232,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         else:
             chord_shares(patch, ends[SECTORS], disc, edge.blur)
         _write_rows(patch, ends[SECTORS], edge, level, by_parts, rows)
-        _multiply(rows, ends, _OUTSIDE if by_parts else 0, products)
-        grouped = products if by_parts else _sum_of(products)
+        _multiply(rows, parts, _OUTSIDE if by_parts else 0, grouped)
         _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
         if by_parts:
             if _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
@@ -253,10 +254,11 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     eliminate(reduced, range(_RADIUS, _X))
     noise = _inverse(reduced, 0)
     if by_parts:
-        xx, xy, yy = _covariance_by_parts(products, levels, normal, noise)
+        xx, xy, yy = _covariance_by_parts(grouped, levels, normal, noise)
     else:
         unknowns = np.zeros(_TERMS)
-        _solve(_sum_of(products), 0, unknowns)
+        _multiply(rows, parts, 0, grouped)  # again, as they were before the elimination
+        _solve(grouped, 0, unknowns)
         area = _correlated_area(patch, rows, ends[SECTORS], unknowns)
         xx, xy, yy = area * noise[0], area * noise[1], area * noise[2]
     information *= (noise[0] + noise[2]) / (xx + yy)
@@ -324,25 +326,18 @@ def _write_rows(
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArray) -> None:
-    """Sums of products of rows in each sector, lower halves, from term `first` on."""
-    for s in range(SECTORS):
-        for a in range(first, _TERMS):
-            for b in range(first, a + 1):
-                total = F32(0.0)
-                for i in range(np.uint64(ends[s]), np.uint64(ends[s + 1])):
-                    total += rows[a, i] * rows[b, i]
-                products[a, b, s] = total
-
-
-@kernel()
-def _sum_of(products: FloatArray) -> FloatArray:
-    """(T, T, 1) sum over all sectors."""
-    total = np.zeros((_TERMS, _TERMS, 1))
-    for a in range(_TERMS):
-        for b in range(a + 1):
-            for s in range(SECTORS):
-                total[a, b, 0] += products[a, b, s]
-    return total
+    """Sums of products of rows in each part, lower halves, from term `first` on."""
+    products[:] = 0.0
+    for s in range(len(products[0, 0])):
+        # In chunks, because of the rounding of long sums, and for the processor's cache.
+        for begin in range(ends[s], ends[s + 1], _CHUNK):
+            end = min(begin + _CHUNK, ends[s + 1])
+            for a in range(first, _TERMS):
+                for b in range(first, a + 1):
+                    total = F32(0.0)
+                    for i in range(np.uint64(begin), np.uint64(end)):
+                        total += rows[a, i] * rows[b, i]
+                    products[a, b, s] += total
 
 
 @kernel(inline="always")

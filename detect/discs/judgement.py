@@ -37,7 +37,7 @@ from detect.discs.rim_network import (
     network_inputs,
     network_log_odds,
 )
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Distances at which grey values are taken for the disc and for the floor, nominal radii.
@@ -46,8 +46,9 @@ _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
 #: inside and outside, and the least share of directions in which the disc differs from the floor.
 GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
-_INNER, _OUTER = (slice(1, 3), slice(2, 4)), slice(5, 7)
+_INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
+_AT_ONCE = 16  #: Candidates at which a network glances at a time.
 _LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
 RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
@@ -130,19 +131,19 @@ def judge(
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
+    contrast, glanced = _glance_odds(
+        image, candidates, nominal, least_step, camera_numbers, networks.glance
+    )
     for i in range(n):
+        if contrast[i] == 0.0:
+            continue
+        fate[i], value[i] = Fate.GLANCE, glanced[i]
+        if glanced[i] < _LEAST_GLANCE:
+            continue
         x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
-        grey, scale = glance(image, camera_numbers, x, y, nominal)
-        contrast = _contrast(grey, sign, least_step)
-        if contrast == 0.0:
-            continue
-        inputs, scales = network_inputs(grey, scale, sign)
-        score = candidates.score[i : i + 1]
-        fate[i], value[i] = Fate.GLANCE, network_log_odds(inputs, scales, score, networks.glance)
-        if value[i] < _LEAST_GLANCE:
-            continue
+        score = candidates.score[i]
         radial = profiles(image, camera_numbers, x, y, nominal)
-        rim = follow_rim(image, camera_numbers, radial, sign * contrast)
+        rim = follow_rim(image, camera_numbers, radial, sign * contrast[i])
         fate[i], value[i] = Fate.NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
@@ -150,13 +151,13 @@ def judge(
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, rim_features = _rim_odds(radial, rim, score[0], sign, networks.look)
+        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, radial, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, features_again = _rim_odds(radial_again, again, score[0], sign, networks.look)
+                more, features_again = _rim_odds(radial_again, again, score, sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
@@ -188,7 +189,7 @@ def _is_known(judged: FloatArray, rim: Rim, sign: float, radius: float) -> bool:
 
 
 @kernel()
-def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
+def _between(grey: Float32Array, bounds: tuple[float, float]) -> FloatArray:
     """Mean grey value of each direction between two distances, nominal radii."""
     per_step = (FARTHEST - NEAREST) / (STEPS - 1)
     first = round((bounds[0] - NEAREST) / per_step)
@@ -200,56 +201,82 @@ def _between(grey: FloatArray, bounds: tuple[float, float]) -> FloatArray:
 
 
 @kernel()
-def glance(
-    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
-) -> tuple[FloatArray, FloatArray]:
-    """Nearest-pixel grey values along some directions.
+def _glance_odds(
+    image: GreyImage, candidates: HoughCandidates, nominal: float, least_step: float,
+    camera_numbers: FloatArray, network: RimNetwork,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """(N,) contrasts of candidates, 0 if too few directions have any, and their log-odds."""
+    n = len(candidates.score)
+    contrast, odds = np.empty(n), np.empty(n)
+    for first in range(0, n, _AT_ONCE):
+        end = min(first + _AT_ONCE, n)
+        sign, score = candidates.sign[first:end], candidates.score[first:end].copy()
+        grey, scale = glance(image, camera_numbers, candidates.floor_xy[first:end], nominal)
+        inputs, scales = network_inputs(grey, scale, sign)
+        log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)
+        for k in range(end - first):
+            contrast[first + k] = _contrast(grey[k], sign[k], least_step)
+            odds[first + k] = log_odds[k]
+    return contrast, odds
 
-    Perspective within the disc is ignored if it shifts the rim by less than a step. Parameters and
-    results as for `detect.discs.rim.profiles`, with fewer directions and steps.
+
+@kernel()
+def glance(
+    image: GreyImage, camera_numbers: FloatArray, floor_xy: FloatArray, radius: float
+) -> tuple[Float32Array, FloatArray]:
+    """Nearest-pixel grey values along some directions from N points on the floor.
+
+    Perspective within a disc is ignored if it shifts the rim by less than a step. Returns
+    (N, GLANCED, len(GLANCED_AT)) grey values, NaN outside the image, and (N, GLANCED) pixels per
+    radius; parameters otherwise as for `detect.discs.rim.profiles`.
     """
-    grey, scale = np.empty((GLANCED, len(GLANCED_AT))), np.empty(GLANCED)
-    u0, v0 = project_floor_point(camera_numbers, x, y)
-    ux, vx = project_floor_point(camera_numbers, x + radius, y)
-    uy, vy = project_floor_point(camera_numbers, x, y + radius)
-    # The scale changes from the centre to the rim by up to radius over distance, on either side.
-    step = GLANCED_AT[1] - GLANCED_AT[0]
-    flat = 2.0 * radius < step * distance_of_floor_point(camera_numbers, x, y)
+    count = len(floor_xy)
+    grey = np.empty((count, GLANCED, len(GLANCED_AT)), np.float32)
+    scale = np.empty((count, GLANCED))
     height, width = image.shape
-    for k in range(GLANCED):
-        cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
-        du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
-        scale[k] = math.sqrt(du * du + dv * dv)
-        for m in range(len(GLANCED_AT)):
-            u, v = u0 + GLANCED_AT[m] * du, v0 + GLANCED_AT[m] * dv
-            if not flat:
-                off = radius * GLANCED_AT[m]
-                u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
-            u, v = u + 0.5, v + 0.5
-            inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
-            grey[k, m] = image[int(v), int(u)] if inside else math.nan
+    step = GLANCED_AT[1] - GLANCED_AT[0]
+    for i in range(count):
+        x, y = floor_xy[i]
+        u0, v0 = project_floor_point(camera_numbers, x, y)
+        ux, vx = project_floor_point(camera_numbers, x + radius, y)
+        uy, vy = project_floor_point(camera_numbers, x, y + radius)
+        # The scale changes from the centre to the rim by up to radius over distance.
+        flat = 2.0 * radius < step * distance_of_floor_point(camera_numbers, x, y)
+        for k in range(GLANCED):
+            cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
+            du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
+            scale[i, k] = math.sqrt(du * du + dv * dv)
+            for m in range(len(GLANCED_AT)):
+                u, v = u0 + GLANCED_AT[m] * du, v0 + GLANCED_AT[m] * dv
+                if not flat:
+                    off = radius * GLANCED_AT[m]
+                    u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
+                u, v = u + 0.5, v + 0.5
+                inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
+                grey[i, k, m] = image[np.uint64(v), np.uint64(u)] if inside else math.nan
     return grey, scale
 
 
 @kernel()
-def pairs_of_steps(grey: FloatArray) -> FloatArray:
+def pairs_of_steps(grey: Float32Array) -> Float32Array:
     """Profiles as the network sees them: means of pairs of steps."""
     # Loops, here and below: expressions of arrays take several times as long to compile.
-    pairs = np.empty((len(grey), grey.shape[1] // 2))
+    pairs = np.empty((len(grey), grey.shape[1] // 2), np.float32)
     for k in range(len(grey)):
         for m in range(grey.shape[1] // 2):
-            pairs[k, m] = 0.5 * (grey[k, 2 * m] + grey[k, 2 * m + 1])
+            pairs[k, m] = np.float32(0.5) * (grey[k, 2 * m] + grey[k, 2 * m + 1])
     return pairs
 
 
 @kernel()
-def _contrast(grey: FloatArray, sign: float, least_step: float) -> float:
+def _contrast(grey: Float32Array, sign: float, least_step: float) -> float:
     """Median step over the directions with a sufficient step; 0 if these are too few."""
     steps = np.empty(GLANCED)
     for inner in _INNER:
         count = 0
         for k in range(GLANCED):
-            step = sign * (np.mean(grey[k, inner]) - np.mean(grey[k, _OUTER]))
+            inside = grey[k, inner] + grey[k, inner + 1]
+            step = 0.5 * sign * (inside - (grey[k, _OUTER] + grey[k, _OUTER + 1]))
             if step > least_step:
                 steps[count] = step
                 count += 1
@@ -259,7 +286,7 @@ def _contrast(grey: FloatArray, sign: float, least_step: float) -> float:
 
 
 @kernel()
-def _quality(grey: FloatArray) -> tuple[float, float]:
+def _quality(grey: Float32Array) -> tuple[float, float]:
     """Between-class over total variance of the grey values inside and outside; mean outside."""
     inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
     count = 0
@@ -293,5 +320,7 @@ def _rim_odds(
     features[4] = 10.0 * off * off
     features[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     features[6] = min(score, 12.0)
-    inputs, scales = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign)
-    return network_log_odds(inputs, scales, features, network), features
+    grey, scale = pairs_of_steps(radial.grey), radial.pixels_per_radius
+    signs = np.full(1, sign)
+    inputs, scales = network_inputs(grey.reshape(1, DIRECTIONS, -1), scale.reshape(1, -1), signs)
+    return network_log_odds(inputs, scales, features.reshape(1, -1), network)[0], features

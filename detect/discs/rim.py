@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.kernels import project_floor_point
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
 DIRECTIONS = 32  #: Directions from the centre of a candidate.
@@ -55,18 +55,22 @@ _PER_POINT = 0.5  #: Log-odds that each point on a circle adds to it.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
 _ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
+_NEAR = 0.03  #: It stops, too, this near a circle that was found from another start.
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
-_1 = np.uint64(1)
+F32 = np.float32
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
 #: Weights of a parabola's start, middle and end at the steps.
 _SHARES = np.linspace(NEAREST, FARTHEST, STEPS) / FARTHEST
 _BEGIN, _MIDDLE, _END = (
-    (1.0 - _SHARES) * (1.0 - 2.0 * _SHARES),
-    4.0 * _SHARES * (1.0 - _SHARES),
-    _SHARES * (2.0 * _SHARES - 1.0),
+    weight.astype(np.float32)
+    for weight in (
+        (1.0 - _SHARES) * (1.0 - 2.0 * _SHARES),
+        4.0 * _SHARES * (1.0 - _SHARES),
+        _SHARES * (2.0 * _SHARES - 1.0),
+    )
 )
 
 
@@ -96,7 +100,7 @@ class Profiles(NamedTuple):
     x: float  #: The point, metres.
     y: float
     radius: float  #: Nominal radius, metres.
-    grey: FloatArray  #: (DIRECTIONS, STEPS) NaN outside the image.
+    grey: Float32Array  #: (DIRECTIONS, STEPS) NaN outside the image.
     #: (DIRECTIONS,) Length of a radius in the image in each direction, pixels.
     pixels_per_radius: FloatArray
 
@@ -109,10 +113,15 @@ def profiles(
 
     `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
     """
-    grey, scale = np.empty((DIRECTIONS, STEPS)), np.empty(DIRECTIONS)
+    grey, scale = np.empty((DIRECTIONS, STEPS), np.float32), np.empty(DIRECTIONS)
+    pixels, (height, width) = image.reshape(-1), image.shape
+    right, bottom = F32(width - 1), F32(height - 1)
+    inside, first = np.empty(STEPS, np.bool_), np.empty(STEPS, np.int32)
+    across, down = np.empty(STEPS, np.float32), np.empty(STEPS, np.float32)
+    # Unsigned, so that no code for negative indices is generated.
+    below, one = np.uint64(width), np.uint64(1)
     u0, v0 = project_floor_point(camera_numbers, x, y)
     half = 0.5 * FARTHEST
-    right, bottom = image.shape[1] - 1.0, image.shape[0] - 1.0
     for k in range(DIRECTIONS):
         # A parabola approximates the image of a direction to well below a tenth of a pixel.
         dx, dy = radius * COS[k], radius * SIN[k]
@@ -120,17 +129,20 @@ def profiles(
         u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
         scale[k] = math.hypot(u1 - u0, v1 - v0) / half
         for m in range(STEPS):
-            u = _BEGIN[m] * u0 + _MIDDLE[m] * u1 + _END[m] * u2
-            v = _BEGIN[m] * v0 + _MIDDLE[m] * v1 + _END[m] * v2
+            u = _BEGIN[m] * F32(u0) + _MIDDLE[m] * F32(u1) + _END[m] * F32(u2)
+            v = _BEGIN[m] * F32(v0) + _MIDDLE[m] * F32(v1) + _END[m] * F32(v2)
+            inside[m] = (u >= F32(0.0)) & (u < right) & (v >= F32(0.0)) & (v < bottom)
+            column, row = np.int32(u), np.int32(v)
+            across[m], down[m] = u - F32(column), v - F32(row)
+            first[m] = row * np.int32(width) + column
+        for m in range(STEPS):
             grey[k, m] = math.nan
-            if 0.0 <= u < right and 0.0 <= v < bottom:
-                # Unsigned, so that no code for negative indices is generated.
-                i, j = np.uint64(u), np.uint64(v)
-                a, b = np.float32(u - i), np.float32(v - j)
-                upper = image[j, i] + a * (np.float32(image[j, i + _1]) - image[j, i])
-                lower = np.float32(image[j + _1, i])
-                lower += a * (np.float32(image[j + _1, i + _1]) - lower)
-                grey[k, m] = upper + b * (lower - upper)
+            if inside[m]:
+                at = np.uint64(np.uint32(first[m]))
+                upper, lower = F32(pixels[at]), F32(pixels[at + below])
+                upper += across[m] * (F32(pixels[at + one]) - upper)
+                lower += across[m] * (F32(pixels[at + below + one]) - lower)
+                grey[k, m] = upper + down[m] * (lower - upper)
     return Profiles(x, y, radius, grey, scale)
 
 
@@ -193,22 +205,24 @@ def fit_circle(
     """
     s_x = s_y = s_w = s_xx = s_xy = s_yy = 0.0
     r_x = r_y = r_w = 0.0
-    # No branches, so that the loop is vectorised.
+    # Apart from the sums, whose order is fixed, so that this loop is vectorised.
+    off_x, off_y, off = np.empty((3, len(x)))
     for k in range(np.uint64(len(x))):
         dx, dy = x[k] - circle.x, y[k] - circle.y
         d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        dx, dy = dx / d, dy / d
-        w = weight[k]
-        off = w * (d - circle.radius)
+        per_d = 1.0 / d
+        off_x[k], off_y[k], off[k] = per_d * dx, per_d * dy, d - circle.radius
+    for k in range(np.uint64(len(x))):
+        dx, dy, w, residual = off_x[k], off_y[k], weight[k], weight[k] * off[k]
         s_w += w
         s_x += w * dx
         s_y += w * dy
         s_xx += w * dx * dx
         s_xy += w * dx * dy
         s_yy += w * dy * dy
-        r_w += off
-        r_x += off * dx
-        r_y += off * dy
+        r_w += residual
+        r_x += residual * dx
+        r_y += residual * dy
     prior = 1.0 / radius_sigma**2
     s_w += prior
     r_w += prior * (1.0 - circle.radius)
@@ -277,7 +291,7 @@ def best_circle(
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     best_count, best_score = 0, 0.0
-    ends, scores = np.zeros((_STARTS, 2)), np.full(_STARTS, -np.inf)
+    ends, scores = np.zeros((_STARTS, 3)), np.full(_STARTS, -np.inf)
     for start in range(_STARTS):
         circle = Circle(_START_X[start], _START_Y[start], 1.0, 0.0, 0.0, 0.0)
         count, _ = _choose(x, y, weight, tolerance, circle, 2.5, chosen)
@@ -286,15 +300,20 @@ def best_circle(
                 break
             before = circle
             circle = fit_circle(x, y, chosen, before, RADIUS_SIGMA)
+            if _is_near(circle, ends[:start], scores[:start]):
+                count = 0
+                break
             count, changed = _choose(x, y, weight, tolerance, circle, 1.6 if i < 2 else 1.0, chosen)
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
             if i > 2 and not changed and moved < _ARRIVED:
                 break
+        if count < LEAST_POINTS:
+            continue
         # By the prior on the radius, a circle of another size needs more points.
         score = count - _POINTS_PER_SIGMA * ((circle.radius - 1.0) / RADIUS_SIGMA) ** 2
-        if count >= LEAST_POINTS:
-            ends[start, 0], ends[start, 1], scores[start] = circle.x, circle.y, score
-        if count >= LEAST_POINTS and score > best_score:
+        ends[start, 0], ends[start, 1], ends[start, 2] = circle.x, circle.y, circle.radius
+        scores[start] = score
+        if score > best_score:
             best_count, best_score = count, score
             best = circle
             for k in range(DIRECTIONS):
@@ -311,6 +330,16 @@ def best_circle(
         if dx * dx + dy * dy > doubt[0] ** 2 + doubt[1] ** 2:
             doubt = dx, dy
     return best, best_count, doubt
+
+
+@kernel()
+def _is_near(circle: Circle, ends: FloatArray, scores: FloatArray) -> bool:
+    """Whether a circle is on its way to one of those found (x, y, radius)."""
+    for k in range(len(ends)):
+        off = max(abs(circle.x - ends[k, 0]), abs(circle.y - ends[k, 1]))
+        if scores[k] > -math.inf and max(off, abs(circle.radius - ends[k, 2])) < _NEAR:
+            return True
+    return False
 
 
 @kernel()
@@ -341,14 +370,15 @@ def follow_rim(
     squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
-        rim_x = x + radius * (best.x + best.radius * COS[k])
-        rim_y = y + radius * (best.y + best.radius * SIN[k])
-        u, v = project_floor_point(camera_numbers, rim_x, rim_y)
-        outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
         if chosen[k] > 0.0:
             off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
             squares += (off / tolerance[k]) ** 2
             mean += step[k]
+        else:
+            rim_x = x + radius * (best.x + best.radius * COS[k])
+            rim_y = y + radius * (best.y + best.radius * SIN[k])
+            u, v = project_floor_point(camera_numbers, rim_x, rim_y)
+            outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
     runs = 0
     for k in range(DIRECTIONS):
         # A gap follows a direction that agrees, and has at least two that do not.

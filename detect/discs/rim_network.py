@@ -11,8 +11,8 @@ and minimum of each channel, and weighs these together with some features of the
     log-odds = w4 [c, features] + b4
 
 A rotation of the disc rotates a and b and changes nothing else. Networks trained from several seeds
-are averaged; if the first is certain, the others are skipped. There are two kinds: one glances at
-every candidate, the other decides about those whose rim was traced.
+are averaged until their mean is certain. There are two kinds: one glances at every candidate,
+several of them at once, the other decides about those whose rim was traced.
 `python -m tools.evaluation train-rim-network` trains both.
 """
 
@@ -34,8 +34,8 @@ WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 OTHERS, SCALES = 2, 2
 #: Added to the variance of the grey values, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-#: Log-odds of the first network below and above which the others are skipped.
-HOPELESS, CERTAIN = -4.0, 5.0
+#: Mean log-odds below and above which further networks are skipped.
+HOPELESS, CERTAIN = -3.0, 3.0
 
 _Weights = Float32Array
 
@@ -75,100 +75,133 @@ def trained_networks() -> Networks:
 
 @kernel()
 def network_inputs(
-    grey: FloatArray, pixels_per_radius: FloatArray, sign: float
+    grey: Float32Array, pixels_per_radius: FloatArray, sign: FloatArray
 ) -> tuple[_Weights, _Weights]:
-    """The input of a network for (K, M) grey values in K directions at M distances.
+    """The input of a network for N looks: (N, K, M) grey values in K directions at M distances.
 
-    Grey values are NaN outside the image. `sign` is -1 for a dark disc, which is seen as a light
-    one. The inputs (M + OTHERS, K + 2) are deviations from the mean relative to their root mean
-    square, 0 outside the image; the logarithm of the pixels per radius; the share outside. They are
-    padded by the last direction in front and the first at the end. The scales are logarithms of the
-    pixels per radius and of the root mean square, relative to usual ones.
+    Grey values are NaN outside the image. `sign` (N,) is -1 for dark discs, which are seen as light
+    ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean relative to their root
+    mean square, 0 outside the image; the logarithm of the pixels per radius; the share outside.
+    Those of each look are padded by the last direction in front and the first at the end. The
+    scales (N, SCALES) are logarithms of the pixels per radius and of the root mean square, relative
+    to usual ones.
     """
-    directions, distances = grey.shape
-    inputs = np.zeros((distances + OTHERS, directions + 2), np.float32)
-    total = squares = size = 0.0
-    n = 0
-    for k in range(directions):
-        for m in range(distances):
-            value = grey[k, m]
-            if value == value:
-                total += value
-                squares += value * value
-                n += 1
-    mean = total / max(n, 1)
-    deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
-    for k in range(directions):
-        outside = 0
-        for m in range(distances):
-            value = grey[k, m]
-            if value == value:
-                inputs[m, k + 1] = sign * (value - mean) / deviation
-            else:
-                outside += 1
-        log_size = math.log(pixels_per_radius[k]) - 1.5
-        size += log_size
-        inputs[distances, k + 1] = log_size
-        inputs[distances + 1, k + 1] = outside / distances
-    for i in range(distances + OTHERS):
-        inputs[i, 0], inputs[i, directions + 1] = inputs[i, directions], inputs[i, 1]
-    scales = np.empty(SCALES, np.float32)
-    scales[0] = size / directions
-    scales[1] = math.log(deviation) - 2.5
+    looks, directions, distances = grey.shape
+    inputs = np.zeros((distances + OTHERS, looks * (directions + 2)), np.float32)
+    scales = np.empty((looks, SCALES), np.float32)
+    for look in range(looks):
+        first = look * (directions + 2) + 1
+        total = squares = size = 0.0
+        n = 0
+        for k in range(directions):
+            sum_k = squares_k = 0.0  # sums by direction do not wait for each other
+            for m in range(distances):
+                value = np.float64(grey[look, k, m])
+                if value == value:
+                    sum_k += value
+                    squares_k += value * value
+                    n += 1
+            total += sum_k
+            squares += squares_k
+        mean = total / max(n, 1)
+        deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
+        scale = sign[look] / deviation
+        for k in range(directions):
+            outside = 0
+            for m in range(distances):
+                value = np.float64(grey[look, k, m])
+                if value == value:
+                    inputs[m, first + k] = scale * (value - mean)
+                else:
+                    outside += 1
+            log_size = math.log(np.float32(pixels_per_radius[look, k])) - 1.5
+            size += log_size
+            inputs[distances, first + k] = log_size
+            inputs[distances + 1, first + k] = outside / distances
+        scales[look, 0] = size / directions
+        scales[look, 1] = math.log(deviation) - 2.5
+    _pad(inputs, looks)
     return inputs, scales
 
 
+@kernel()
+def _pad(values: _Weights, looks: int) -> None:
+    """Put the last direction of each look before its first, and the first behind the last."""
+    width = values.shape[1] // looks
+    for row in values:
+        for first in range(0, len(row), width):
+            last = first + width - 1
+            row[first], row[last] = row[last - 1], row[first + 1]
+
+
 @kernel(fastmath={"contract"})
-def _convolve(values: _Weights, weights: _Weights, bias: _Weights) -> _Weights:
-    """Convolution over three neighbours on a circle, and relu, as (C, K + 2) float32."""
-    result = np.empty((len(bias), values.shape[1]), np.float32)
-    directions = values.shape[1] - 2
+def _convolve(values: _Weights, weights: _Weights, bias: _Weights, looks: int) -> _Weights:
+    """Convolution over three neighbours on a circle, and relu, as (C, N (K + 2)) float32."""
+    result = np.zeros((len(bias), values.shape[1]), np.float32)
+    # Across the looks, too, so that the loops are long; what is between them is overwritten.
+    inner = values.shape[1] - 2
     for c in range(len(bias)):
         row = result[c, 1:]
-        for k in range(directions):
+        for k in range(inner):
             row[k] = bias[c]
         for i in range(len(values)):
             seen = values[i]
             before, same, after = weights[0, i, c], weights[1, i, c], weights[2, i, c]
-            for k in range(directions):
+            for k in range(inner):
                 row[k] += before * seen[k] + same * seen[k + 1] + after * seen[k + 2]
-        for k in range(directions):
+        for k in range(inner):
             row[k] = max(row[k], np.float32(0.0))
-        result[c, 0], row[directions] = row[directions - 1], row[0]
+    _pad(result, looks)
     return result
+
+
+@kernel(fastmath={"nnan", "nsz"})
+def _pool(values: _Weights, scales: _Weights) -> _Weights:
+    """(N, 3 C + SCALES) mean, maximum and minimum of each channel of N looks, and their scales."""
+    channels, looks = len(values), len(scales)
+    width = values.shape[1] // looks
+    pooled = np.empty((looks, 3 * channels + scales.shape[1]), np.float32)
+    for look in range(looks):
+        for c in range(channels):
+            row = values[c, look * width + 1 : (look + 1) * width - 1]
+            total, most, least = np.float32(0.0), row[0], row[0]
+            for k in range(len(row)):
+                total += row[k]
+                most, least = max(most, row[k]), min(least, row[k])
+            pooled[look, c] = total / np.float32(len(row))
+            pooled[look, channels + c], pooled[look, 2 * channels + c] = most, least
+        for i in range(scales.shape[1]):
+            pooled[look, 3 * channels + i] = scales[look, i]
+    return pooled
 
 
 @kernel()
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
-) -> float:
-    """Log-odds that a rim with (F,) features is a disc's, the mean of the networks."""
-    members, channels = network.around_bias.shape
-    units = network.dense_bias.shape[1]
-    directions = inputs.shape[1] - 2
-    odds = np.float64(0.0)
-    pooled = np.empty(3 * channels + len(scales), np.float32)
-    for i in range(len(scales)):
-        pooled[3 * channels + i] = scales[i]
+) -> FloatArray:
+    """(N,) log-odds that rims with (N, F) features are discs', the mean of the networks."""
+    looks, (members, units) = len(scales), network.dense_bias.shape
+    odds = np.zeros(looks)
     for n in range(members):
-        around = _convolve(inputs, network.around[n], network.around_bias[n])
-        again = _convolve(around, network.again[n], network.again_bias[n])
-        for c in range(channels):
-            total = most = least = again[c, 1]
-            for k in range(2, directions + 1):
-                total += again[c, k]
-                most = max(most, again[c, k])
-                least = min(least, again[c, k])
-            pooled[c] = total / np.float32(directions)
-            pooled[channels + c], pooled[2 * channels + c] = most, least
-        odds += network.out_bias[n]
-        for d in range(units):
-            unit = network.dense_bias[n, d]
-            for i in range(len(pooled)):
-                unit += pooled[i] * network.dense[n, i, d]
-            odds += max(unit, np.float32(0.0)) * network.out[n, d]
-        for f in range(len(features)):
-            odds += features[f] * network.out[n, units + f]
-        if n == 0 and not HOPELESS <= odds <= CERTAIN:
-            return float(odds)
-    return float(odds / members)
+        around = _convolve(inputs, network.around[n], network.around_bias[n], looks)
+        again = _convolve(around, network.again[n], network.again_bias[n], looks)
+        pooled = _pool(again, scales)
+        doubtful = 0
+        for look in range(looks):
+            if n > 0 and not HOPELESS <= odds[look] <= CERTAIN:
+                continue
+            dense = network.dense_bias[n].copy()
+            for i in range(pooled.shape[1]):
+                for d in range(units):
+                    dense[d] += pooled[look, i] * network.dense[n, i, d]
+            value = np.float64(network.out_bias[n])
+            for d in range(units):
+                value += max(dense[d], np.float32(0.0)) * network.out[n, d]
+            for f in range(features.shape[1]):
+                value += features[look, f] * network.out[n, units + f]
+            # The mean so far.
+            odds[look] += (value - odds[look]) / (n + 1)
+            doubtful += HOPELESS <= odds[look] <= CERTAIN
+        if doubtful == 0:
+            break
+    return odds

@@ -27,15 +27,17 @@ def log_odds_of(
     inputs: FloatArray, scales: FloatArray, features: FloatArray, network: RimNetwork
 ) -> float:
     """See `detect.discs.rim_network.network_log_odds`."""
-    odds = []
+    odds: list[float] = []
     for member in range(len(network.out)):
+        if odds and not HOPELESS <= np.mean(odds) <= CERTAIN:
+            break
         w = RimNetwork(*(array[member] for array in network))
         a = _relu(_convolved(inputs, w.around) + w.around_bias)
         b = _relu(_convolved(a, w.again) + w.again_bias)
         pooled = np.concatenate([b.mean(axis=0), b.max(axis=0), b.min(axis=0), scales])
         c = _relu(pooled @ w.dense + w.dense_bias)
         odds.append(w.out @ np.concatenate([c, features]) + w.out_bias)
-    return float(np.mean(odds) if HOPELESS <= odds[0] <= CERTAIN else odds[0])
+    return float(np.mean(odds))
 
 
 def _convolved(values: FloatArray, weights: FloatArray) -> FloatArray:

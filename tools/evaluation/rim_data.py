@@ -124,11 +124,11 @@ class _Gathering:
                     yield k, is_disc, counted, source
 
         candidates = candidates_of(scene, table, _SETTINGS)
+        grey, scale = glance(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
+        grey *= candidates.sign[:, None, None]
         for k, *row in known(candidates.floor_xy, candidates.sign):
-            x, y = candidates.floor_xy[k]
-            grey, scale = glance(image, scene.camera_numbers, x, y, _RADIUS)
-            seen = candidates.score[k : k + 1], candidates.sign[k] * grey[None], scale[None]
-            self.glances.append((*seen, *row))
+            one = slice(k, k + 1)
+            self.glances.append((candidates.score[one], grey[one], scale[one], *row))
         rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
         rims = rims.where((rims.fate == Fate.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
@@ -390,7 +390,7 @@ def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatA
 
 
 def _is_light(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> bool:
-    grey, _ = glance(image, camera_numbers(camera), floor_xy[0], floor_xy[1], _RADIUS)
+    [grey], _ = glance(image, camera_numbers(camera), floor_xy[None], _RADIUS)
     return bool(np.nanmean(grey[:, 1:3]) > np.nanmean(grey[:, 5:7]))
 
 

@@ -42,7 +42,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
+SHAPES = {"glance": Shape(8, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
@@ -212,17 +212,17 @@ def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> ND
     batch = batch_of(
         looks.grey[chosen, 0], looks.pixels_per_radius[chosen, 0], looks.features[chosen]
     )
-    members = []
-    for layers in zip(*network, strict=True):
+    mean = np.zeros(len(batch.inputs))
+    for n, layers in enumerate(zip(*network, strict=True)):
         w = RimNetwork(*layers)
         weights = [
             w.around.reshape(-1, w.around.shape[-1]), w.around_bias,
             w.again.reshape(-1, w.again.shape[-1]), w.again_bias,
             w.dense, w.dense_bias, w.out[:, None], np.atleast_1d(w.out_bias),
         ]  # fmt: skip
-        members.append(_Member(weights).log_odds(batch))
-    first, mean = members[0], np.mean(members, axis=0)
-    return np.where((first >= HOPELESS) & (first <= CERTAIN), mean, first).astype(np.float64)
+        doubtful = (mean >= HOPELESS) & (mean <= CERTAIN)
+        mean += doubtful * (_Member(weights).log_odds(batch) - mean) / (n + 1)
+    return mean
 
 
 @dataclass(frozen=True)

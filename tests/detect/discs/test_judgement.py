@@ -186,7 +186,7 @@ def test_a_glance_at_a_near_disc_follows_perspective(published_camera: Camera) -
     low = replace(published_camera, robot_from_camera=checked_pose("sensor2World", pose))
     place = (0.0, -0.4)
     image = PaintedFloor(low).disc(place, LIGHT).image(noise=0.0)
-    grey, scale = glance(image, camera_numbers(low), *place, 0.1)
+    [grey], scale = glance(image, camera_numbers(low), np.array([place]), 0.1)
     assert scale.min() > 20.0  # pixels
     assert np.all(grey[:, GLANCED_AT < 1.0] > 0.5 * (LIGHT + FLOOR))
     assert np.all(grey[:, GLANCED_AT > 1.0] < 0.5 * (LIGHT + FLOOR))

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from detect.discs.judgement import FEATURES
 from detect.discs.rim import DIRECTIONS, STEPS
-from detect.discs.rim_network import network_inputs, network_log_odds, trained_networks
+from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds, trained_networks
 from tests.reference import rim_network as reference
 
-Profiles = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+FloatArray = NDArray[np.float64]
+Profiles = tuple[FloatArray, FloatArray, FloatArray]
 
 
 def some_profiles(seed: int) -> Profiles:
@@ -23,27 +24,39 @@ def some_profiles(seed: int) -> Profiles:
     return grey, rng.uniform(3.0, 30.0, DIRECTIONS), rng.uniform(0.0, 1.0, len(FEATURES))
 
 
+def odds_of(profiles: list[Profiles], signs: list[float], network: RimNetwork) -> FloatArray:
+    grey, scale, features = (np.array(each) for each in zip(*profiles, strict=True))
+    inputs = network_inputs(grey.astype(np.float32), scale, np.array(signs))
+    return network_log_odds(*inputs, features, network)
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_compiled_network_is_its_equation(seed: int, sign: float) -> None:
     grey, scale, features = some_profiles(seed)
-    inputs, scales = network_inputs(grey, scale, sign)
+    inputs, scales = network_inputs(grey[None].astype(np.float32), scale[None], np.array([sign]))
     expected, expected_scales = reference.inputs_of(grey, scale, sign)
     np.testing.assert_allclose(inputs[:, 1:-1].T, expected, atol=2e-6)
-    np.testing.assert_allclose(scales, expected_scales, atol=2e-6)
-    found = network_log_odds(inputs, scales, features, trained_networks().look)
+    np.testing.assert_allclose(scales[0], expected_scales, atol=2e-6)
+    [found] = network_log_odds(inputs, scales, features[None], trained_networks().look)
     odds = reference.log_odds_of(expected, expected_scales, features, trained_networks().look)
     assert found == pytest.approx(odds, abs=1e-4)
 
 
+def test_several_looks_at_once_are_each_judged_as_alone() -> None:
+    profiles, signs = [some_profiles(seed) for seed in range(5)], [1.0, -1.0, 1.0, 1.0, -1.0]
+    network = trained_networks().look
+    alone = [odds_of(profiles[k : k + 1], signs[k : k + 1], network)[0] for k in range(5)]
+    np.testing.assert_allclose(odds_of(profiles, signs, network), alone, atol=1e-5)
+
+
 def test_turned_directions_and_a_dark_disc_are_the_same() -> None:
     grey, scale, features = some_profiles(3)
-    network = trained_networks().look
-    odds = network_log_odds(*network_inputs(grey, scale, 1.0), features, network)
-    turned = network_inputs(np.roll(grey, 7, axis=0), np.roll(scale, 7), 1.0)
-    assert network_log_odds(*turned, features, network) == pytest.approx(odds, abs=1e-4)
-    dark = network_inputs(255.0 - grey, scale, -1.0)
-    assert network_log_odds(*dark, features, network) == pytest.approx(odds, abs=1e-4)
+    turned = np.roll(grey, 7, axis=0), np.roll(scale, 7), features
+    looks = [(grey, scale, features), turned, (255.0 - grey, scale, features)]
+    odds, odds_turned, odds_dark = odds_of(looks, [1.0, 1.0, -1.0], trained_networks().look)
+    assert odds_turned == pytest.approx(odds, abs=1e-4)
+    assert odds_dark == pytest.approx(odds, abs=1e-4)
 
 
 def test_a_clear_disc_is_likelier_than_a_flat_floor() -> None:
@@ -54,7 +67,6 @@ def test_a_clear_disc_is_likelier_than_a_flat_floor() -> None:
     disc = 90.0 + 60.0 / (1.0 + np.exp((at - 1.0) / 0.08)) + noise
     whole = np.array([1.0, 0.0, 0.3, 0.02, 0.004, 0.3, 0.15])
     none = np.array([0.4, 4.0, 0.8, 0.2, 0.4, 0.3, 0.13])
-    network = trained_networks().look
-    clear = network_log_odds(*network_inputs(disc, scale, 1.0), whole, network)
-    flat = network_log_odds(*network_inputs(90.0 + noise, scale, 1.0), none, network)
+    looks = [(disc, scale, whole), (90.0 + noise, scale, none)]
+    clear, flat = odds_of(looks, [1.0, 1.0], trained_networks().look)
     assert clear > flat + 2.0
