@@ -105,7 +105,7 @@ def steep_gradient(image: GreyImage, most_rows: int) -> float:
         for u in range(2, len(row)):
             histogram[abs(np.int32(row[u]) - np.int32(row[u - 2]))] += 1
     below = np.cumsum(histogram)
-    return 0.5 * np.searchsorted(below, 0.9 * below[-1])
+    return 0.5 * float(np.searchsorted(below, 0.9 * below[-1]))
 
 
 def blank_margins(image: GreyImage) -> tuple[int, int]:

@@ -18,6 +18,7 @@ for 3D Object Recognition and Pose, PAMI 13 (1991).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from camera import Camera
 from camera.kernels import camera_numbers
 from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
 from detect.verticals.tilt import levelling_rotation
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 from redetect.landmarks import FrameTilt
 
@@ -42,6 +43,14 @@ _STEP_RAD = 1e-4
 _ITERATIONS = 7
 _FREEDOM = 4.0  #: Degrees of freedom of Student's t distribution of the discs' tilts.
 _LEAST_PIVOT = 1e-13  #: A pivot below this share of its diagonal entry counts as zero.
+
+
+class OutlineTilt(NamedTuple):
+    """Tilt from the outline of one disc."""
+
+    found: bool  # whether enough of the outline is on the ellipse
+    tilt: FloatArray  # (2,) pitch and roll, rad
+    covariance: FloatArray  # (2, 2) from the points alone
 
 
 def tilt_of_outlines(
@@ -95,19 +104,15 @@ def _tilts_of_discs(
         if count < LEAST_DIRECTIONS:
             continue
         # If the camera is higher than calibrated, discs are larger than they seem.
-        found, pitch, roll, cpp, cpr, crr = fit_outline(
-            point_xy, px_per_m, centre, x, y, radius / height_ratio
-        )
-        if found:
-            tilts[used, 0], tilts[used, 1] = pitch, roll
-            covariances[used, 0, 0], covariances[used, 1, 1] = cpp, crr
-            covariances[used, 0, 1] = covariances[used, 1, 0] = cpr
+        outline = fit_outline(point_xy, px_per_m, centre, x, y, radius / height_ratio)
+        if outline.found:
+            tilts[used], covariances[used] = outline.tilt, outline.covariance
             used += 1
     return tilts[:used], covariances[:used]
 
 
 @kernel()
-def _contrast(grey: FloatArray) -> float:
+def _contrast(grey: Float32Array) -> float:
     """Mean grey level within half a radius minus that beyond one and a third."""
     return float(np.nanmean(grey[:, :4]) - np.nanmean(grey[:, -8:]))
 
@@ -120,13 +125,11 @@ def fit_outline(
     x: float,
     y: float,
     radius: float,
-) -> tuple[bool, float, float, float, float, float]:
+) -> OutlineTilt:
     """Estimate the tilt of one disc near (x, y) from (N, 2) points of its outline.
 
     Points are on the calibrated floor, relative to (x, y), metres; NaN where the outline is not
-    visible. `px_per_m` is the scale of the image in each direction, `centre` the camera's. Returns
-    whether enough of the outline is on the ellipse, pitch and roll (rad), and, from the points
-    alone, the variance of the pitch, the covariance, and the variance of the roll.
+    visible. `px_per_m` is the scale of the image in each direction, `centre` the camera's.
     """
     count = len(point_xy)
     unknowns = np.zeros(4)  # centre, metres; pitch, roll
@@ -179,7 +182,7 @@ def fit_outline(
                     normal[i, j] += weight[k] * row[k, i] * row[k, j]
             normal[i, i] *= 1.0 + 1e-9
         if not invert_positive(normal, inverse):
-            return False, math.nan, math.nan, math.nan, math.nan, math.nan
+            return OutlineTilt(False, unknowns[2:].copy(), inverse[2:, 2:].copy())
         for i in range(4):
             for j in range(4):
                 unknowns[i] += inverse[i, j] * right[j]
@@ -191,8 +194,7 @@ def fit_outline(
         weights += weight[k]
     variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
     found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
-    cpp, cpr, crr = variance * inverse[2, 2], variance * inverse[2, 3], variance * inverse[3, 3]
-    return found, unknowns[2], unknowns[3], cpp, cpr, crr
+    return OutlineTilt(found, unknowns[2:].copy(), variance * inverse[2:, 2:])
 
 
 @kernel()

@@ -127,8 +127,8 @@ class _Gathering:
         grey, scale = glance(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
         grey *= candidates.sign[:, None, None]
         for k, *row in known(candidates.floor_xy, candidates.sign):
-            one = slice(k, k + 1)
-            self.glances.append((candidates.score[one], grey[one], scale[one], *row))
+            seen = candidates.score[k, None], grey[k, None], scale[k, None]
+            self.glances.append((*seen, *row))
         rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
         rims = rims.where((rims.fate == Fate.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):

@@ -29,7 +29,7 @@ from redetect.slam.association.loops import (
     shared_landmarks,
     sightings,
 )
-from redetect.slam.mapping.graph import Estimate, graph_of_recording, meeting_points, with_lines
+from redetect.slam.mapping.graph import Estimate, graph_of_recording, triangulate, with_lines
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.solve import solve
 from redetect.slam.recording import Recording
@@ -66,11 +66,11 @@ def intersect_bearings(
     """
     lines, count = recording.lines, int(labels.max(initial=-1)) + 1
     poses = path[lines.frame + 1]
-    places, ahead, _ = meeting_points(
+    met = triangulate(
         poses, lines.bearing_rad, lines.sigma_rad, labels, count, camera_xy, _LEAST_SIGMA_M**-2
     )
-    places[np.bincount(labels, ahead < 0.0, minlength=count) > 0] = np.nan
-    return places
+    behind = np.bincount(labels, met.ahead_m < 0.0, minlength=count) > 0
+    return np.where(behind[:, None], np.nan, met.xy)
 
 
 def solve_path(

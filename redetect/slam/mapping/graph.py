@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -158,14 +159,14 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
     for some in (near, np.ones(len(seen), dtype=bool)):
         use = some & np.isnan(xy[label, 0])
         own, bearing, sigma = seen[use], rows.bearing_rad, rows.sigma_rad
-        found, ahead, miss = meeting_points(
+        met = triangulate(
             *(poses[pose[use]], bearing[own], sigma[own], label[use], len(every)),
             camera_xy,
             MOST_SIGMA_M**-2,
         )
-        agrees = (ahead > 0.0) & (miss <= MOST_MISS)
+        agrees = (met.ahead_m > 0.0) & (met.miss_sigmas <= MOST_MISS)
         count, right = (np.bincount(label[use], w, len(every)) for w in (None, agrees))
-        xy = np.where((right > 0.5 * count)[:, None], found, xy)
+        xy = np.where((right > 0.5 * count)[:, None], met.xy, xy)
     placed = np.isfinite(xy[:, 0])
     return InitialLines(every[placed], xy[placed], every[~placed])
 
@@ -186,7 +187,15 @@ def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
     return np.asarray(certain & (share > 0.5))
 
 
-def meeting_points(
+class Triangulation(NamedTuple):
+    """The points in which the rays of K lines meet, and how well."""
+
+    xy: FloatArray  # (K, 2) metres; NaN if the rays do not determine it
+    ahead_m: FloatArray  # (n,) distance of the point along each ray
+    miss_sigmas: FloatArray  # (n,) distance from each ray, standard deviations
+
+
+def triangulate(
     poses: FloatArray,
     bearing_rad: FloatArray,
     sigma_rad: FloatArray,
@@ -194,12 +203,11 @@ def meeting_points(
     count: int,
     camera_xy: ArrayLike,
     least_information: float,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The points nearest to the rays of each line, by angular distance.
+) -> Triangulation:
+    """Triangulate `count` lines: the points nearest to the rays of each, by angular distance.
 
-    Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). Returns points
-    (count, 2), NaN if the information (m^-2) is less in some direction; for each ray the distance
-    of the point along it (n,) (m), and from it in standard deviations (n,).
+    Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). A point is
+    determined if its information (m^-2) is more than the least in every direction.
     """
     centre = apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2)))
     # A bearing b in the robot frame is the direction (sin b, -cos b).
@@ -220,4 +228,4 @@ def meeting_points(
         ahead = np.sum(along * (places[labels] - centre), axis=1)
         distance = np.where(np.isfinite(ahead), np.abs(ahead), distance)
     miss = np.abs(np.sum((places[labels] - centre) * normal, axis=1)) * np.sqrt(weight)
-    return places, ahead, miss
+    return Triangulation(places, ahead, miss)

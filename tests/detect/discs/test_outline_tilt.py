@@ -92,12 +92,10 @@ def test_errors_of_points_are_as_large_as_stated(published_camera: Camera) -> No
         distance = np.linalg.norm(away, axis=1)
         px_per_m = np.full(32, 120.0)
         points = away * (1.0 + noise / px_per_m / distance)[:, None]
-        found, pitch, roll, cpp, cpr, crr = fit_outline(
-            points, px_per_m, centre, middle[0], middle[1], 0.1
-        )
-        assert found
-        error = np.array([pitch, roll]) - tilt
-        squared.append(error @ np.linalg.solve([[cpp, cpr], [cpr, crr]], error) / 2.0)
+        outline = fit_outline(points, px_per_m, centre, middle[0], middle[1], 0.1)
+        assert outline.found
+        error = outline.tilt - tilt
+        squared.append(error @ np.linalg.solve(outline.covariance, error) / 2.0)
     assert 0.15 < np.mean(squared) < 0.45
 
 
