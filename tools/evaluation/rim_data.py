@@ -93,7 +93,7 @@ class Truth(NamedTuple):
     others: FloatArray | None = None  # where nothing is a disc; None: wherever else
 
 
-_Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
+_Row = tuple[FloatArray, FloatArray | Float32Array, FloatArray, bool, float, str]
 
 
 class _Gathering:
