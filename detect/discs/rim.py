@@ -55,7 +55,6 @@ _PER_POINT = 0.5  #: Log-odds that each point on a circle adds to it.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
 _ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
-_NEAR = 0.03  #: It stops, too, this near a circle that was found from another start.
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
@@ -205,24 +204,22 @@ def fit_circle(
     """
     s_x = s_y = s_w = s_xx = s_xy = s_yy = 0.0
     r_x = r_y = r_w = 0.0
-    # Apart from the sums, whose order is fixed, so that this loop is vectorised.
-    off_x, off_y, off = np.empty((3, len(x)))
+    # No branches, so that the loop is vectorised.
     for k in range(np.uint64(len(x))):
         dx, dy = x[k] - circle.x, y[k] - circle.y
         d = math.sqrt(dx * dx + dy * dy) + 1e-12
-        per_d = 1.0 / d
-        off_x[k], off_y[k], off[k] = per_d * dx, per_d * dy, d - circle.radius
-    for k in range(np.uint64(len(x))):
-        dx, dy, w, residual = off_x[k], off_y[k], weight[k], weight[k] * off[k]
+        per_d, w = 1.0 / d, weight[k]
+        dx, dy = per_d * dx, per_d * dy
+        off = w * (d - circle.radius)
         s_w += w
         s_x += w * dx
         s_y += w * dy
         s_xx += w * dx * dx
         s_xy += w * dx * dy
         s_yy += w * dy * dy
-        r_w += residual
-        r_x += residual * dx
-        r_y += residual * dy
+        r_w += off
+        r_x += off * dx
+        r_y += off * dy
     prior = 1.0 / radius_sigma**2
     s_w += prior
     r_w += prior * (1.0 - circle.radius)
@@ -291,7 +288,7 @@ def best_circle(
     chosen = np.zeros(DIRECTIONS)
     best = Circle(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     best_count, best_score = 0, 0.0
-    ends, scores = np.zeros((_STARTS, 3)), np.full(_STARTS, -np.inf)
+    ends, scores = np.zeros((_STARTS, 2)), np.full(_STARTS, -np.inf)
     for start in range(_STARTS):
         circle = Circle(_START_X[start], _START_Y[start], 1.0, 0.0, 0.0, 0.0)
         count, _ = _choose(x, y, weight, tolerance, circle, 2.5, chosen)
@@ -300,9 +297,6 @@ def best_circle(
                 break
             before = circle
             circle = fit_circle(x, y, chosen, before, RADIUS_SIGMA)
-            if _is_near(circle, ends[:start], scores[:start]):
-                count = 0
-                break
             count, changed = _choose(x, y, weight, tolerance, circle, 1.6 if i < 2 else 1.0, chosen)
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
             if i > 2 and not changed and moved < _ARRIVED:
@@ -311,8 +305,7 @@ def best_circle(
             continue
         # By the prior on the radius, a circle of another size needs more points.
         score = count - _POINTS_PER_SIGMA * ((circle.radius - 1.0) / RADIUS_SIGMA) ** 2
-        ends[start, 0], ends[start, 1], ends[start, 2] = circle.x, circle.y, circle.radius
-        scores[start] = score
+        ends[start, 0], ends[start, 1], scores[start] = circle.x, circle.y, score
         if score > best_score:
             best_count, best_score = count, score
             best = circle
@@ -330,16 +323,6 @@ def best_circle(
         if dx * dx + dy * dy > doubt[0] ** 2 + doubt[1] ** 2:
             doubt = dx, dy
     return best, best_count, doubt
-
-
-@kernel()
-def _is_near(circle: Circle, ends: FloatArray, scores: FloatArray) -> bool:
-    """Whether a circle is on its way to one of those found (x, y, radius)."""
-    for k in range(len(ends)):
-        off = max(abs(circle.x - ends[k, 0]), abs(circle.y - ends[k, 1]))
-        if scores[k] > -math.inf and max(off, abs(circle.radius - ends[k, 2])) < _NEAR:
-            return True
-    return False
 
 
 @kernel()

@@ -138,9 +138,10 @@ def _varied(looks: Looks, chosen: NDArray[np.int64], rng: np.random.Generator) -
     grey, scale = looks.grey[chosen, view], looks.pixels_per_radius[chosen, view]
     mirrored = rng.random(n) < 0.5
     grey[mirrored], scale[mirrored] = grey[mirrored, ::-1], scale[mirrored, ::-1]
-    noise = rng.normal(size=grey.shape) * rng.uniform(0.0, _NOISE, (n, 1, 1))
-    lit = grey * np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))) + noise
-    return batch_of(lit.astype(np.float32), scale, looks.features[chosen].astype(np.float32))
+    gain = np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))).astype(np.float32)
+    level = rng.uniform(0.0, _NOISE, (n, 1, 1)).astype(np.float32)
+    lit = gain * grey + level * rng.standard_normal(grey.shape, np.float32)
+    return batch_of(lit, scale, looks.features[chosen].astype(np.float32))
 
 
 def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int) -> _Member:
