@@ -40,7 +40,7 @@ _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
 #: rendered floor, a board, a photograph; and how much less what is of the other polarity than the
 #: discs there.
-_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (2.0, 1.0)
+_BUILDING, _DISTURBED, _REAL = (5.0, 5.0), (0.2, 0.2), (2.0, 1.0)
 _SCENE, _BOARD, _PHOTOGRAPH, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), (0.4, 1.0), 0.3
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
@@ -143,7 +143,8 @@ class _Gathering:
     def _views(
         self, image: ByteArray, camera: Camera, place: FloatArray, sign: float
     ) -> tuple[FloatArray, FloatArray]:
-        grey, scale = np.empty((_VIEWS, DIRECTIONS, STEPS // 2)), np.empty((_VIEWS, DIRECTIONS))
+        grey = np.empty((_VIEWS, DIRECTIONS, STEPS // 2), np.float32)
+        scale = np.empty((_VIEWS, DIRECTIONS), np.float32)
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
         off[0] = 0.0
         numbers = camera_numbers(camera)
