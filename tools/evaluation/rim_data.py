@@ -138,11 +138,12 @@ class _Gathering:
         rims = rims.where((rims.fate == Fate.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
             views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])
-            self.looks.append((rims.features[k], *views, *row))
+            seen = rims.features[k], *views
+            self.looks.append((*seen, *row))
 
     def _views(
         self, image: ByteArray, camera: Camera, place: FloatArray, sign: float
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[Float32Array, Float32Array]:
         grey = np.empty((_VIEWS, DIRECTIONS, STEPS // 2), np.float32)
         scale = np.empty((_VIEWS, DIRECTIONS), np.float32)
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
