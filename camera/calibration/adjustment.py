@@ -329,8 +329,7 @@ def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatA
     angles = np.arange(_OUTLINE_POINTS) * (2.0 * np.pi / _OUTLINE_POINTS)
     ring = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
     view = points.views
-    on_board = points.board[:, None, :] + ring
-    in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], on_board)
+    in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], points.board[:, None, :] + ring)
     in_camera += estimate.translations[view][:, None, :]
     outline = model.pixels_of_points(estimate.intrinsics, in_camera.reshape(-1, 3))
     outline = outline.reshape(len(view), _OUTLINE_POINTS, 2)

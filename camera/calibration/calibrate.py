@@ -210,8 +210,7 @@ def calibrated_camera(calibration: Calibration) -> Camera:
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     covariance[:COUNT, :COUNT] = calibration.adjusted.covariance
     try:
-        camera = with_intrinsics(UNPOSED, calibration.intrinsics, **size)
-        return with_covariance(camera, covariance)
+        return with_covariance(with_intrinsics(UNPOSED, calibration.intrinsics, **size), covariance)
     except CameraError as error:
         raise CalibrationError(
             f"the calibration is not a possible camera: {error}; take pictures that cover the "

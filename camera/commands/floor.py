@@ -80,8 +80,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
         indices, pixels = find_board(image, board)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    yaw = radians(options.floor_yaw)
-    places = on_floor(board.points[indices], options.floor_origin, yaw)
+    places = on_floor(board.points[indices], options.floor_origin, radians(options.floor_yaw))
     return pixels, places[:, :2], 0.5 * board.circle_m
 
 

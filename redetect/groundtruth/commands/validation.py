@@ -212,8 +212,7 @@ def perform_report(options: Report) -> int:
     output = options.output or options.session / "report.html"
     check_outputs([output], options.force)
     inputs = gather(options.session, options.truth)
-    page = report_page(inputs, __version__)
-    write_bytes(output, page, overwrite=options.force)
+    write_bytes(output, report_page(inputs, __version__), overwrite=options.force)
     for problem in inputs.problems:
         warn(problem)
     shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]

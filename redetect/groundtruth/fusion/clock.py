@@ -269,8 +269,7 @@ def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int 
         within |= here
         if np.count_nonzero(here) >= 3:
             t = groundtruth[here] - segment.reference_s
-            line = np.polyfit(t, offsets[here], 1)
-            bends.append(offsets[here] - np.polyval(line, t))
+            bends.append(offsets[here] - np.polyval(np.polyfit(t, offsets[here], 1), t))
     expected = model.robot_times(groundtruth[within]) - groundtruth[within]
     difference = offsets[within] - expected
     drift = log.drift[np.isfinite(log.drift)]

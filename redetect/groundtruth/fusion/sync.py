@@ -295,10 +295,9 @@ def _most_likely_clock(
     sigmas = _SIGMA_FACTOR * unit
     # If the drift is not determined, it is 0.
     if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
-        around = np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0])
         offset_s = minimize_scalar(
             lambda offset_s: deviance(np.array([offset_s, 0.0])),
-            bounds=around,
+            bounds=np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0]),
             method="bounded",
             options={"xatol": 1e-4},
         ).x
@@ -394,8 +393,7 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     The parts before and after a time have the best of many offsets, without drift; a jump is found
     if both together fit much better than the best clock without one.
     """
-    spacing = max(float(fit.sigmas[0]), _JUMP_SPACING_S)
-    offsets = fit.clock[0] + spacing * _JUMP_OFFSETS
+    offsets = fit.clock[0] + max(float(fit.sigmas[0]), _JUMP_SPACING_S) * _JUMP_OFFSETS
     offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
     before = np.cumsum(squared, axis=1)
@@ -410,8 +408,7 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
 
 def _differ(parts: list[ClockSegment]) -> bool:
     """Whether the clock is determined before and after a jump, and differs there."""
-    determined = [part for part in parts if part.is_determined]
-    for before, after in pairwise(determined):
+    for before, after in pairwise([part for part in parts if part.is_determined]):
         place = 0.5 * (before.to_s + after.from_s)
         offsets, variances = [], []
         for part in (before, after):

@@ -149,8 +149,7 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
     total = sum(len(one) for one in scans)
     if total == 0:
         raise GroundTruthError("no scans of any scanner")
-    width = max(one.ranges_mm.shape[1] for one in scans)
-    ranges = np.zeros((total, width), dtype=np.uint16)
+    ranges = np.zeros((total, max(one.ranges_mm.shape[1] for one in scans)), dtype=np.uint16)
     first = np.cumsum([0, *(len(one) for one in scans)])
     for begin, one in zip(first, scans):
         ranges[begin : begin + len(one), : one.ranges_mm.shape[1]] = one.ranges_mm

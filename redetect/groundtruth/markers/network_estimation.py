@@ -154,8 +154,7 @@ def _chained(
             "in which it sees the board of the world, or the double board together with a "
             "connected camera"
         )
-    bodies = {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
-    return poses[1:], bodies
+    return poses[1:], {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
 
 
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:

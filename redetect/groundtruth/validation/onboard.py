@@ -231,8 +231,7 @@ def range_errors(
             continue
         for mount, scan in zip(reference.still.mounts, reference.still.scans):
             pose = compose(reference.pose, mount)
-            rays = scan.direction @ rotation(pose[2]).T
-            far, _, cosines = first_walls(pose[:2], rays, segments)
+            far, _, cosines = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
             of_a_wall = np.abs(scan.range_m - far) < OF_A_WALL_M
             angles.append(np.arccos(np.minimum(cosines, 1.0))[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])

@@ -126,8 +126,7 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
     one, none = np.ones(len(lever)), np.zeros(len(lever))
     by_x, by_y = (one, none, -lever[:, 1]), (none, one, lever[:, 0])
     jacobian = np.concatenate([np.stack(by_x, axis=1), np.stack(by_y, axis=1)])
-    off = apply(pose, discs) - targets
-    variance = max(float(np.mean(off**2)), _DISC_SIGMA_M**2)
+    variance = max(float(np.mean((apply(pose, discs) - targets) ** 2)), _DISC_SIGMA_M**2)
     return np.asarray(variance * np.linalg.inv(jacobian.T @ jacobian))
 
 

@@ -343,8 +343,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    xy = to_dataset(table[:, 1:3])
-    discs = Landmarks(table[:, 0].astype(np.int64), xy, covariance, count)
+    discs = Landmarks(table[:, 0].astype(np.int64), to_dataset(table[:, 1:3]), covariance, count)
     return LandmarkMap(discs, no_landmarks())
 
 
