@@ -90,9 +90,8 @@ def corners_counted(image: GreyImage) -> tuple[int, int] | None:
 
     None if none of at least 3 x 3 is found. A part of a board may be mistaken for all of it.
     """
-    reduced = next(_reductions(image), image)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for searched, _ in both_heights(reduced):
+    for searched, _ in both_heights(next(_reductions(image), image)):
         found, _, meta = cv2.findChessboardCornersSBWithMeta(searched, (3, 3), flags)
         if found:
             rows, columns = np.asarray(meta).shape[:2]

@@ -102,11 +102,10 @@ def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
 def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
     """Parts of the image in which no point was seen."""
     warnings = []
-    thirds = coverage(points, 3, 3)
     across, down = ("left", "middle", "right"), ("top", "middle", "bottom")
     empty = [
         f"{down[row]} {across[column]}" if row != 1 or column != 1 else "centre"
-        for row, column in np.argwhere(thirds == 0)
+        for row, column in np.argwhere(coverage(points, 3, 3) == 0)
     ]
     if empty:
         warnings.append(f"no points in the image's {', '.join(empty)}: hold the board there, too")

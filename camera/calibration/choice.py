@@ -186,10 +186,9 @@ def holdout_error(
     for out in folds:
         used = np.setdiff1d(every, out)
         fit = fitted(estimate.of(used), points.of(used), span)
-        held = points.of(out)
         there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
-            test = fitted(there, held, nothing, sigma_px=fit.sigma_px)
+            test = fitted(there, points.of(out), nothing, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point is beyond this fit's fold
             return float("inf")
         squares += float(np.sum(test.residuals**2))

@@ -47,13 +47,12 @@ def perform_sync(options: Sync) -> int:
     if not any(segment.is_determined for segment in segments):
         print("no segment could be synchronised: no clock file is written")
         return 1
-    model = ClockModel(segments)
     document: dict[str, Any] = {
         **provenance(options.settings, [options.odometry, options.groundtruth]),
         "segments": segments,
     }
     if log is not None:
-        document["ptpd"] = compare_with_ptpd(model, log)
+        document["ptpd"] = compare_with_ptpd(ClockModel(segments), log)
         rms, inside = (document["ptpd"][k] for k in ("rms_difference_s", "reports_in_segments"))
         print(
             f"ptpd: {len(log.offset_s)} reports, {inside} compared, "

@@ -190,9 +190,8 @@ def summary_lines(
 def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     """The robot's scanners that have scans in the session, and the files read."""
     path = session / "robot.json"
-    robot = read_robot(path)
     on_board, files = [], [path]
-    for scanner in robot.scanners:
+    for scanner in read_robot(path).scanners:
         try:
             found = find_scans(session, scanner.name)
         except GroundTruthError as error:

@@ -271,12 +271,11 @@ def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int 
             t = groundtruth[here] - segment.reference_s
             bends.append(offsets[here] - np.polyval(np.polyfit(t, offsets[here], 1), t))
     expected = model.robot_times(groundtruth[within]) - groundtruth[within]
-    difference = offsets[within] - expected
     drift = log.drift[np.isfinite(log.drift)]
     return {
         "reports": len(log.offset_s),
         "reports_in_segments": int(np.count_nonzero(within)),
-        "rms_difference_s": _rms(difference),
+        "rms_difference_s": _rms(offsets[within] - expected),
         "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
         "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
         "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,

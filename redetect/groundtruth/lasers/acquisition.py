@@ -79,11 +79,10 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
         row = np.minimum((share * count).astype(np.int64), np.maximum(count - 1, 0))
         return np.asarray(values[row, beams])
 
-    median = quantile(ordered, 0.5)
     # Fewer than two readings in a hundred scans are no evidence of a background.
     seen = count >= max(1, round(0.02 * len(ranges_mm)))
     deviation = np.full_like(metres, np.inf)
-    np.subtract(metres, median, out=deviation, where=hit)
+    np.subtract(metres, quantile(ordered, 0.5), out=deviation, where=hit)
     deviation = np.sort(np.abs(deviation), axis=0)
     sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
     near = np.where(seen, quantile(ordered, _PASSING), 0.0)

@@ -269,9 +269,8 @@ def refine_mounts(
                 near = squared <= gate * gate
                 normal, world = normals[index[near]], world[near]
                 row = np.zeros((len(world), count + len(used), 3))
-                by_mount = world - apply(poses[r], mounts[m, :2])
                 row[:, m, :2] = normal @ rotation(poses[r, 2])
-                row[:, m, 2] = _moment(by_mount, normal)
+                row[:, m, 2] = _moment(world - apply(poses[r], mounts[m, :2]), normal)
                 row[:, count + r, :2] = normal
                 row[:, count + r, 2] = _moment(world - poses[r, :2], normal)
                 rows.append(row)

@@ -61,9 +61,8 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
     those of the map (M, 2) (m); None if it is not certain.
     """
     most = min(len(recording), _MOST_FRAMES)
-    poses = chain_steps(recording.steps[:most])
     rows = recording.circles.only(recording.circles.frame < most)
-    at = apply(poses[rows.frame + 1], rows.xy)
+    at = apply(chain_steps(recording.steps[:most])[rows.frame + 1], rows.xy)
     frames, before = min(_FEWEST_FRAMES, most), -1
     while True:
         discs = _merged(at[rows.frame < frames])

@@ -352,9 +352,8 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
     still = ~np.any(velocity[:, 1:] != 0.0, axis=1)
     bounds = np.flatnonzero(np.diff(still, prepend=~still[:1], append=~still[-1:]))
     first, end = bounds[:-1], bounds[1:]
-    inside = (first > 0) & (end < len(still))
     lasts_s = velocity[np.minimum(end, len(still) - 1), 0] - velocity[first, 0]
-    dropped = still[first] & inside & (lasts_s < _SHORT_STOP_S)
+    dropped = still[first] & (first > 0) & (end < len(still)) & (lasts_s < _SHORT_STOP_S)
     return np.asarray(velocity[~np.repeat(dropped, end - first)])
 
 
