@@ -245,6 +245,4 @@ class CalibrationSettings:
 
     def lens(self, count: int, *, tangential: bool = False) -> FreeLens:
         """The lens with `count` free radial coefficients."""
-        if self.polynomial:
-            return FreeLens(0, tangential, count)
-        return FreeLens(count, tangential)
+        return FreeLens(0, tangential, count) if self.polynomial else FreeLens(count, tangential)

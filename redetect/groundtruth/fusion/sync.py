@@ -196,8 +196,7 @@ def _segment(
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
-            part = segment.only(which)
-            parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
+            parts += _segment(odometry, segment.only(which), bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
     offset_s, drift = best.clock.tolist()

@@ -212,7 +212,7 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
     for i in range(len(faces)):
         for j in range(i + 2, len(faces) - (i == 0)):
-            if _cross(faces[i], faces[j]):
+            if _divides(faces[i], faces[j]) and _divides(faces[j], faces[i]):
                 raise GroundTruthError(f"outline: faces {i + 1} and {j + 1} cross")
     return faces
 
@@ -257,13 +257,11 @@ def _turn(angle: float) -> float:
     return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
 
 
-def _cross(a: FloatArray, b: FloatArray) -> bool:
-    def on_both_sides(face: FloatArray, other: FloatArray) -> bool:
-        (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
-        sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
-        return bool(sides[0] * sides[1] < 0.0)
-
-    return on_both_sides(a, b) and on_both_sides(b, a)
+def _divides(face: FloatArray, other: FloatArray) -> bool:
+    """Whether the ends of another face are on both sides of the line through a face."""
+    (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
+    sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
+    return bool(sides[0] * sides[1] < 0.0)
 
 
 def refine(

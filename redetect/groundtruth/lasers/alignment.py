@@ -121,15 +121,14 @@ def align_scanners(
     targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
     gates = np.geomspace(s.gate_m, 0.08, 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
-    steps["realigned"] = _round(scans, steps["merged"], s)
-    together = steps["realigned"]
+    steps["realigned"] = together = _round(scans, steps["merged"], s)
     for _ in range(_ROUNDS):  # until no scanner moves
         before, together = together, _round(scans, together, s)
         if np.abs(together - before).max() < 1e-5:
             break
     steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
+    whole, curves = _whole_to_map(stills, together, measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
     starts, others = [], []

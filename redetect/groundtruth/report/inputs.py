@@ -170,9 +170,8 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
         return None
     parts = []
     for visit in inputs.visits:
-        part = in_visits(odometry, [visit])
         try:
-            mine, theirs, _ = matched_streams(part, onto)
+            mine, theirs, _ = matched_streams(in_visits(odometry, [visit]), onto)
             parts.append(moved_poses(mine, planar_alignment(mine, theirs)))
         except GroundTruthError:
             continue  # a visit without odometry, or without truth

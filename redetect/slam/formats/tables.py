@@ -41,8 +41,7 @@ def odometry_table(recording: Recording) -> Table:
     after = in_turned_axes(before, steps[:, 2])
     triangles = [spread[:, *np.triu_indices(3)] for spread in (before, after)]
     numbers = np.concatenate([steps, *triangles], axis=1).tolist()
-    steps_named = enumerate(zip(recording.prefixes, numbers), 1)
-    rows = [(number, prefix, *row) for number, (prefix, row) in steps_named]
+    rows = [(k + 1, name, *numbers[k]) for k, name in enumerate(recording.prefixes)]
     return Table(ODOMETRY_COLUMNS, rows)
 
 
