@@ -288,7 +288,12 @@ def fit_points(
 ) -> tuple[Adjusted, Points]:
     """Adjust intrinsics and poses to points, or to the centroids of circles of a radius above 0."""
     span = lens.span(settings.aspect)
-    start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
+    # Fixed parameters start at their values: no coefficient, the known aspect.
+    begin = np.where(np.any(span != 0.0, axis=1), start.intrinsics, 0.0)
+    if settings.aspect is not None:
+        begin[1] = settings.aspect * begin[0]
+    if model.is_possible(begin, points.width, points.height):
+        start = replace(start, intrinsics=begin)
     adjusted = partial(adjust, span=span, robust=settings.robust)
     return fit_to_centres(adjusted, start, points, radius_m)
 
@@ -312,16 +317,6 @@ def fit_to_centres(
         corrected = replace(points, pixels=points.pixels - shifts)
         fit = adjusted(fit.estimate, corrected)
     return fit, corrected
-
-
-def _within(
-    intrinsics: FloatArray, points: Points, span: FloatArray, aspect: float | None
-) -> FloatArray:
-    """The start with fixed parameters at their values: no coefficient, the known aspect."""
-    inside = np.where(np.any(span != 0.0, axis=1), intrinsics, 0.0)
-    if aspect is not None:
-        inside[1] = aspect * inside[0]
-    return inside if model.is_possible(inside, points.width, points.height) else intrinsics
 
 
 def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatArray:

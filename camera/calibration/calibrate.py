@@ -12,7 +12,6 @@ import numpy as np
 from camera.boards.board import Board
 from camera.calibration.adjustment import (
     Adjusted,
-    Estimate,
     Points,
     residuals_of,
     with_unfitted_terms,
@@ -186,9 +185,13 @@ def calibrate(
         demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)
         start, measured = consensus.estimate.of(used), measured.of(used)
-        measured, wrong = _without_wrong_points(
-            start, measured, consensus.fit.sigma_px, settings, radius
-        )
+        wrong = 0
+        if settings.robust:
+            residuals = residuals_of(start, measured, radius)
+            right = np.all(np.abs(residuals) < _WRONG_POINT * consensus.fit.sigma_px, axis=1)
+            # A picture with too few remaining points is unchanged: the robust loss handles it.
+            right |= (np.bincount(measured.views, right) < _FEWEST_POINTS)[measured.views]
+            measured, wrong = measured.where(right), int(np.sum(~right))
         lens, tried = choose_lens(start, measured, settings, radius)
     except (StartError, np.linalg.LinAlgError):
         raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
@@ -263,20 +266,3 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
         width=size[0],
         height=size[1],
     )
-
-
-def _without_wrong_points(
-    estimate: Estimate,
-    points: Points,
-    sigma_px: float,
-    settings: CalibrationSettings,
-    radius_m: float,
-) -> tuple[Points, int]:
-    """Exclude points that were found wrongly; the second result is their number."""
-    if not settings.robust:
-        return points, 0
-    residuals = residuals_of(estimate, points, radius_m)
-    right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
-    # A picture with too few remaining points is unchanged: the robust loss handles it.
-    right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
-    return points.where(right), int(np.sum(~right))

@@ -82,10 +82,8 @@ def read_common_covariance(stream: PathLike) -> FloatArray:
     `groundtruth laser` wrote beside it; zeros if there is none.
     """
     path = Path(stream).with_suffix(".json")
-    if path.is_file():
-        content = JsonObject.read(path)
-        if COMMON in content:
-            return content.covariance(COMMON, 3)
+    if path.is_file() and COMMON in (content := JsonObject.read(path)):
+        return content.covariance(COMMON, 3)
     return np.zeros((3, 3))
 
 

@@ -21,7 +21,6 @@ from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.walls import (
-    BULGE_M,
     MapProblem,
     StillScan,
     WallCurves,
@@ -266,9 +265,8 @@ def _whole_to_map(
         body = compose(measured[0], invert(poses[0]))
     prior = np.eye(3) / _UNKNOWN_SIGMA**2
     start, least = body[None], inf
-    fine, coarse = (wall_curves(building, bulge_m) for bulge_m in (BULGE_M, _MOST_BULGE_M))
-    curves = fine
-    for tried in (fine, coarse):
+    curves = wall_curves(building)
+    for tried in (curves, wall_curves(building, _MOST_BULGE_M)):
         problem = MapProblem(stills, start, prior, building, tried, poses)
         with suppress(GeometryError):  # then each scanner is searched around its measured pose
             found, _, cost = problem.narrowed(start, narrowing_m)

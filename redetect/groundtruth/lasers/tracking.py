@@ -204,8 +204,9 @@ class Tracker:
             raise GeometryError(f"{far:.2f} m from where the robot should be")
         beams = explain_set(self.sets[i], self.fixed, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
-            through, agree = beams.through, beams.agree
-            raise GeometryError(f"{through} beams see through the robot, {agree} see it")
+            raise GeometryError(
+                f"{beams.through} beams see through the robot, {beams.agree} see it"
+            )
         self._store(i, found, beams)
         return pose
 

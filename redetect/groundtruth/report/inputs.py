@@ -161,10 +161,9 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
     if odometry is None or onto is None:
         return None
     try:
-        times = odometry.times_s
         if inputs.clock is not None:
-            times = inputs.clock.groundtruth_times(times)
-        odometry = PlanarPoses(times, odometry.poses)
+            times = inputs.clock.groundtruth_times(odometry.times_s)
+            odometry = PlanarPoses(times, odometry.poses)
     except GroundTruthError as error:
         inputs.problems.append(f"odometry.csv: {error}")
         return None
