@@ -118,9 +118,8 @@ def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> Float
     Each corner has its own small window: a larger one is affected by distortion of the edges, and
     attracted by the next corner if it contains that. NaN corners remain NaN.
     """
-    half = np.clip(
-        np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
-    ).astype(int)
+    half = np.rint(share * _spacing(grid))
+    half = np.clip(half, _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     refined = np.full(grid.shape, np.nan)
     present = np.isfinite(grid[..., 0])

@@ -156,9 +156,8 @@ def project_estimate(
     """Pixels of all points (N, 2), derivatives by intrinsics (N, 2, 14) and by pose (N, 2, 6)."""
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
-    pixels, by_intrinsics, by_point = model.project_points(
-        estimate.intrinsics, turned + estimate.translations[view]
-    )
+    in_camera = turned + estimate.translations[view]
+    pixels, by_intrinsics, by_point = model.project_points(estimate.intrinsics, in_camera)
     by_pose = np.concatenate([-by_point @ cross_matrices(turned), by_point], axis=-1)
     return pixels, by_intrinsics, by_pose
 

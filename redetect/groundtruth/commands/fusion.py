@@ -102,9 +102,8 @@ def perform_fuse(options: Fuse) -> int:
         known = stream_errors.read_common_covariance(options.laser)
         streams["laser"], common = stream_errors.without_common(streams["laser"], known)
     fusion = fuse(odometry, streams, settings)
-    poses, filtered = (
-        stream_errors.with_common(path, common) for path in (fusion.poses, fusion.filtered)
-    )
+    paths = (fusion.poses, fusion.filtered)
+    poses, filtered = (stream_errors.with_common(path, common) for path in paths)
     fusion = replace(fusion, poses=poses, filtered=filtered)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]

@@ -175,9 +175,8 @@ class Filter(ABC):
         self._state[_POSE] = start
         self._linearised = self._state.copy()
         self._covariance = common_tilt_variance * np.eye(self.size)
-        self._covariance[:POSE_SIZE, :POSE_SIZE] = (
-            0.0 if start_covariance is None else start_covariance
-        )
+        of_pose = 0.0 if start_covariance is None else start_covariance
+        self._covariance[:POSE_SIZE, :POSE_SIZE] = of_pose
 
     @property
     def state(self) -> FloatArray:

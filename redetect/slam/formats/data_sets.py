@@ -305,9 +305,7 @@ def _alike(seen: _Sightings) -> FloatArray:
     for number in np.unique(seen.ids):
         chosen = seen.ids == number
         time = seen.times[seen.frame[chosen]]
-        first, end = (
-            np.searchsorted(time, time + reach) for reach in (-_ALIKE_S / 2, _ALIKE_S / 2)
-        )
+        first, end = np.searchsorted(time, [time - _ALIKE_S / 2, time + _ALIKE_S / 2])
         count[chosen] = end - first
     return count
 
