@@ -237,8 +237,7 @@ class Camera:
     def unproject(self, pixels: ArrayLike) -> FloatArray:
         """(..., 3) camera-frame directions (x, y, 1) of (..., 2) pixels; NaN past the fold."""
         xy = self.undistort(pixels)
-        ones = np.where(np.isnan(xy[..., :1]), np.nan, 1.0)
-        return np.concatenate([xy, ones], axis=-1)
+        return np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 1.0)], axis=-1)
 
     # -- robot frame and floor --------------------------------------------------------------
 

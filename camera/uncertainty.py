@@ -104,13 +104,11 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
         Of the position assigned to the same pixel.
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
-    _, by_intrinsics, by_point = project_points(
-        intrinsics_of(camera), offset @ camera.camera_from_robot.T
-    )
+    in_camera = offset @ camera.camera_from_robot.T
+    _, by_intrinsics, by_point = project_points(intrinsics_of(camera), in_camera)
     by_place = by_point @ camera.camera_from_robot
-    by_parameters = np.concatenate(
-        [by_intrinsics, -by_place, by_place @ cross_matrices(offset)], axis=-1
-    )
+    by_turn = by_place @ cross_matrices(offset)
+    by_parameters = np.concatenate([by_intrinsics, -by_place, by_turn], axis=-1)
     return np.asarray(-np.linalg.solve(by_place[:, :, :2], by_parameters))
 
 

@@ -159,8 +159,7 @@ def sheet_of_board(board: Board) -> Sheet:
     if "circles" in board.kind:
         if board.circle_m == 0.0:
             raise CalibrationError("circle_m is 0: circles are printed with a diameter")
-        radius = 0.5 * board.circle_m
-        dots = [Circle((x, y), radius, **_INK) for x, y, _ in board.points.tolist()]
+        dots = [Circle((x, y), 0.5 * board.circle_m, **_INK) for x, y, _ in board.points.tolist()]
         width, height = (high - low)[:2] + board.circle_m
         text = f"{board}: distance {millimetres:g} mm, diameter {1e3 * board.circle_m:g} mm"
         return Sheet(dots, float(width), float(height), text)

@@ -90,9 +90,8 @@ def corners_counted(image: GreyImage) -> tuple[int, int] | None:
 
     None if none of at least 3 x 3 is found. A part of a board may be mistaken for all of it.
     """
-    reduced = next(_reductions(image), image)
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
-    for searched, _ in both_heights(reduced):
+    for searched, _ in both_heights(next(_reductions(image), image)):
         found, _, meta = cv2.findChessboardCornersSBWithMeta(searched, (3, 3), flags)
         if found:
             rows, columns = np.asarray(meta).shape[:2]
@@ -119,9 +118,8 @@ def _refined(image: GreyImage, grid: NDArray[np.float32], share: float) -> Float
     Each corner has its own small window: a larger one is affected by distortion of the edges, and
     attracted by the next corner if it contains that. NaN corners remain NaN.
     """
-    half = np.clip(
-        np.rint(share * _spacing(grid)), _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW
-    ).astype(int)
+    half = np.rint(share * _spacing(grid))
+    half = np.clip(half, _SMALLEST_HALF_WINDOW, _LARGEST_HALF_WINDOW).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
     refined = np.full(grid.shape, np.nan)
     present = np.isfinite(grid[..., 0])

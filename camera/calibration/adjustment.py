@@ -156,9 +156,8 @@ def project_estimate(
     """Pixels of all points (N, 2), derivatives by intrinsics (N, 2, 14) and by pose (N, 2, 6)."""
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
-    pixels, by_intrinsics, by_point = model.project_points(
-        estimate.intrinsics, turned + estimate.translations[view]
-    )
+    in_camera = turned + estimate.translations[view]
+    pixels, by_intrinsics, by_point = model.project_points(estimate.intrinsics, in_camera)
     by_pose = np.concatenate([-by_point @ cross_matrices(turned), by_point], axis=-1)
     return pixels, by_intrinsics, by_pose
 
@@ -288,7 +287,12 @@ def fit_points(
 ) -> tuple[Adjusted, Points]:
     """Adjust intrinsics and poses to points, or to the centroids of circles of a radius above 0."""
     span = lens.span(settings.aspect)
-    start = replace(start, intrinsics=_within(start.intrinsics, points, span, settings.aspect))
+    # Fixed parameters start at their values: no coefficient, the known aspect.
+    begin = np.where(np.any(span != 0.0, axis=1), start.intrinsics, 0.0)
+    if settings.aspect is not None:
+        begin[1] = settings.aspect * begin[0]
+    if model.is_possible(begin, points.width, points.height):
+        start = replace(start, intrinsics=begin)
     adjusted = partial(adjust, span=span, robust=settings.robust)
     return fit_to_centres(adjusted, start, points, radius_m)
 
@@ -314,23 +318,12 @@ def fit_to_centres(
     return fit, corrected
 
 
-def _within(
-    intrinsics: FloatArray, points: Points, span: FloatArray, aspect: float | None
-) -> FloatArray:
-    """The start with fixed parameters at their values: no coefficient, the known aspect."""
-    inside = np.where(np.any(span != 0.0, axis=1), intrinsics, 0.0)
-    if aspect is not None:
-        inside[1] = aspect * inside[0]
-    return inside if model.is_possible(inside, points.width, points.height) else intrinsics
-
-
 def circle_shifts(estimate: Estimate, points: Points, radius_m: float) -> FloatArray:
     """From the images of circles' centres to the area centroids of their images, (N, 2) pixels."""
     angles = np.arange(_OUTLINE_POINTS) * (2.0 * np.pi / _OUTLINE_POINTS)
     ring = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
     view = points.views
-    on_board = points.board[:, None, :] + ring
-    in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], on_board)
+    in_camera = np.einsum("nij,nkj->nki", estimate.rotations[view], points.board[:, None, :] + ring)
     in_camera += estimate.translations[view][:, None, :]
     outline = model.pixels_of_points(estimate.intrinsics, in_camera.reshape(-1, 3))
     outline = outline.reshape(len(view), _OUTLINE_POINTS, 2)

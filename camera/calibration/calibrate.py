@@ -12,7 +12,6 @@ import numpy as np
 from camera.boards.board import Board
 from camera.calibration.adjustment import (
     Adjusted,
-    Estimate,
     Points,
     residuals_of,
     with_unfitted_terms,
@@ -102,11 +101,10 @@ def coverage(points: Points, columns: int = 8, rows: int = 6) -> IntArray:
 def coverage_warnings(intrinsics: FloatArray, points: Points) -> list[str]:
     """Parts of the image in which no point was seen."""
     warnings = []
-    thirds = coverage(points, 3, 3)
     across, down = ("left", "middle", "right"), ("top", "middle", "bottom")
     empty = [
         f"{down[row]} {across[column]}" if row != 1 or column != 1 else "centre"
-        for row, column in np.argwhere(thirds == 0)
+        for row, column in np.argwhere(coverage(points, 3, 3) == 0)
     ]
     if empty:
         warnings.append(f"no points in the image's {', '.join(empty)}: hold the board there, too")
@@ -187,9 +185,13 @@ def calibrate(
         demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)
         start, measured = consensus.estimate.of(used), measured.of(used)
-        measured, wrong = _without_wrong_points(
-            start, measured, consensus.fit.sigma_px, settings, radius
-        )
+        wrong = 0
+        if settings.robust:
+            residuals = residuals_of(start, measured, radius)
+            right = np.all(np.abs(residuals) < _WRONG_POINT * consensus.fit.sigma_px, axis=1)
+            # A picture with too few remaining points is unchanged: the robust loss handles it.
+            right |= (np.bincount(measured.views, right) < _FEWEST_POINTS)[measured.views]
+            measured, wrong = measured.where(right), int(np.sum(~right))
         lens, tried = choose_lens(start, measured, settings, radius)
     except (StartError, np.linalg.LinAlgError):
         raise CalibrationError(f"no camera explains the points; {ALL_THE_SAME}") from None
@@ -210,8 +212,7 @@ def calibrated_camera(calibration: Calibration) -> Camera:
     covariance = np.zeros((PARAMETERS, PARAMETERS))
     covariance[:COUNT, :COUNT] = calibration.adjusted.covariance
     try:
-        camera = with_intrinsics(UNPOSED, calibration.intrinsics, **size)
-        return with_covariance(camera, covariance)
+        return with_covariance(with_intrinsics(UNPOSED, calibration.intrinsics, **size), covariance)
     except CameraError as error:
         raise CalibrationError(
             f"the calibration is not a possible camera: {error}; take pictures that cover the "
@@ -265,20 +266,3 @@ def points_of(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -
         width=size[0],
         height=size[1],
     )
-
-
-def _without_wrong_points(
-    estimate: Estimate,
-    points: Points,
-    sigma_px: float,
-    settings: CalibrationSettings,
-    radius_m: float,
-) -> tuple[Points, int]:
-    """Exclude points that were found wrongly; the second result is their number."""
-    if not settings.robust:
-        return points, 0
-    residuals = residuals_of(estimate, points, radius_m)
-    right = np.all(np.abs(residuals) < _WRONG_POINT * sigma_px, axis=1)
-    # A picture with too few remaining points is unchanged: the robust loss handles it.
-    right |= (np.bincount(points.views, right) < _FEWEST_POINTS)[points.views]
-    return points.where(right), int(np.sum(~right))

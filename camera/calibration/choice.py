@@ -73,7 +73,10 @@ def choose_lens(
     chance. Whether it needs tangential terms is then tested as well.
     """
     fitted = partial(_fitted, points, settings, radius_m, start)
-    chosen, tried = _chosen_of_a_kind(fitted, start, settings)
+    counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
+    fixed = settings.tangential is True
+    radial = fitted(start, [settings.lens(count, tangential=fixed) for count in counts])
+    chosen, tried = _with_tangential(fitted, start, settings, radial)
     if settings.polynomial is not None or settings.coefficients is not None:
         return chosen, tried
     # Not one: a3 alone is k1.
@@ -88,24 +91,12 @@ def choose_lens(
     return chosen, tried | polynomials
 
 
-def _chosen_of_a_kind(
-    fitted: Fitted, start: Estimate, settings: CalibrationSettings
-) -> tuple[FreeLens, Candidates]:
-    """`choose_lens` among rational functions, or polynomials."""
-    counts = range(settings.most + 1) if settings.coefficients is None else [settings.most]
-    fixed = settings.tangential is True
-    tried = fitted(start, [settings.lens(count, tangential=fixed) for count in counts])
-    if fixed:
-        return _fewest_needed(tried), tried
-    return _with_tangential(fitted, start, settings, tried)
-
-
 def _with_tangential(
     fitted: Fitted, start: Estimate, settings: CalibrationSettings, radial: Candidates
 ) -> tuple[FreeLens, Candidates]:
-    """Choose among radial lenses, and add tangential terms if they pay off."""
+    """Choose among radial lenses, and add tangential terms if they pay off and are not set."""
     chosen = _fewest_needed(radial)
-    if settings.tangential is False:
+    if settings.tangential is not None:
         return chosen, radial
     beside = chosen._replace(tangential=True)
     tried = radial | fitted(radial[chosen].adjusted.estimate, [beside])
@@ -186,10 +177,9 @@ def holdout_error(
     for out in folds:
         used = np.setdiff1d(every, out)
         fit = fitted(estimate.of(used), points.of(used), span)
-        held = points.of(out)
         there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
         try:
-            test = fitted(there, held, nothing, sigma_px=fit.sigma_px)
+            test = fitted(there, points.of(out), nothing, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point is beyond this fit's fold
             return float("inf")
         squares += float(np.sum(test.residuals**2))

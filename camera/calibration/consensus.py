@@ -137,8 +137,7 @@ def view_rms(residuals: FloatArray, points: Points, share: float = 1.0) -> Float
     Infinite where one of these is NaN.
     """
     squares = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
-    ordered = squares[np.lexsort((squares, points.views))]
-    of_views = np.split(ordered, np.cumsum(points.counts)[:-1])
+    of_views = np.split(squares[np.lexsort((squares, points.views))], np.cumsum(points.counts)[:-1])
     return np.sqrt([np.mean(some[: int(np.ceil(share * len(some)))]) for some in of_views])
 
 

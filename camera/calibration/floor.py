@@ -112,9 +112,8 @@ def placed_camera(
     if intrinsics_covariance is None:
         return replace(camera, covariance=None)
     both = pose.by_intrinsics @ intrinsics_covariance
-    return with_covariance(
-        camera, np.block([[intrinsics_covariance, both.T], [both, pose.covariance]])
-    )
+    joint = np.block([[intrinsics_covariance, both.T], [both, pose.covariance]])
+    return with_covariance(camera, joint)
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:

@@ -125,9 +125,8 @@ def project_points(
     by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
     by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
-    by_xy = scale[:, None] * distorted_jacobian(
-        np.where(np.isnan(r)[:, None], np.nan, xy), coef, brown
-    )
+    seen_xy = np.where(np.isnan(r)[:, None], np.nan, xy)
+    by_xy = scale[:, None] * distorted_jacobian(seen_xy, coef, brown)
     by_point = np.empty((len(r), 2, 3))
     by_point[:, :, :2] = by_xy / z[:, None, None]
     by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
@@ -245,6 +244,4 @@ class CalibrationSettings:
 
     def lens(self, count: int, *, tangential: bool = False) -> FreeLens:
         """The lens with `count` free radial coefficients."""
-        if self.polynomial:
-            return FreeLens(0, tangential, count)
-        return FreeLens(count, tangential)
+        return FreeLens(0, tangential, count) if self.polynomial else FreeLens(count, tangential)

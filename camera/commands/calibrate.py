@@ -294,8 +294,7 @@ def _each_once(paths: list[Path]) -> list[Path]:
 
 
 def _frames(path: Path, name: str, most: int) -> Iterator[tuple[str, GreyImage]]:
-    refused = CalibrationError(f"{path}: not a video that OpenCV can read")
-    with opened_video(path, refused) as video:
+    with opened_video(path, CalibrationError(f"{path}: not a video that OpenCV can read")) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         # The frames are spread over the whole video.
         step = max(1, -(-count // most))

@@ -43,9 +43,8 @@ def perform(options: Convert) -> int:
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose is dropped: the format has none (--pose-from restores it)")
-    write_bytes(
-        options.target, files.format_of(camera, to_format).encode(), overwrite=options.force
-    )
+    content = files.format_of(camera, to_format).encode()
+    write_bytes(options.target, content, overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

@@ -80,8 +80,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
         indices, pixels = find_board(image, board)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
-    yaw = radians(options.floor_yaw)
-    places = on_floor(board.points[indices], options.floor_origin, yaw)
+    places = on_floor(board.points[indices], options.floor_origin, radians(options.floor_yaw))
     return pixels, places[:, :2], 0.5 * board.circle_m
 
 
@@ -91,15 +90,11 @@ def describe_pose(pose: FloorPose) -> str:
     R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
     down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
     bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
+    axes = ("X (left)    ", "Y (backward)", "Z (up)      ")
     return "\n".join(
         [
             f"pose from {len(fit.residuals)} points on the floor, RMS {fit.rms_px:.3f} px:",
-            *(
-                f"  {axis} {value:9.5f} m +- {s:.5f}"
-                for axis, value, s in zip(
-                    ("X (left)    ", "Y (backward)", "Z (up)      "), t, sigma
-                )
-            ),
+            *(f"  {axis} {value:9.5f} m +- {s:.5f}" for axis, value, s in zip(axes, t, sigma)),
             f"  looking {down:.3f} deg down, {bearing:.3f} deg to the left; rotations about X, "
             f"Y, Z +- {', '.join(f'{degrees(s):.4f}' for s in sigma[3:])} deg",
             "  covariance (X Y Z in m, rotations about X Y Z in rad):",

@@ -129,8 +129,7 @@ class ForeignCamera:
         return np.where(there[:, None], xy, np.nan)
 
     def _seen(self, normalised: FloatArray) -> Projected:
-        parameters = np.array([*self.pinhole, *self.distortion])
-        return projected(self.model, parameters, normalised)
+        return projected(self.model, np.array([*self.pinhole, *self.distortion]), normalised)
 
 
 class Projected(NamedTuple):

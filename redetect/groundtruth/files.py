@@ -193,8 +193,7 @@ def read_text(path: PathLike, largest_bytes: int, expected: str) -> str:
 
 def read_rows(path: PathLike, largest_bytes: int = 1 << 28) -> Iterator[tuple[int, list[str]]]:
     """Yield line numbers and words, without commas, comments and blank lines."""
-    text = read_text(path, largest_bytes, "rows of numbers")
-    for number, line in enumerate(text.split("\n"), 1):
+    for number, line in enumerate(read_text(path, largest_bytes, "rows of numbers").split("\n"), 1):
         content = line.partition("#")[0].strip()
         if content:
             blanks = len(content.split(None, 1)) > 1

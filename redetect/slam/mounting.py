@@ -94,8 +94,7 @@ def mounted_camera(camera: Camera, mounting: FloatArray, covariance: FloatArray)
 
 def check_rows_fit_camera(camera: Camera, floor_xy: FloatArray) -> None:
     """Check that rows can be from a camera at all."""
-    pixels = camera.project_floor(floor_xy)
-    outside = ~np.all(np.isfinite(pixels), axis=-1)
+    outside = ~np.all(np.isfinite(camera.project_floor(floor_xy)), axis=-1)
     if np.any(outside):
         x, y = floor_xy[np.flatnonzero(outside)[0]]
         raise SlamError(

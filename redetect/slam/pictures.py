@@ -75,11 +75,10 @@ def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatA
     assert path.covariance is not None
     error = path.poses - reference
     error[:, 2] = wrap_angle(error[:, 2])
-    variance = np.diagonal(path.covariance, axis1=1, axis2=2)
     nees = np.full(len(error), np.nan)
     usable = is_positive_definite(path.covariance)
     nees[usable] = squared_mahalanobis(error[usable], path.covariance[usable])
-    return error, np.sqrt(np.clip(variance, 0.0, None)), nees
+    return error, np.sqrt(np.clip(np.diagonal(path.covariance, axis1=1, axis2=2), 0.0, None)), nees
 
 
 def draw_map(

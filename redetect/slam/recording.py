@@ -288,8 +288,7 @@ def read_recording(
 
 def read_runs(flags: RunFlags) -> list[Recording]:
     """Read the rows of the runs that flags name."""
-    noise = flags.odometry_noise
-    return [read_recording(run, noise=noise, **flags.rows) for run in flags.runs]
+    return [read_recording(run, noise=flags.odometry_noise, **flags.rows) for run in flags.runs]
 
 
 def recording_of_frames(

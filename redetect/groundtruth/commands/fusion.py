@@ -47,13 +47,12 @@ def perform_sync(options: Sync) -> int:
     if not any(segment.is_determined for segment in segments):
         print("no segment could be synchronised: no clock file is written")
         return 1
-    model = ClockModel(segments)
     document: dict[str, Any] = {
         **provenance(options.settings, [options.odometry, options.groundtruth]),
         "segments": segments,
     }
     if log is not None:
-        document["ptpd"] = compare_with_ptpd(model, log)
+        document["ptpd"] = compare_with_ptpd(ClockModel(segments), log)
         rms, inside = (document["ptpd"][k] for k in ("rms_difference_s", "reports_in_segments"))
         print(
             f"ptpd: {len(log.offset_s)} reports, {inside} compared, "
@@ -103,9 +102,8 @@ def perform_fuse(options: Fuse) -> int:
         known = stream_errors.read_common_covariance(options.laser)
         streams["laser"], common = stream_errors.without_common(streams["laser"], known)
     fusion = fuse(odometry, streams, settings)
-    poses, filtered = (
-        stream_errors.with_common(path, common) for path in (fusion.poses, fusion.filtered)
-    )
+    paths = (fusion.poses, fusion.filtered)
+    poses, filtered = (stream_errors.with_common(path, common) for path in paths)
     fusion = replace(fusion, poses=poses, filtered=filtered)
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]

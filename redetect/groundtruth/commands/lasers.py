@@ -129,10 +129,9 @@ def _print_differences(
 def _sigmas(before: scanners.Scanner, after: scanners.Scanner) -> float:
     """Distance of a scanner from its measured pose, in the measurement's standard deviations."""
     shift = pose_differences(after.pose, before.pose)
-    covariance = before.covariance + after.covariance
     if not np.any(before.covariance):
         return 0.0
-    return float(np.sqrt(shift @ np.linalg.pinv(covariance) @ shift))
+    return float(np.sqrt(shift @ np.linalg.pinv(before.covariance + after.covariance) @ shift))
 
 
 def perform_laser(options: Laser) -> int:

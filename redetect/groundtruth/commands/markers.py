@@ -36,14 +36,13 @@ def perform_network(command: Network) -> int:
             print(f"left out: {error}", file=sys.stderr)
     estimate = estimate_network(boards, list(shots.values()), command.settings)
     folder = command.boards if command.boards.is_dir() else command.boards.parent
-    calibrations = tuple(
-        Path(os.path.relpath(folder / calibration_of(name), command.output.parent)).as_posix()
-        for name in estimate.names
-    )
     network = session.Network(
         estimate.names,
         tuple(boards.cameras[name] for name in estimate.names),
-        calibrations,
+        tuple(
+            Path(os.path.relpath(folder / calibration_of(name), command.output.parent)).as_posix()
+            for name in estimate.names
+        ),
         estimate.world_from_camera,
         estimate.covariance,
     )
@@ -51,8 +50,7 @@ def perform_network(command: Network) -> int:
     for name, board in product(estimate.names, sorted({view.board for view in estimate.views})):
         chosen = [i for i, v in enumerate(estimate.views) if (v.camera, v.board) == (name, board)]
         if chosen:
-            figures = adjusted.residual_figures(chosen)
-            table.append({"camera": name, "board": board, **figures})
+            table.append({"camera": name, "board": board, **adjusted.residual_figures(chosen)})
     extra = {
         "made_by": outputs.provenance(command.settings),
         "reduced_cost": adjusted.reduced_cost,
@@ -80,22 +78,21 @@ def perform_rig(command: Rig) -> int:
     for index, marker in enumerate(rig.ids):
         own = [i for i, view in enumerate(estimate.views) if view.rig_index == index]
         table.append({"marker": marker, **estimate.adjusted.residual_figures(own)})
-    pairs = [
-        {
-            "markers": [rig.ids[a], rig.ids[b]],
-            "times": len(pair.agrees),
-            "agree": pair.support,
-            "agree_with_second_solution": int((pair.agrees & ~pair.first).sum()),
-        }
-        for (a, b), pair in sorted(estimate.pairs.items())
-    ]
     extra: dict[str, Any] = {
         "made_by": outputs.provenance(command.settings),
         "frame": frame,
         "times": estimate.times,
         "reduced_cost": estimate.adjusted.reduced_cost,
         "residuals": table,
-        "pairs": pairs,
+        "pairs": [
+            {
+                "markers": [rig.ids[a], rig.ids[b]],
+                "times": len(pair.agrees),
+                "agree": pair.support,
+                "agree_with_second_solution": int((pair.agrees & ~pair.first).sum()),
+            }
+            for (a, b), pair in sorted(estimate.pairs.items())
+        ],
     }
     drawn = draw_rig(estimate)
     session.write_rig(command.output, rig, extra, overwrite=command.force)

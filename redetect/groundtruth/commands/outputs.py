@@ -65,8 +65,7 @@ def print_table(rows: Sequence[dict[str, Any]]) -> None:
 
 def print_sigmas(kind: str, names: Sequence[str], covariance: Any) -> None:
     """Print the standard deviations of each pose, from a (6 N, 6 N) covariance."""
-    sigmas = np.sqrt(np.diagonal(covariance)).reshape(-1, 6)
-    for name, row in zip(names, sigmas):
+    for name, row in zip(names, np.sqrt(np.diagonal(covariance)).reshape(-1, 6)):
         print(
             f"{kind} {name}: sigma {1e3 * np.linalg.norm(row[:3]):.2f} mm, "
             f"{np.degrees(np.linalg.norm(row[3:])):.4f} deg"

@@ -190,9 +190,8 @@ def summary_lines(
 def _onboard(session: Path) -> tuple[list[onboard.Onboard], list[Path]]:
     """The robot's scanners that have scans in the session, and the files read."""
     path = session / "robot.json"
-    robot = read_robot(path)
     on_board, files = [], [path]
-    for scanner in robot.scanners:
+    for scanner in read_robot(path).scanners:
         try:
             found = find_scans(session, scanner.name)
         except GroundTruthError as error:
@@ -212,8 +211,7 @@ def perform_report(options: Report) -> int:
     output = options.output or options.session / "report.html"
     check_outputs([output], options.force)
     inputs = gather(options.session, options.truth)
-    page = report_page(inputs, __version__)
-    write_bytes(output, page, overwrite=options.force)
+    write_bytes(output, report_page(inputs, __version__), overwrite=options.force)
     for problem in inputs.problems:
         warn(problem)
     shown = [*inputs.streams, *(["truth"] if inputs.truth is not None else [])]

@@ -269,15 +269,13 @@ def compare_with_ptpd(model: ClockModel, log: PtpdLog) -> dict[str, float | int 
         within |= here
         if np.count_nonzero(here) >= 3:
             t = groundtruth[here] - segment.reference_s
-            line = np.polyfit(t, offsets[here], 1)
-            bends.append(offsets[here] - np.polyval(line, t))
+            bends.append(offsets[here] - np.polyval(np.polyfit(t, offsets[here], 1), t))
     expected = model.robot_times(groundtruth[within]) - groundtruth[within]
-    difference = offsets[within] - expected
     drift = log.drift[np.isfinite(log.drift)]
     return {
         "reports": len(log.offset_s),
         "reports_in_segments": int(np.count_nonzero(within)),
-        "rms_difference_s": _rms(difference),
+        "rms_difference_s": _rms(offsets[within] - expected),
         "mean_drift_ptpd": float(np.mean(drift)) if drift.size else None,
         "mean_drift_headings": float(np.mean([segment.rate - 1.0 for segment in determined])),
         "rms_from_line_s": _rms(np.concatenate(bends)) if bends else None,
@@ -309,23 +307,19 @@ def read_ptpd(path: PathLike) -> PtpdLog:
         elif _OFFSET in lowered and "," in lowered:
             found = {name.strip(" #\t"): k for k, name in enumerate(lowered.split(","))}
             columns = found if _OFFSET in found else {}
-        elif columns and (row := _table_row(line, columns)) is not None:
-            rows.append(row)
+        elif columns:
+            words = [word.strip() for word in line.split(",")]
+            named = {name: words[at] for name, at in columns.items() if at < len(words)}
+            # There is none in some states.
+            if not math.isnan(offset := _number(named.get(_OFFSET, ""))):
+                share = _number(named.get("observed drift", named.get("drift", "")))
+                rows.append([_time(named.get("timestamp", "")), offset, share])
     if not rows:
         raise GroundTruthError(
             f"{path}: no line reports an offset from master: expected a log of ptpd"
         )
     table = np.array(rows, dtype=np.float64)
     return PtpdLog(table[:, 0].copy(), table[:, 1].copy(), table[:, 2] * _PARTS_PER_BILLION)
-
-
-def _table_row(line: str, columns: dict[str, int]) -> list[float] | None:
-    """A row of the comma-separated layout; None for states in which there is no offset."""
-    words = [word.strip() for word in line.split(",")]
-    named = {name: words[at] for name, at in columns.items() if at < len(words)}
-    offset = _number(named.get(_OFFSET, ""))
-    drift = _number(named.get("observed drift", named.get("drift", "")))
-    return None if math.isnan(offset) else [_time(named.get("timestamp", "")), offset, drift]
 
 
 def _number(word: str) -> float:

@@ -53,8 +53,7 @@ class Movements:
         """The movements of a stream at the grid's steps around its time."""
         first = int(np.floor(poses.times_s[0] / _STEP_S))
         middle = _STEP_S * np.arange(first, int(np.ceil(poses.times_s[-1] / _STEP_S)) + 1)
-        interval = float(np.median(np.diff(poses.times_s)))
-        longest = max(_LONGEST_GAP_S, _INTERVALS * interval)
+        longest = max(_LONGEST_GAP_S, _INTERVALS * float(np.median(np.diff(poses.times_s))))
         columns = (*poses.poses[:, :2].T, np.unwrap(poses.poses[:, 2]))
         ends, known = [], np.ones(len(middle), dtype=np.bool_)
         for times in (middle - 0.5 * _WINDOW_S, middle + 0.5 * _WINDOW_S):

@@ -225,10 +225,9 @@ def fuse(
     noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)
     inflation = variance_inflation(problem, noise) if chosen.learn_noise else 1.0
     smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
-    deviations = _systematic_deviations(spread)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
-    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], deviations)
+    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], _systematic_deviations(spread))
     if not np.all(kept):
         names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
         fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}

@@ -136,8 +136,7 @@ def measured_poses(
             f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
         )
     order = np.argsort(times, kind="stable")
-    together = PlanarPoses(times[order], poses[order], covariances[order])
-    return together, names[order], repaired
+    return PlanarPoses(times[order], poses[order], covariances[order]), names[order], repaired
 
 
 def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:

@@ -55,13 +55,12 @@ def predicted_backward(
     mirror[_TURN_PER_METRE] = -1.0
     reverse = np.concatenate([np.zeros((1, 4)), -controls[:0:-1]])
     history = kernels.empty_history(count)
-    unmeasured = kernels.MeasuredPoses(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
     uncut = np.zeros(count, dtype=np.bool_)
     kernels.filter_forward(
         kernels.Odometry(reverse, np.concatenate([np.zeros((1, 3)), variances[:0:-1]])),
         mirror * end,
         end_spread * mirror * mirror[:, None],
-        unmeasured,
+        kernels.MeasuredPoses(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))),
         kernels.Gating(math.inf, 1, np.ones(kernels.POSE), math.inf, uncut),
         np.empty((1, kernels.STATE)),
         history,

@@ -53,8 +53,7 @@ def jitter_ratio(poses: PlanarPoses) -> float:
     count = len(poses) - _ORDER
     if poses.covariances is None or count < _FEWEST:
         return 0.0
-    intervals = np.diff(poses.times_s)
-    usual = float(np.median(intervals))
+    usual = float(np.median(np.diff(poses.times_s)))
     over = poses.times_s[_ORDER:] - poses.times_s[:-_ORDER]
     counted = over <= _LONGEST_INTERVALS * _ORDER * usual
     if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
@@ -83,10 +82,8 @@ def read_common_covariance(stream: PathLike) -> FloatArray:
     `groundtruth laser` wrote beside it; zeros if there is none.
     """
     path = Path(stream).with_suffix(".json")
-    if path.is_file():
-        content = JsonObject.read(path)
-        if COMMON in content:
-            return content.covariance(COMMON, 3)
+    if path.is_file() and COMMON in (content := JsonObject.read(path)):
+        return content.covariance(COMMON, 3)
     return np.zeros((3, 3))
 
 

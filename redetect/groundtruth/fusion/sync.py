@@ -26,7 +26,7 @@ from redetect.groundtruth.fusion.clock import ClockSegment, ClockStatus, knots_o
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
-from redetect.groundtruth.fusion.stream_errors import roughness, with_jitter_covered
+from redetect.groundtruth.fusion.stream_errors import roughness, with_common, with_jitter_covered
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -108,6 +108,7 @@ def synchronise(
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
     near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))
+    no_match = f"no offset within {bounds.largest_offset_s:g} s makes odometry's movements agree"
     found: list[ClockSegment] = []
     parts, set_at_s = _parted_where_set(parts, search)
     for part in parts:
@@ -116,7 +117,9 @@ def synchronise(
         start_s = search.nearest_s(part, around_s) - around_s
         for clock in _segment(own, part, near, start_s, _MOST_JUMPS):
             clock = replace(clock, offset_s=clock.offset_s + around_s)
-            clock = _if_matching(clock, part, search, bounds)
+            here = part.only(part.during(clock.from_s, clock.to_s))
+            if clock.is_determined and not search.matches(here, clock.offset_s):
+                clock = _undetermined(here, clock.turned_rad, no_match)
             beside = [at for at in set_at_s if at in (clock.from_s, clock.to_s)]
             found.append(_set_near(beside[0], clock) if beside else clock)
     if all(segment.note == _NO_ODOMETRY for segment in found):
@@ -143,17 +146,6 @@ def _parted_where_set(
     return found, times_s
 
 
-def _if_matching(
-    clock: ClockSegment, segment: PlanarPoses, search: OffsetSearch, bounds: SyncSettings
-) -> ClockSegment:
-    """A segment's clock, undetermined if the streams' movements do not agree by it."""
-    here = segment.only(segment.during(clock.from_s, clock.to_s))
-    if not clock.is_determined or search.matches(here, clock.offset_s):
-        return clock
-    note = f"no offset within {bounds.largest_offset_s:g} s makes odometry's movements agree"
-    return _undetermined(here, clock.turned_rad, note)
-
-
 def _segment(
     odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
     jumps_left: int,
@@ -178,7 +170,8 @@ def _segment(
     # By maximum likelihood of headings, and of whole poses.
     reference_s, start = float(np.mean(measured.times_s)), np.array([start_s, 0.0])
     jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
-    best = _most_likely_clock(own, _headings_alone(jittered), reference_s, start, bounds)
+    headings_alone = with_common(jittered, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]))
+    best = _most_likely_clock(own, headings_alone, reference_s, start, bounds)
     if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
     driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
@@ -196,8 +189,7 @@ def _segment(
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
-            part = segment.only(which)
-            parts += _segment(odometry, part, bounds, start_s, jumps_left - 1)
+            parts += _segment(odometry, segment.only(which), bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
     offset_s, drift = best.clock.tolist()
@@ -295,10 +287,9 @@ def _most_likely_clock(
     sigmas = _SIGMA_FACTOR * unit
     # If the drift is not determined, it is 0.
     if not sigmas[1] < _DETERMINED_DRIFT * largest[1]:
-        around = np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0])
         offset_s = minimize_scalar(
             lambda offset_s: deviance(np.array([offset_s, 0.0])),
-            bounds=around,
+            bounds=np.clip(clock[0] + [-_NEAR_S, _NEAR_S], -largest[0], largest[0]),
             method="bounded",
             options={"xatol": 1e-4},
         ).x
@@ -381,21 +372,13 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     return PlanarPoses(begin_s + means[:, 0], means[:, 1:])
 
 
-def _headings_alone(measured: PlanarPoses) -> PlanarPoses:
-    """Poses with known headings only."""
-    assert measured.covariances is not None
-    unknown = np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0])
-    return PlanarPoses(measured.times_s, measured.poses, measured.covariances + unknown)
-
-
 def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     """Time at which the clock was set, on the ground truth's clock; None if it was not.
 
     The parts before and after a time have the best of many offsets, without drift; a jump is found
     if both together fit much better than the best clock without one.
     """
-    spacing = max(float(fit.sigmas[0]), _JUMP_SPACING_S)
-    offsets = fit.clock[0] + spacing * _JUMP_OFFSETS
+    offsets = fit.clock[0] + max(float(fit.sigmas[0]), _JUMP_SPACING_S) * _JUMP_OFFSETS
     offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
     before = np.cumsum(squared, axis=1)
@@ -410,8 +393,7 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
 
 def _differ(parts: list[ClockSegment]) -> bool:
     """Whether the clock is determined before and after a jump, and differs there."""
-    determined = [part for part in parts if part.is_determined]
-    for before, after in pairwise(determined):
+    for before, after in pairwise([part for part in parts if part.is_determined]):
         place = 0.5 * (before.to_s + after.from_s)
         offsets, variances = [], []
         for part in (before, after):

@@ -79,11 +79,10 @@ def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Backg
         row = np.minimum((share * count).astype(np.int64), np.maximum(count - 1, 0))
         return np.asarray(values[row, beams])
 
-    median = quantile(ordered, 0.5)
     # Fewer than two readings in a hundred scans are no evidence of a background.
     seen = count >= max(1, round(0.02 * len(ranges_mm)))
     deviation = np.full_like(metres, np.inf)
-    np.subtract(metres, median, out=deviation, where=hit)
+    np.subtract(metres, quantile(ordered, 0.5), out=deviation, where=hit)
     deviation = np.sort(np.abs(deviation), axis=0)
     sigma = np.maximum(1.4826 * quantile(deviation, 0.5), _LEAST_SIGMA_M)
     near = np.where(seen, quantile(ordered, _PASSING), 0.0)
@@ -149,8 +148,7 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
     total = sum(len(one) for one in scans)
     if total == 0:
         raise GroundTruthError("no scans of any scanner")
-    width = max(one.ranges_mm.shape[1] for one in scans)
-    ranges = np.zeros((total, width), dtype=np.uint16)
+    ranges = np.zeros((total, max(one.ranges_mm.shape[1] for one in scans)), dtype=np.uint16)
     first = np.cumsum([0, *(len(one) for one in scans)])
     for begin, one in zip(first, scans):
         ranges[begin : begin + len(one), : one.ranges_mm.shape[1]] = one.ranges_mm
@@ -214,7 +212,7 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
     for i in range(len(faces)):
         for j in range(i + 2, len(faces) - (i == 0)):
-            if _cross(faces[i], faces[j]):
+            if _divides(faces[i], faces[j]) and _divides(faces[j], faces[i]):
                 raise GroundTruthError(f"outline: faces {i + 1} and {j + 1} cross")
     return faces
 
@@ -259,13 +257,11 @@ def _turn(angle: float) -> float:
     return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
 
 
-def _cross(a: FloatArray, b: FloatArray) -> bool:
-    def on_both_sides(face: FloatArray, other: FloatArray) -> bool:
-        (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
-        sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
-        return bool(sides[0] * sides[1] < 0.0)
-
-    return on_both_sides(a, b) and on_both_sides(b, a)
+def _divides(face: FloatArray, other: FloatArray) -> bool:
+    """Whether the ends of another face are on both sides of the line through a face."""
+    (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
+    sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
+    return bool(sides[0] * sides[1] < 0.0)
 
 
 def refine(

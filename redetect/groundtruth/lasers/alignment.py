@@ -21,7 +21,6 @@ from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.walls import (
-    BULGE_M,
     MapProblem,
     StillScan,
     WallCurves,
@@ -121,15 +120,14 @@ def align_scanners(
     targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
     gates = np.geomspace(s.gate_m, 0.08, 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
-    steps["realigned"] = _round(scans, steps["merged"], s)
-    together = steps["realigned"]
+    steps["realigned"] = together = _round(scans, steps["merged"], s)
     for _ in range(_ROUNDS):  # until no scanner moves
         before, together = together, _round(scans, together, s)
         if np.abs(together - before).max() < 1e-5:
             break
     steps["together"] = together
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
+    whole, curves = _whole_to_map(stills, together, measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
     starts, others = [], []
@@ -267,9 +265,8 @@ def _whole_to_map(
         body = compose(measured[0], invert(poses[0]))
     prior = np.eye(3) / _UNKNOWN_SIGMA**2
     start, least = body[None], inf
-    fine, coarse = (wall_curves(building, bulge_m) for bulge_m in (BULGE_M, _MOST_BULGE_M))
-    curves = fine
-    for tried in (fine, coarse):
+    curves = wall_curves(building)
+    for tried in (curves, wall_curves(building, _MOST_BULGE_M)):
         problem = MapProblem(stills, start, prior, building, tried, poses)
         with suppress(GeometryError):  # then each scanner is searched around its measured pose
             found, _, cost = problem.narrowed(start, narrowing_m)

@@ -204,8 +204,9 @@ class Tracker:
             raise GeometryError(f"{far:.2f} m from where the robot should be")
         beams = explain_set(self.sets[i], self.fixed, self.body, pose)
         if beams.through > 0.25 * (beams.agree + beams.through) + 2.0:
-            through, agree = beams.through, beams.agree
-            raise GeometryError(f"{through} beams see through the robot, {agree} see it")
+            raise GeometryError(
+                f"{beams.through} beams see through the robot, {beams.agree} see it"
+            )
         self._store(i, found, beams)
         return pose
 
@@ -221,8 +222,7 @@ class Tracker:
         """New readings of set i where the robot may be."""
         centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * unseen_s
-        moving = np.array([*motion, *pose[:2]])
-        return new_points(self.sets[i], self.fixed, centre, reach, moving)
+        return new_points(self.sets[i], self.fixed, centre, reach, np.array([*motion, *pose[:2]]))
 
     def _refine(self, i: int, seen: NewReadings, start: FloatArray) -> OutlinePose:
         found = refine(seen, start, self.fixed, self.body, self.settings, float(self.prior_m[i]))
@@ -507,10 +507,9 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     middle = mean_of(times - origin)
     lead = track.poses[rows[begins]]
     moved = track.poses[rows] + track.motion[rows] * (middle[block] - (times - origin))[:, None]
-    apart = pose_differences(moved, lead[block])
     # Equal weights: information computed at a wrong pose would favour wrong poses, and with equal
     # weights at the mean time an error of the motion cancels.
-    poses = lead + mean_of(apart)
+    poses = lead + mean_of(pose_differences(moved, lead[block]))
     poses[:, 2] = wrap_angle(poses[:, 2])
     noise = mean_of(track.noise[rows]) / size[:, None, None]
     covariances = noise + mean_of((track.covariances - track.noise)[rows])

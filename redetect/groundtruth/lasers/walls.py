@@ -347,7 +347,6 @@ class MapProblem(NamedTuple):
 
     def _solved(self, on: _OnWalls, poses: FloatArray, map_sigma_m: float | None) -> _Solution:
         """Solve for poses and offsets of the seen walls; without `map_sigma_m`, for that too."""
-        missing = pose_differences(poses, self.measured).ravel()
         seen, index = np.unique(on.wall, return_inverse=True)
         count, rows = poses.size, np.arange(len(on.error_m))
         columns = [*(3 * on.body + c for c in range(3)), count + 2 * index, count + 2 * index + 1]
@@ -362,7 +361,7 @@ class MapProblem(NamedTuple):
         h[count:], g[count:] = root.T @ h[count:], root.T @ g[count:]
         h[:, count:] = h[:, count:] @ root
         own = np.linalg.inv(h[:count, :count] + self.prior)
-        of_poses = own @ (g[:count] + self.prior @ missing)
+        of_poses = own @ (g[:count] + self.prior @ pose_differences(poses, self.measured).ravel())
         by_offsets = own @ h[:count, count:]
         rest = h[count:, count:] - h[count:, :count] @ by_offsets
         gradient = g[count:] - h[count:, :count] @ of_poses

@@ -231,9 +231,19 @@ def adjust_bundle(
         free = bundle.free.copy()
         bodies = np.arange(len(free) - bundle.shared)
         free[bundle.shared :] &= np.isin(bodies, bundle.seen.body[used])
-        bundle = replace(bundle, free=free)
-        bundle = _minimised(bundle, used, _PLAIN, _TOLERANCE)
-    return _result(bundle, used)
+        bundle = _minimised(replace(bundle, free=free), used, _PLAIN, _TOLERANCE)
+    problem = linearised(bundle.only(used))
+    at = np.flatnonzero(np.repeat(bundle.free[: bundle.shared], 6))
+    covariance = np.zeros((6 * bundle.shared, 6 * bundle.shared))
+    covariance[np.ix_(at, at)] = inverted_information(_shared_information(problem, len(at)))
+    return AdjustedBundle(
+        bundle,
+        used,
+        bundle.seen.pixels - bundle.pixels(),
+        float(problem.residual @ problem.residual),
+        len(problem.residual) - bundle.unknowns,
+        covariance,
+    )
 
 
 def linearised(bundle: Bundle, loss: solver.Loss = _PLAIN) -> solver.Linear:
@@ -306,21 +316,6 @@ def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
     errors = np.sqrt(np.bincount(bundle.view, squares) / count)
     rms = np.sqrt(np.bincount(bundle.view, np.sum(difference**2, axis=1)) / count)
     return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(rms, nan=np.inf)
-
-
-def _result(bundle: Bundle, used: BoolArray) -> AdjustedBundle:
-    problem = linearised(bundle.only(used))
-    at = np.flatnonzero(np.repeat(bundle.free[: bundle.shared], 6))
-    covariance = np.zeros((6 * bundle.shared, 6 * bundle.shared))
-    covariance[np.ix_(at, at)] = inverted_information(_shared_information(problem, len(at)))
-    return AdjustedBundle(
-        bundle,
-        used,
-        bundle.seen.pixels - bundle.pixels(),
-        float(problem.residual @ problem.residual),
-        len(problem.residual) - bundle.unknowns,
-        covariance,
-    )
 
 
 def _shared_information(problem: solver.Linear, shared: int) -> FloatArray:

@@ -56,7 +56,6 @@ def estimate_network(
     """
     names = tuple(sorted(setup.cameras))
     seen = [[(view, _camera_from_board(view, setup)) for view in shot] for shot in shots]
-    offset = None
     parts = {WORLD: setup.world_from_board}
     if setup.double is not None:
         offset = setup.double.offset
@@ -70,13 +69,12 @@ def estimate_network(
         )
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
-    if setup.double is not None:
-        offset = adjusted.bundle.chain.body_from_part[list(parts).index(SECOND)]
+    body_from_part = dict(zip(parts, adjusted.bundle.chain.body_from_part))
     return NetworkEstimate(
         names,
         adjusted.bundle.chain.world_from_camera,
         adjusted.camera_covariance * adjusted.reduced_cost,
-        offset,
+        body_from_part.get(SECOND),
         adjusted,
         views,
     )
@@ -154,8 +152,7 @@ def _chained(
             "in which it sees the board of the world, or the double board together with a "
             "connected camera"
         )
-    bodies = {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
-    return poses[1:], bodies
+    return poses[1:], {number: poses[here[0][0]] @ here[0][1] for number, here in held.items()}
 
 
 def _most_central(poses: Sequence[FloatArray]) -> FloatArray:

@@ -83,14 +83,13 @@ def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> li
     `solver`: else as in `solve_camera`. Returns `world_from_robot`, those with the least residuals
     over all cameras first. Solutions in which a corner is behind its camera are left out.
     """
-    used = np.unique(problem.seen.camera)
     if solver == "pycolmap":
         poses = _pycolmap(problem)
     elif solver == "ippe":
         poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
     else:
         poses = []
-        for index in used:
+        for index in np.unique(problem.seen.camera):
             chosen = problem.seen.camera == index
             lens, pixels = problem.network.cameras[index], problem.seen.pixels[chosen]
             with suppress(GeometryError):
@@ -147,8 +146,7 @@ def _opencv(points: FloatArray, normalised: FloatArray, solver: str) -> list[Flo
     both = (np.ascontiguousarray(points), np.ascontiguousarray(normalised))
     try:
         found = cv2.solvePnPGeneric(*both, np.eye(3), None, flags=flags[solver])
-        turns_and_shifts = zip(*found[1:3])
-        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in turns_and_shifts]
+        poses = [se3.transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in zip(*found[1:3])]
     except cv2.error as error:
         raise GeometryError(f"{solver} found no pose: {error.err}") from None
     return [pose for pose in poses if np.all(np.isfinite(pose))]
@@ -292,8 +290,7 @@ def _consensus(problem: refinement.PoseProblem) -> tuple[BoolArray, refinement.R
     count = problem.views
     found: dict[bytes, tuple[BoolArray, refinement.RefinedPose]] = {}
     # A larger marker is the better hypothesis.
-    extents = [problem.extent_px(view) for view in range(count)]
-    order = np.argsort(extents)[::-1]
+    order = np.argsort([problem.extent_px(view) for view in range(count)])[::-1]
     hypotheses = ((view, start) for view in order for start in view_poses(problem, view))
     for view, start in hypotheses:
         explained = _explained(problem, np.arange(count) == view, start)

@@ -126,9 +126,12 @@ def estimate_rig(
     bundle, views, times = _bundle(solved, rig, renumbered, start, network, settings)
     free = bundle.free.copy()
     free[len(network.cameras) + renumbered[root]] = known is not None
-    bundle = replace(bundle, free=free, priors=priors)
     if np.any(network.covariance):
-        bundle = _with_free_cameras(bundle, network.covariance)
+        # The cameras are free, each with its own covariance as a prior.
+        seen_by = np.unique(bundle.seen.camera).tolist()
+        free[seen_by] = True
+        priors += tuple(_prior(c, bundle.poses[c], network.covariance, c) for c in seen_by)
+    bundle = replace(bundle, free=free, priors=priors)
     try:
         adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
@@ -247,15 +250,6 @@ def _bundle(
     view = np.repeat(np.arange(len(views)), 4)
     bundle = adjustment.Bundle(network.cameras, len(start), together, free, points, view)
     return bundle, tuple(views), len(poses)
-
-
-def _with_free_cameras(bundle: adjustment.Bundle, covariance: FloatArray) -> adjustment.Bundle:
-    """The bundle with its cameras free, each with its own covariance as a prior."""
-    seen = np.unique(bundle.seen.camera)
-    free = bundle.free.copy()
-    free[seen] = True
-    priors = (_prior(c, bundle.poses[c], covariance, c) for c in seen.tolist())
-    return replace(bundle, free=free, priors=(*bundle.priors, *priors))
 
 
 def _prior(

@@ -86,11 +86,10 @@ class Track:
         posed = self.posed
         poses = np.array([pose.world_from_robot for _, pose in posed]).reshape(-1, 4, 4)
         raised = [excess_of(pose) * pose.covariance for _, pose in posed]
-        covariances = np.array(raised).reshape(-1, 6, 6)
         return PlanarPoses(
             np.array([time_s for time_s, _ in posed], dtype=np.float64),
             np.column_stack([poses[:, 0, 3], poses[:, 1, 3], se3.heading(poses)]),
-            se3.planar_covariance(poses, covariances),
+            se3.planar_covariance(poses, np.array(raised).reshape(-1, 6, 6)),
         )
 
 

@@ -161,18 +161,16 @@ def _odometry(session: Path, inputs: Inputs) -> PlanarPoses | None:
     if odometry is None or onto is None:
         return None
     try:
-        times = odometry.times_s
         if inputs.clock is not None:
-            times = inputs.clock.groundtruth_times(times)
-        odometry = PlanarPoses(times, odometry.poses)
+            times = inputs.clock.groundtruth_times(odometry.times_s)
+            odometry = PlanarPoses(times, odometry.poses)
     except GroundTruthError as error:
         inputs.problems.append(f"odometry.csv: {error}")
         return None
     parts = []
     for visit in inputs.visits:
-        part = in_visits(odometry, [visit])
         try:
-            mine, theirs, _ = matched_streams(part, onto)
+            mine, theirs, _ = matched_streams(in_visits(odometry, [visit]), onto)
             parts.append(moved_poses(mine, planar_alignment(mine, theirs)))
         except GroundTruthError:
             continue  # a visit without odometry, or without truth

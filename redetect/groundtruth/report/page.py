@@ -78,8 +78,7 @@ def _state(inputs: Inputs) -> list[Part]:
     if inputs.visits:
         spans = ", ".join(f"{b - a:.0f} s" for a, b in inputs.visits[:_MOST_ROWS])
         content.append(Part("text", f"{len(inputs.visits)} visits to the covered area: {spans}."))
-    for problem in inputs.problems:
-        content.append(Part("problem", f"Cannot be read: {problem}"))
+    content += [Part("problem", f"Cannot be read: {problem}") for problem in inputs.problems]
     if inputs.missing:
         content.append(Part("note", "Missing in the session: " + ", ".join(inputs.missing) + "."))
     return content
@@ -351,8 +350,8 @@ def _clock(inputs: Inputs) -> list[Part]:
     )  # fmt: skip
     caption = "The robot's clock minus the ground truth's, by segment"
     content = [table(caption, head, rows, text=(8,))]
-    for note in dict.fromkeys(s.note for s in inputs.clock.segments[:_MOST_ROWS] if s.note):
-        content.append(Part("note", f"Note: {note}."))
+    notes = dict.fromkeys(s.note for s in inputs.clock.segments[:_MOST_ROWS] if s.note)
+    content += [Part("note", f"Note: {note}.") for note in notes]
     left_out = len(inputs.clock.segments) - len(rows)
     if left_out > 0:
         content.append(Part("note", f"{left_out} more segments are in clock.json."))

@@ -234,9 +234,8 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     """Poses, and their covariances, after a rigid motion (x, y, theta) of the world."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(motion[2])
-    moved = poses.poses @ turn.T + motion
     covariances = None if poses.covariances is None else turn @ poses.covariances @ turn.T
-    return PlanarPoses(poses.times_s, moved, covariances)
+    return PlanarPoses(poses.times_s, poses.poses @ turn.T + motion, covariances)
 
 
 def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:

@@ -231,8 +231,7 @@ def range_errors(
             continue
         for mount, scan in zip(reference.still.mounts, reference.still.scans):
             pose = compose(reference.pose, mount)
-            rays = scan.direction @ rotation(pose[2]).T
-            far, _, cosines = first_walls(pose[:2], rays, segments)
+            far, _, cosines = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
             of_a_wall = np.abs(scan.range_m - far) < OF_A_WALL_M
             angles.append(np.arccos(np.minimum(cosines, 1.0))[of_a_wall])
             errors.append((scan.range_m - far)[of_a_wall])
@@ -270,9 +269,8 @@ def refine_mounts(
                 near = squared <= gate * gate
                 normal, world = normals[index[near]], world[near]
                 row = np.zeros((len(world), count + len(used), 3))
-                by_mount = world - apply(poses[r], mounts[m, :2])
                 row[:, m, :2] = normal @ rotation(poses[r, 2])
-                row[:, m, 2] = _moment(by_mount, normal)
+                row[:, m, 2] = _moment(world - apply(poses[r], mounts[m, :2]), normal)
                 row[:, count + r, :2] = normal
                 row[:, count + r, 2] = _moment(world - poses[r, :2], normal)
                 rows.append(row)

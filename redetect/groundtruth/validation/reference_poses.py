@@ -256,8 +256,7 @@ def _determined(candidates: FloatArray, covariance: FloatArray) -> tuple[Distanc
 
 def _covariance(jacobian: FloatArray, sigma_m: float) -> FloatArray:
     """(3, 3); infinite if the distances do not determine a direction."""
-    information = jacobian.T @ jacobian / sigma_m**2
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = np.linalg.eigh(jacobian.T @ jacobian / sigma_m**2)
     if not values[0] > 1e-10 * values[2]:
         return np.diag(np.full(3, np.inf))
     return np.asarray((vectors / values) @ vectors.T)

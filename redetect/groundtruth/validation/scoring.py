@@ -171,8 +171,7 @@ def score_relations(
     Gaps longer than `largest_gap_s` are not interpolated. Raises `GroundTruthError` if no relation
     has poses at both its times.
     """
-    times_s = (relations.from_s, relations.to_s)
-    before, after = (_at(poses, some, largest_gap_s) for some in times_s)
+    before, after = (_at(poses, times_s, largest_gap_s) for times_s in relations[:2])
     known = np.isfinite(before[:, 0]) & np.isfinite(after[:, 0])
     mine = between(before[known], after[known])
     return relative_score(relations.from_to[known], mine, int((~known).sum()))

@@ -206,7 +206,6 @@ def search_jointly(
         if taken[j]:
             continue
         nodes += 1
-        size = pairs * width
         for k in range(pairs):
             other = partner[chosen_row[k]]
             for a in range(width):
@@ -215,7 +214,7 @@ def search_jointly(
         for a in range(width):
             for b in range(width):
                 own[a, b] = predicted[j * width + a, j * width + b] + noise[row, a, b]
-        added = _append(factor, whitened, size, cross, own, innovations[row, j])
+        added = _append(factor, whitened, pairs * width, cross, own, innovations[row, j])
         if added < 0.0 or total[pairs] + added > gates[reachable]:
             continue
         chosen_row[pairs] = row

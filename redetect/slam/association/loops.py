@@ -379,8 +379,7 @@ def _refined(
     if found is None:
         return None
     pose, pairs = found
-    off = apply(pose, later.xy)[:, None] - earlier.xy
-    nearest = np.linalg.norm(off, axis=2).min(axis=1)
+    nearest = np.linalg.norm(apply(pose, later.xy)[:, None] - earlier.xy, axis=2).min(axis=1)
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
     return Match(
         earlier.middle_frame,

@@ -61,9 +61,8 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
     those of the map (M, 2) (m); None if it is not certain.
     """
     most = min(len(recording), _MOST_FRAMES)
-    poses = chain_steps(recording.steps[:most])
     rows = recording.circles.only(recording.circles.frame < most)
-    at = apply(poses[rows.frame + 1], rows.xy)
+    at = apply(chain_steps(recording.steps[:most])[rows.frame + 1], rows.xy)
     frames, before = min(_FEWEST_FRAMES, most), -1
     while True:
         discs = _merged(at[rows.frame < frames])
@@ -126,8 +125,7 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
     one, none = np.ones(len(lever)), np.zeros(len(lever))
     by_x, by_y = (one, none, -lever[:, 1]), (none, one, lever[:, 0])
     jacobian = np.concatenate([np.stack(by_x, axis=1), np.stack(by_y, axis=1)])
-    off = apply(pose, discs) - targets
-    variance = max(float(np.mean(off**2)), _DISC_SIGMA_M**2)
+    variance = max(float(np.mean((apply(pose, discs) - targets) ** 2)), _DISC_SIGMA_M**2)
     return np.asarray(variance * np.linalg.inv(jacobian.T @ jacobian))
 
 

@@ -254,8 +254,7 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
         for number in range(1, _MOST_ROUNDS + 1):
             run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
-            compared = run.stretches(at, length, most=loops.MOST_COMPARED)
-            found = loops.find_matches(compared, search)
+            found = loops.find_matches(run.stretches(at, length, most=loops.MOST_COMPARED), search)
             found = consistent_matches(found, matches, at.path, recording.step_covariance)
             at, found = _with_matches(run, at, found)
             spread = _isotropic(len(at.xy), loops.REACH_M)
@@ -304,8 +303,7 @@ def _with_matches(
     while waiting:
         some = waiting.pop()
         together = [*closed, *some]
-        pairs = pairs_by_votes(match.pairs for match in together)
-        labels, _ = run.merged(before.labels, pairs)
+        labels, _ = run.merged(before.labels, pairs_by_votes(match.pairs for match in together))
         trial = run.solved(labels, closed_path(before.path, together, run.recording.lost))
         if not run.by_discs or trial.cost - at.cost <= _MOST_COST * (len(at.xy) - len(trial.xy)):
             at, closed = trial, together

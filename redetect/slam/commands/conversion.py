@@ -143,10 +143,9 @@ def _import_data_set(command: Import) -> None:
 def _write_run(command: Import, run: Recording, what: str, *notes: str) -> None:
     names = ("range_sigma", "bearing_sigma", "calibrated")
     settings = ", ".join(f"{name}: {getattr(command, name)}" for name in names)
-    head = "\n".join(
-        [_made_by(command.file), *([settings] if what == "measurements" else []), *notes]
-    )
-    write_frames(command.output, frames_of_discs(run), head=head, overwrite=command.force)
+    head = [_made_by(command.file), *([settings] if what == "measurements" else []), *notes]
+    frames = frames_of_discs(run)
+    write_frames(command.output, frames, head="\n".join(head), overwrite=command.force)
     print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *notes]))
 
 

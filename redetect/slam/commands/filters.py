@@ -133,8 +133,7 @@ def _mapped(command: Ekf, recording: Recording) -> _Result:
     ekf = EkfSlam(
         command.start, camera_xy=camera_xy, common_tilt_variance=recording.common_tilt_variance
     )
-    associator = Associator(command.association, command.gate_probability)
-    run = run_ekf(recording, ekf, associator)
+    run = run_ekf(recording, ekf, Associator(command.association, command.gate_probability))
     landmark_map = ekf.landmark_map()
     discs, lines = len(landmark_map.discs), len(landmark_map.lines)
     if not discs and not lines:

@@ -61,8 +61,7 @@ def perform(command: Map) -> int:
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         map_file.write_path(output / own, path.part(first, end), head, overwrite=command.force)
     check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
-    results = _results(mapped, check, command)
-    files.write_json(output / TABLE_NAME, results, overwrite=command.force)
+    files.write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
     if final.joint_covariance is None:

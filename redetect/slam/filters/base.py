@@ -175,9 +175,8 @@ class Filter(ABC):
         self._state[_POSE] = start
         self._linearised = self._state.copy()
         self._covariance = common_tilt_variance * np.eye(self.size)
-        self._covariance[:POSE_SIZE, :POSE_SIZE] = (
-            0.0 if start_covariance is None else start_covariance
-        )
+        of_pose = 0.0 if start_covariance is None else start_covariance
+        self._covariance[:POSE_SIZE, :POSE_SIZE] = of_pose
 
     @property
     def state(self) -> FloatArray:
@@ -388,7 +387,7 @@ class Associator:
         return found
 
     def _lines(self, rows: LineRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
-        names, slots = _names_and_slots(estimate.line_slots)
+        names, slots = np.array([*estimate.line_slots.items()], dtype=np.int64).reshape(-1, 2).T
         away = np.linalg.norm(estimate.state[slots[:, None] + _XY] - estimate.state[:2], axis=1)
         names = names[away < FARTHEST_LINE_M]
         if not len(names) or not len(rows):
@@ -432,13 +431,9 @@ def run_filter(
     )
 
 
-def _names_and_slots(of: dict[int, int]) -> tuple[IntArray, IntArray]:
-    return np.array(list(of), dtype=np.int64), np.array(list(of.values()), dtype=np.int64)
-
-
 def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:
     """The discs near any of the rows."""
-    names, slots = _names_and_slots(estimate.disc_slots)
+    names, slots = np.array([*estimate.disc_slots.items()], dtype=np.int64).reshape(-1, 2).T
     state, spread = estimate.state, estimate.pose_covariance
     away = np.linalg.norm(state[slots[:, None, None] + _XY] - apply(state[:3], seen_xy), axis=2)
     reach = np.sqrt(spread[0, 0] + spread[1, 1]) + np.sqrt(spread[2, 2]) * np.hypot(*seen_xy.T)

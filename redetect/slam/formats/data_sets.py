@@ -305,9 +305,7 @@ def _alike(seen: _Sightings) -> FloatArray:
     for number in np.unique(seen.ids):
         chosen = seen.ids == number
         time = seen.times[seen.frame[chosen]]
-        first, end = (
-            np.searchsorted(time, time + reach) for reach in (-_ALIKE_S / 2, _ALIKE_S / 2)
-        )
+        first, end = np.searchsorted(time, [time - _ALIKE_S / 2, time + _ALIKE_S / 2])
         count[chosen] = end - first
     return count
 
@@ -343,8 +341,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    xy = to_dataset(table[:, 1:3])
-    discs = Landmarks(table[:, 0].astype(np.int64), xy, covariance, count)
+    discs = Landmarks(table[:, 0].astype(np.int64), to_dataset(table[:, 1:3]), covariance, count)
     return LandmarkMap(discs, no_landmarks())
 
 
@@ -353,9 +350,8 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
     still = ~np.any(velocity[:, 1:] != 0.0, axis=1)
     bounds = np.flatnonzero(np.diff(still, prepend=~still[:1], append=~still[-1:]))
     first, end = bounds[:-1], bounds[1:]
-    inside = (first > 0) & (end < len(still))
     lasts_s = velocity[np.minimum(end, len(still) - 1), 0] - velocity[first, 0]
-    dropped = still[first] & inside & (lasts_s < _SHORT_STOP_S)
+    dropped = still[first] & (first > 0) & (end < len(still)) & (lasts_s < _SHORT_STOP_S)
     return np.asarray(velocity[~np.repeat(dropped, end - first)])
 
 

@@ -171,17 +171,16 @@ def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
         base = 0
     moved = _table(steps, 3)
     of_steps = in_turned_axes(spreads[0], -moved[:, 2])
-    circles = CircleRows(
-        frame=np.array([rank[row.vertices[0]] - 1 for row in sights], dtype=np.int64),
-        xy=to_dataset(_table(sights, 2)),
-        covariance=covariance_from_dataset(spreads[1], back=True),
-        ids=np.array([row.vertices[1] - base for row in sights], dtype=np.int64),
-    )
     recording = Recording(
         prefixes=tuple(f"vertex.{vertex}" for vertex in order[1:]),
         steps=to_dataset(moved),
         step_covariance=covariance_from_dataset(of_steps, back=True),
-        circles=circles,
+        circles=CircleRows(
+            frame=np.array([rank[row.vertices[0]] - 1 for row in sights], dtype=np.int64),
+            xy=to_dataset(_table(sights, 2)),
+            covariance=covariance_from_dataset(spreads[1], back=True),
+            ids=np.array([row.vertices[1] - base for row in sights], dtype=np.int64),
+        ),
         lines=LineRows.of(),
     )
     return RunGraph(

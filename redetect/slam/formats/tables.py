@@ -41,8 +41,7 @@ def odometry_table(recording: Recording) -> Table:
     after = in_turned_axes(before, steps[:, 2])
     triangles = [spread[:, *np.triu_indices(3)] for spread in (before, after)]
     numbers = np.concatenate([steps, *triangles], axis=1).tolist()
-    steps_named = enumerate(zip(recording.prefixes, numbers), 1)
-    rows = [(number, prefix, *row) for number, (prefix, row) in steps_named]
+    rows = [(k + 1, name, *numbers[k]) for k, name in enumerate(recording.prefixes)]
     return Table(ODOMETRY_COLUMNS, rows)
 
 
@@ -62,12 +61,10 @@ def bearing_table(recording: Recording, camera_xy: ArrayLike) -> Table:
     """The bearings of verticals that have identifiers, from the camera's place (2,)."""
     some = recording.lines
     camera = from_dataset(camera_xy).tolist()
+    names = [";".join(map(str, ids)) for ids in some.ids]
+    numbers = np.column_stack([some.bearing_rad, some.sigma_rad]).tolist()
     rows = [
-        (
-            *(some.frame[k] + 1, recording.prefixes[some.frame[k]]),
-            ";".join(map(str, some.ids[k])),
-            *(float(some.bearing_rad[k]), float(some.sigma_rad[k]), *camera),
-        )
+        (some.frame[k] + 1, recording.prefixes[some.frame[k]], names[k], *numbers[k], *camera)
         for k in np.flatnonzero(some.identified)
     ]
     return Table(BEARING_COLUMNS, rows)

@@ -158,12 +158,9 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
     xy = np.full((len(every), 2), np.nan)
     for some in (near, np.ones(len(seen), dtype=bool)):
         use = some & np.isnan(xy[label, 0])
-        own, bearing, sigma = seen[use], rows.bearing_rad, rows.sigma_rad
-        met = triangulate(
-            *(poses[pose[use]], bearing[own], sigma[own], label[use], len(every)),
-            camera_xy,
-            MOST_SIGMA_M**-2,
-        )
+        own = rows.only(seen[use])
+        views = (poses[pose[use]], own.bearing_rad, own.sigma_rad, label[use], len(every))
+        met = triangulate(*views, camera_xy, MOST_SIGMA_M**-2)
         agrees = (met.ahead_m > 0.0) & (met.miss_sigmas <= MOST_MISS)
         count, right = (np.bincount(label[use], w, len(every)) for w in (None, agrees))
         xy = np.where((right > 0.5 * count)[:, None], met.xy, xy)

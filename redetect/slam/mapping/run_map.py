@@ -82,7 +82,6 @@ def chi_squared(
     total = odometry + discs + lines
     poses = len(graph.steps) + 1
     landmarks = len(graph.disc_ids) + len(graph.line_ids)
-    rows = len(graph.disc_pose) + len(graph.line_pose)
     # As many numbers of odometry are measured as of poses are estimated; the start is the origin. A
     # lost step contributes practically nothing.
     unknown = 2 * landmarks + len(weighting.unknown_mounting) + 3 * lost_steps
@@ -92,7 +91,7 @@ def chi_squared(
         poses=poses,
         landmarks=landmarks,
         steps=poses,
-        measurements=rows,
+        measurements=len(graph.disc_pose) + len(graph.line_pose),
         odometry=odometry,
         discs=discs,
         lines=lines,

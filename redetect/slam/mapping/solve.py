@@ -148,12 +148,11 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
     ]
     with _determined("covariances"):
         found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
-    poses = np.concatenate([np.zeros((1, 3, 3)), found[0]])
     mounting = None
     if weighting.calibrate:
         mounting = np.zeros((MOUNTING, MOUNTING))
         mounting[np.ix_(weighting.unknown_mounting, weighting.unknown_mounting)] = shared
-    return Marginals(poses, found[1], found[2], mounting)
+    return Marginals(np.concatenate([np.zeros((1, 3, 3)), found[0]]), found[1], found[2], mounting)
 
 
 def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> FloatArray:
