@@ -38,17 +38,17 @@ _SETTINGS = CircleSettings()
 #: Of a disc, metres.
 _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
-#: rendered floor, a board, a photograph; and how much less what is of the other polarity than the
-#: discs there.
-_BUILDING, _DISTURBED, _REAL = (5.0, 5.0), (0.2, 0.2), (2.0, 1.0)
-_SCENE, _BOARD, _PHOTOGRAPH, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), (0.4, 1.0), 0.3
+#: floor with discs (rendered or painted), a board; and how much less what is of the other polarity
+#: than the discs there.
+_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (2.0, 1.0)
+_SCENE, _BOARD, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), 0.3
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
 _SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
-_FARTHEST_M = 7.0  #: Of discs on rendered floors.
+_FARTHEST_M = (4.0, 7.0)  #: Of discs on rendered floors.
 #: How often discs are painted into a photograph, how many, and how far apart.
 _PHOTOGRAPH_ROUNDS, _PER_PHOTOGRAPH, _APART_M = 4, 6, 0.5
 #: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
@@ -225,7 +225,8 @@ def _scenes(
     kinds: list[str], count: int,
 ) -> None:  # fmt: skip
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
-    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, _FARTHEST_M)
+    farthest_m = _FARTHEST_M[number // 2 % 2]
+    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, farthest_m)
     for _ in range(count):
         kind = str(rng.choice(kinds))
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
@@ -271,7 +272,7 @@ def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder:
     camera = read_camera(folder / f"{folder.name}.cam")
     photograph = _read(folder / "images" / f"{folder.name}.jpg")
     floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
-    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs")
+    gathering.add(photograph, camera, Truth(), _REAL, "photographs")
     for _ in range(_PHOTOGRAPH_ROUNDS):
         grey = 255.0 * (photograph / 255.0) ** rng.uniform(0.7, 1.5)
         blurred = cv2.GaussianBlur(grey, (0, 0), rng.uniform(0.3, 1.2))
@@ -289,7 +290,7 @@ def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder:
                 break
         at = np.array(places).reshape(-1, 2)
         truth = Truth(_images(camera, at))
-        gathering.add(image, camera, truth, _PHOTOGRAPH, "photographs", _OTHER_SIGN)
+        gathering.add(image, camera, truth, _SCENE, "photographs", _OTHER_SIGN)
         _add_disturbed(gathering, image, camera, at, rng, "photographs disturbed")
 
 
