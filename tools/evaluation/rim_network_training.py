@@ -1,6 +1,6 @@
 """Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: 300,000 looks and 13,000 weights take some ten minutes. Forward and backward pass are
+Plain NumPy: 170,000 looks and 13,000 weights take some ten minutes. Forward and backward pass are
 written out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter,
 Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls once.
 """
@@ -43,7 +43,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(8, 8, 1, 20), "look": Shape(16, 24, 4, 28)}
+SHAPES = {"glance": Shape(8, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
@@ -236,7 +236,7 @@ class TrainRimNetwork(Study):
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
     every: int = 4  # Every n-th frame of the recorded run is used.
-    scenes: int = 2000  # Rendered floors with disturbed discs.
+    scenes: int = 1000  # Rendered floors with disturbed discs.
     seed: int = 1  # Of the disturbances and the networks.
     output: Path = Path("build/rim_network.npz")
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
