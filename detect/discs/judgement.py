@@ -49,7 +49,7 @@ GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
 _AT_ONCE = 16  #: Candidates at which a network glances at a time.
-_LEAST_GLANCE = -0.5  #: Threshold of the log-odds of a glance.
+_LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
 RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
 #: A rim is traced again, from its own centre, unless it is hopeless or its log-odds exceed this.

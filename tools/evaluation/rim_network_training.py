@@ -43,7 +43,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(8, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
+SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
