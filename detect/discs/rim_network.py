@@ -155,7 +155,7 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights, looks: int) -
     return result
 
 
-@kernel(fastmath={"nnan", "nsz"})
+@kernel()
 def _pool(values: _Weights, scales: _Weights) -> _Weights:
     """(N, 3 C + SCALES) mean, maximum and minimum of each channel of N looks, and their scales."""
     channels, looks = len(values), len(scales)
