@@ -328,7 +328,7 @@ def _write_rows(
 def _multiply(rows: Float32Array, ends: IntArray, first: int, products: FloatArray) -> None:
     """Sums of products of rows in each part, lower halves, from term `first` on."""
     products[:] = 0.0
-    for s in range(len(products[0, 0])):
+    for s in range(products.shape[2]):
         # In chunks, because of the rounding of long sums, and for the processor's cache.
         for begin in range(ends[s], ends[s + 1], _CHUNK):
             end = min(begin + _CHUNK, ends[s + 1])

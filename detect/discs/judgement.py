@@ -210,7 +210,7 @@ def _glance_odds(
     contrast, odds = np.empty(n), np.empty(n)
     for first in range(0, n, _AT_ONCE):
         end = min(first + _AT_ONCE, n)
-        sign, score = candidates.sign[first:end], candidates.score[first:end].copy()
+        sign, score = candidates.sign[first:end], candidates.score[first:end]
         grey, scale = glance(image, camera_numbers, candidates.floor_xy[first:end], nominal)
         inputs, scales = network_inputs(grey, scale, sign)
         log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)

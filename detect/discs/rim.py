@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.kernels import project_floor_point
+from detect.discs.model import F32
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
@@ -58,7 +59,6 @@ _ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nom
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
-F32 = np.float32
 _ANGLES = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
 COS, SIN = np.cos(_ANGLES), np.sin(_ANGLES)
 #: Weights of a parabola's start, middle and end at the steps.

@@ -188,7 +188,7 @@ def network_log_odds(
         pooled = _pool(again, scales)
         doubtful = 0
         for look in range(looks):
-            if n > 0 and not HOPELESS <= odds[look] <= CERTAIN:
+            if not HOPELESS <= odds[look] <= CERTAIN:
                 continue
             dense = network.dense_bias[n].copy()
             for i in range(pooled.shape[1]):
