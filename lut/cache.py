@@ -4,7 +4,8 @@ A cached table is a file named by the hash of everything that determines its con
 a hash of that name and of the bytes that follow, so that damage and renamed files are detected.
 Against forgery, only files and folders are used that belong to the user and that no one else can
 write to. Rejected tables are computed again, with a warning. Files appear whole or not at all, so
-processes may share a cache; one that cannot be written to is not an error.
+processes may share a cache; one that cannot be written to is not an error. Beyond two gigabytes,
+tables that were not used for the longest time are deleted.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ _log = logging.getLogger("redetect")
 _DIGEST_BYTES = hashlib.sha256().digest_size
 #: The largest table that is read; that of a 20-megapixel camera has a tenth of this size.
 _LARGEST_FILE_BYTES = 1 << 32
+#: Size of all tables that are kept.
+_LARGEST_CACHE_BYTES = 1 << 31
 
 
 def cache_folder() -> Path:
@@ -135,3 +138,16 @@ def _keep(path: Path, table: DiscTable | VerticalTable | VoteTable) -> None:
             stream.write(payload)
         # By default, some users' files are writable by their group.
         path.chmod(0o600)
+        _delete_least_recent(path)
+
+
+def _delete_least_recent(kept: Path) -> None:
+    """Delete the tables not used for the longest time, but `kept`, until the cache is small."""
+    tables = [(table, table.stat()) for table in kept.parent.glob("*-*.table") if table != kept]
+    total = kept.stat().st_size
+    # Many file systems record reading once a day only, or never.
+    tables.sort(key=lambda table: max(table[1].st_atime, table[1].st_mtime), reverse=True)
+    for table, state in tables:
+        total += state.st_size
+        if total > _LARGEST_CACHE_BYTES:
+            table.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
+import os
 import pickle
 import subprocess
 import sys
@@ -201,6 +202,39 @@ def test_a_folder_in_the_place_of_the_file_does_no_harm(tmp_path: Path, camera: 
 
 
 # -- where ----------------------------------------------------------------------------------------
+
+
+def test_tables_not_used_for_the_longest_time_are_deleted(
+    tmp_path: Path, camera: Camera, computed: list[DiscShape], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shapes = [dataclasses.replace(SHAPE, far_limit_m_per_px=0.1 + 0.001 * k) for k in range(4)]
+    for age, shape in zip((30, 20, 10), shapes, strict=False):
+        before = set(tmp_path.iterdir())
+        cached_disc_table(camera, shape, tmp_path)
+        (path,) = set(tmp_path.iterdir()) - before
+        # The first was read lately, the others only written.
+        written = time.time() - 3600.0 * age
+        os.utime(path, (time.time() if age == 30 else written, written))
+    other = tmp_path / "notes.txt"
+    other.write_bytes(bytes(1000))
+    size = max(path.stat().st_size for path in tmp_path.glob("*.table"))
+    monkeypatch.setattr(lut.cache, "_LARGEST_CACHE_BYTES", int(2.5 * size))
+    cached_disc_table(camera, shapes[3], tmp_path)
+    assert len(list(tmp_path.glob("*.table"))) == 2
+    assert other.exists()
+    computed.clear()
+    for shape in (shapes[0], shapes[3]):
+        cached_disc_table(camera, shape, tmp_path)
+    assert computed == []
+
+
+def test_a_table_larger_than_the_cache_is_kept(
+    tmp_path: Path, camera: Camera, computed: list[DiscShape], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lut.cache, "_LARGEST_CACHE_BYTES", 1)
+    for _ in range(2):
+        cached_disc_table(camera, SHAPE, tmp_path)
+    assert computed == [SHAPE]
 
 
 def test_a_cache_that_cannot_be_written_to_is_no_error(
