@@ -106,33 +106,16 @@ def align_scanners(
             )
     scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
     measured = np.stack([scanner.pose for scanner in scanners])
-    # Only walls that a scanner can see; drawings may show a whole city.
     reach = max(float(still.range_m.max()) for still in stills) + _AROUND_M
-    low, high = measured[:, :2].min(axis=0) - reach, measured[:, :2].max(axis=0) + reach
-    ends = building.reshape(-1, 2, 2)
-    building = building[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
-    if not len(building):
-        raise GeometryError("no wall of the map is near the scanners: expected some")
-    steps: dict[str, FloatArray] = {}
-    shares, relative = _pairs(scans, measured, s)
-    steps["pairs"], order = _chained(measured, shares, relative)
-    # One scan after the other, the best overlapping first, with those merged already.
-    targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
-    gates = np.geomspace(s.gate_m, 0.08, 8)
-    steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
-    steps["realigned"] = together = _round(scans, steps["merged"], s)
-    for _ in range(_ROUNDS):  # until no scanner moves
-        before, together = together, _round(scans, together, s)
-        if np.abs(together - before).max() < 1e-5:
-            break
-    steps["together"] = together
+    building = _walls_near(building, measured, reach)
+    shares, steps = _together(scans, measured, s)
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole, curves = _whole_to_map(stills, together, measured, building, narrowing)
+    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
+    coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
     starts, others = [], []
     for one, still, pose, prior in zip(scanners, stills, whole, priors):
-        coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
         try:
             lone = MapProblem([still], one.pose[None], prior, building, curves)
             start, other = lone.likely_pose(pose, coarse)
@@ -161,6 +144,35 @@ def align_scanners(
         covariance=covariance, map_sigma_m=fit.map_sigma_m, undetermined=undetermined,
         inconsistent=inconsistent,
     )  # fmt: skip
+
+
+def _walls_near(building: FloatArray, poses: FloatArray, reach_m: float) -> FloatArray:
+    """The walls that a scanner can see; drawings may show a whole city."""
+    low, high = poses[:, :2].min(axis=0) - reach_m, poses[:, :2].max(axis=0) + reach_m
+    ends = building.reshape(-1, 2, 2)
+    near = building[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
+    if not len(near):
+        raise GeometryError("no wall of the map is near the scanners: expected some")
+    return near
+
+
+def _together(
+    scans: list[Scan], measured: FloatArray, s: AlignmentSettings
+) -> tuple[dict[tuple[int, int], float], dict[str, FloatArray]]:
+    """Align scans with each other: overlaps of pairs, and the poses after each step."""
+    steps: dict[str, FloatArray] = {}
+    shares, relative = _pairs(scans, measured, s)
+    steps["pairs"], order = _chained(measured, shares, relative)
+    # One scan after the other, the best overlapping first, with those merged already.
+    targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
+    gates = np.geomspace(s.gate_m, 0.08, 8)
+    steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
+    steps["realigned"] = together = _round(scans, steps["merged"], s)
+    for _ in range(_ROUNDS):  # until no scanner moves
+        before, together = together, _round(scans, together, s)
+        if np.abs(together - before).max() < 1e-5:
+            break
+    return shares, steps | {"together": together}
 
 
 def _prior(scanner: Scanner) -> FloatArray:
