@@ -257,6 +257,22 @@ def replaced(
     return _with(image, window, about.grey, look_alike(about, kind, rng), rng)
 
 
+def with_disc(
+    image: ByteArray,
+    floor_xy: Float32Array,
+    place: FloatArray,
+    radius: float,
+    rng: np.random.Generator,
+) -> ByteArray:
+    """An image with a light disc on the floor; parameters as of `disturbed`."""
+    window, about = _surroundings(image, floor_xy, place, radius)
+    light = min(max(about.floor * math.exp(rng.uniform(0.2, 1.4)), about.floor + 15.0), 252.0)
+    distance = 1.0 - np.hypot(about.offset[..., 0], about.offset[..., 1])
+    share = about.share(distance, about.pixel * rng.uniform(0.3, 0.8))
+    grey = about.grey * (1.0 - share) + share * light
+    return _with(image, window, about.grey, grey, rng)
+
+
 _Window = tuple[slice, slice]
 
 

@@ -40,7 +40,7 @@ BORDER = "cut by the border"
 _OPTICS = (0.0, 0.7)
 #: Cells per pixel along u and v, on which scenes are computed.
 _FINE = (3, 4)
-_DISTANCE_M = (0.8, 4.0)
+_NEAREST_M, _FARTHEST_M = 0.8, 4.0
 _APART_M = 1.2
 _PER_SCENE = 4
 _NOISE = 2.5
@@ -79,10 +79,13 @@ class Tally:
 
 
 class Stage:
-    """A camera over its floors, on the fine grid."""
+    """A camera over its floors, on the fine grid, and how far away discs may be."""
 
-    def __init__(self, camera: Camera, radius_m: float, rng: np.random.Generator) -> None:
-        self.camera, self.radius_m = camera, radius_m
+    def __init__(
+        self, camera: Camera, radius_m: float, rng: np.random.Generator,
+        farthest_m: float = _FARTHEST_M,
+    ) -> None:  # fmt: skip
+        self.camera, self.radius_m, self.farthest_m = camera, radius_m, farthest_m
         across, down = _FINE
         u = (np.arange(camera.width * across) + 0.5) / across - 0.5
         v = (np.arange(camera.height * down) + 0.5) / down - 0.5
@@ -161,7 +164,7 @@ def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[Floa
     for _ in range(4000):
         pixel = rng.uniform([-40.0, 0.0], [width + 40.0, height + 40.0])
         ahead = stage.camera.floor_from_pixel(pixel)
-        distance = rng.uniform(*_DISTANCE_M)
+        distance = rng.uniform(_NEAREST_M, stage.farthest_m)
         place = ahead * distance / np.hypot(*ahead)
         if not np.isfinite(place).all():
             continue

@@ -1,9 +1,10 @@
 """Candidates of known truth (`detect.discs.judgement`), for training the networks.
 
-They come from rendered buildings and floors with known truth, from boards of many discs, from discs
-of the buildings and of real images that were disturbed (`tools.evaluation.disturbances`), and from
-a recorded run with its map: there discs are the shipped rows of mapped ones, and what is far from
-every mapped disc is none. Other cameras than the run's see a part of the floors, and the boards.
+They come from rendered buildings and floors with known truth, from boards of many discs, from
+photographs of buildings with discs painted on the floor, from discs of the buildings, photographs
+and real images that were disturbed (`tools.evaluation.disturbances`), and from a recorded run with
+its map: there discs are the shipped rows of mapped ones, and what is far from every mapped disc is
+none. Other cameras than the run's see a part of the floors, the photographs and the boards.
 """
 
 from __future__ import annotations
@@ -30,22 +31,26 @@ from detect.settings import CircleSettings
 from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.landmarks import read_frames
-from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced
+from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced, with_disc
 from tools.evaluation.disturbed import BLURRED, BORDER, Stage, render_scene
 
 _SETTINGS = CircleSettings()
 #: Of a disc, metres.
 _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
-#: rendered floor, a board; and how much less what is of the other polarity than the discs there.
-_BUILDING, _DISTURBED, _REAL = (3.0, 3.0), (0.2, 0.2), (2.0, 1.0)
-_SCENE, _BOARD, _OTHER_SIGN = (0.4, 0.4), (0.1, 0.5), 0.3
+#: rendered floor, a board, a photograph; and how much less what is of the other polarity than the
+#: discs there.
+_BUILDING, _DISTURBED, _REAL = (4.0, 4.0), (0.2, 0.2), (3.0, 1.5)
+_SCENE, _BOARD, _PHOTOGRAPH, _OTHER_SIGN = (0.15, 0.25), (0.04, 0.2), (0.3, 0.5), 0.3
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
 _SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
+_FARTHEST_M = (4.0, 7.0)  #: Of discs on rendered floors, by turns.
+#: How often discs are painted into a photograph, how many, and how far apart.
+_PHOTOGRAPH_ROUNDS, _PER_PHOTOGRAPH, _APART_M = 4, 6, 0.5
 #: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
 _VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
 #: A disc of fewer pixels than this from its middle up is not told from others.
@@ -180,8 +185,13 @@ def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatA
     return np.array(rows).reshape(-1, 4)
 
 
-def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks]:
-    """Glances and looks at all sources of a folder of data; of the real frames, every n-th."""
+def gather(
+    data: Path, every: int, scenes: int, seed: int, without: str = ""
+) -> tuple[Looks, Looks]:
+    """Glances and looks at the sources of a folder of data; of the real frames, every n-th.
+
+    A rendered building may be left out.
+    """
     camera = read_camera(data / "dlr" / "e" / "e.cam")
     kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
     photographs = sorted((data / "york").glob("dev/*/images/*"))
@@ -189,6 +199,7 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
         (data / "dlr" / "e" / "images" / f"{name}.jpg", mapped, shipped)
         for name, mapped, shipped in _mapped(data / "dlr", camera)
     ]
+    buildings = [of for of in sorted((data / "rendered").glob("r*")) if of.name != without]
     frames = [frame for frame in frames[::every] if frame[0].is_file()]
     parts: list[tuple[Any, ...]] = [
         *((_scenes, camera, kinds, _SCENES_PER_STAGE) for _ in range(scenes // _SCENES_PER_STAGE)),
@@ -196,7 +207,8 @@ def gather(data: Path, every: int, scenes: int, seed: int) -> tuple[Looks, Looks
             (_boards, photographs, _SCENES_PER_STAGE // 5)
             for _ in range(scenes // _SCENES_PER_STAGE)
         ),
-        *((_building, folder) for folder in sorted((data / "rendered").glob("r*"))),
+        *((_photograph, folder) for folder in sorted((data / "york").glob("dev/*/"))),
+        *((_building, folder) for folder in buildings),
         *((_real, camera, frames[k : k + _AT_ONCE]) for k in range(0, len(frames), _AT_ONCE)),
     ]
     with ProcessPoolExecutor() as pool:
@@ -219,7 +231,8 @@ def _scenes(
     kinds: list[str], count: int,
 ) -> None:  # fmt: skip
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
-    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng)
+    farthest_m = _FARTHEST_M[number // 2 % 2]
+    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, farthest_m)
     for _ in range(count):
         kind = str(rng.choice(kinds))
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
@@ -258,6 +271,33 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
         truth = Truth(_images(camera, seen[sure]), unsure=_images(camera, seen[~sure]))
         gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
         _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
+
+
+def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
+    """Look at a photograph of a building, as it is and with discs on its floor."""
+    camera = read_camera(folder / f"{folder.name}.cam")
+    photograph = _read(folder / "images" / f"{folder.name}.jpg")
+    floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
+    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs")
+    for _ in range(_PHOTOGRAPH_ROUNDS):
+        grey = 255.0 * (photograph / 255.0) ** rng.uniform(0.7, 1.5)
+        blurred = cv2.GaussianBlur(grey, (0, 0), rng.uniform(0.3, 1.2))
+        image = np.asarray(np.rint(blurred), np.uint8)
+        places: list[FloatArray] = []
+        for place in camera.floor_from_pixel(
+            rng.uniform(0.0, [camera.width, camera.height], (200, 2))
+        ):
+            apart = all(np.hypot(*(place - other)) > _APART_M for other in places)
+            seen = _images(camera, place)
+            if apart and len(seen) > 0 and seen[0, 3] > 1.5 * _LEAST_HALF_PX:
+                places.append(place)
+                image = with_disc(image, floor_xy, place, _RADIUS, rng)
+            if len(places) == _PER_PHOTOGRAPH:
+                break
+        at = np.array(places).reshape(-1, 2)
+        truth = Truth(_images(camera, at))
+        gathering.add(image, camera, truth, _PHOTOGRAPH, "photographs", _OTHER_SIGN)
+        _add_disturbed(gathering, image, camera, at, rng, "photographs disturbed")
 
 
 def _real(

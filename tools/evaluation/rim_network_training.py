@@ -1,8 +1,12 @@
 """Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: 170,000 looks and 13,000 weights take some ten minutes. Forward and backward pass are
+Plain NumPy: 230,000 looks and 25,000 weights take half an hour. Forward and backward pass are
 written out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter,
 Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls once.
+
+There are few buildings of known truth. So that the networks do not learn these by heart, each look
+is varied whenever it is used: mirrored, on another floor, in other light, partly hidden, cut off,
+less sharp, or noisier.
 """
 
 from __future__ import annotations
@@ -14,8 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 from tyro.conf import Positional
 
+from detect.discs.rim import FARTHEST, NEAREST
 from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
 from redetect.storage import write_whole
 from tools.evaluation.figures import Figures, Study
@@ -25,13 +31,22 @@ FloatArray = NDArray[np.floating]
 
 _BATCH = 256
 #: Share of the discs that a glance may lose.
-_LOST_AT_A_GLANCE = 0.01
+_LOST_AT_A_GLANCE = 0.02
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
 #: A look is never taken for certain.
 _SMOOTHING = 0.01
-#: Grey values are multiplied by exp(N(0, _GAIN)), noise of up to _NOISE grey levels is added.
-_GAIN, _NOISE = 0.3, 4.0
+#: Looks vary in several ways, each with a share of them. Another look's deviations are added in
+#: part, mostly to the floor alone, from this distance on (nominal radii; width of the transition).
+_TEXTURED, _TEXTURE, _ONLY_FLOOR, _FLOOR_FROM = 0.35, (0.1, 0.7), 0.7, (1.08, 0.04)
+#: Light comes from one side, N(0, x) grey levels per radius, and a power exp(N(0, x)) of it.
+_RELIT, _SIDE_LIGHT, _POWER = 0.5, 12.0, 0.35
+#: Distances are smoothed by neighbours of up to this weight.
+_SOFT, _NEIGHBOUR = 0.3, 0.33
+#: A sector shows another look (radians); the image ends somewhere within so many nominal radii.
+_HIDDEN, _SECTOR, _CUT, _CUT_AT = 0.2, (0.4, 1.6), 0.1, 1.2
+#: All are multiplied by exp(N(0, x)); noise has up to so many levels, for some thrice as many.
+_GAIN, _NOISE, _NOISY = 0.3, 4.0, 0.3
 
 
 class Shape(NamedTuple):
@@ -43,7 +58,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
+SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(24, 32, 4, 60)}
 
 
 class Batch(NamedTuple):
@@ -132,17 +147,78 @@ def _neighbours(values: FloatArray) -> FloatArray:
     return np.concatenate([np.roll(values, 1, 1), values, np.roll(values, -1, 1)], axis=-1)
 
 
-def _varied(looks: Looks, chosen: NDArray[np.int64], rng: np.random.Generator) -> Batch:
-    """Looks as they could have been: from a place nearby, mirrored, in other light, noisier."""
+def _varied(
+    looks: Looks, chosen: NDArray[np.int64], others: NDArray[np.int64], rng: np.random.Generator
+) -> Batch:
+    """Looks as they could have been; `others` are looks at what is no disc."""
     n = len(chosen)
     view = rng.integers(looks.grey.shape[1], size=n)
     grey, scale = looks.grey[chosen, view], looks.pixels_per_radius[chosen, view]
     mirrored = rng.random(n) < 0.5
     grey[mirrored], scale[mirrored] = grey[mirrored, ::-1], scale[mirrored, ::-1]
+    for share, vary in _VARIATIONS:
+        some = np.flatnonzero(rng.random(n) < share)
+        other = looks.grey[rng.choice(others, len(some)), 0]
+        grey[some] = vary(grey[some], other, rng)
     gain = np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))).astype(np.float32)
-    level = rng.uniform(0.0, _NOISE, (n, 1, 1)).astype(np.float32)
-    lit = gain * grey + level * rng.standard_normal(grey.shape, np.float32)
+    noise = rng.uniform(0.0, _NOISE, (n, 1, 1)) * np.where(rng.random((n, 1, 1)) < _NOISY, 3.0, 1.0)
+    lit = gain * grey + noise.astype(np.float32) * rng.standard_normal(grey.shape, np.float32)
     return batch_of(lit, scale, looks.features[chosen].astype(np.float32))
+
+
+def _positions(grey: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Angles (N, K, 1) from a random direction, and distances (M,) in nominal radii, of samples."""
+    looks, directions, distances = grey.shape
+    angle = np.linspace(0.0, 2.0 * np.pi, directions, endpoint=False, dtype=np.float32)[:, None]
+    first = rng.uniform(0.0, 2.0 * np.pi, (looks, 1, 1)).astype(np.float32)
+    return angle - first, np.linspace(NEAREST, FARTHEST, distances, dtype=np.float32)
+
+
+def _each(values: FloatArray) -> FloatArray:
+    return values.astype(np.float32)[:, None, None]
+
+
+def _textured(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Looks with the deviations of others added."""
+    n, (at, width) = len(grey), _FLOOR_FROM
+    _, distance = _positions(grey, rng)
+    floor = np.where(_each(rng.random(n)) < _ONLY_FLOOR, expit((distance - at) / width), 1.0)
+    deviation = np.nan_to_num(other - np.nanmean(other, axis=(1, 2), keepdims=True))
+    return np.asarray(grey + _each(rng.uniform(*_TEXTURE, n)) * floor * deviation)
+
+
+def _relit(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Looks with light from one side, and brighter or darker."""
+    n = len(grey)
+    angle, distance = _positions(grey, rng)
+    lit = grey + _each(rng.normal(0.0, _SIDE_LIGHT, n)) * distance * np.cos(angle)
+    power = _each(np.exp(rng.normal(0.0, _POWER, n)))
+    return np.asarray(255.0 * (np.clip(lit, 1.0, 255.0) / 255.0) ** power)
+
+
+def _softened(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Looks that are less sharp."""
+    weight = _each(rng.uniform(0.0, _NEIGHBOUR, len(grey)))
+    padded = np.pad(grey, ((0, 0), (0, 0), (1, 1)), mode="edge")
+    return (1.0 - 2.0 * weight) * grey + weight * (padded[:, :, :-2] + padded[:, :, 2:])
+
+
+def _hidden(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Looks with a sector of others."""
+    angle, _ = _positions(grey, rng)
+    return np.where(angle % (2.0 * np.pi) < _each(rng.uniform(*_SECTOR, len(grey))), other, grey)
+
+
+def _cut(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Looks of which a part is outside the image."""
+    angle, distance = _positions(grey, rng)
+    farthest = _each(rng.uniform(0.0, _CUT_AT, len(grey)))
+    return np.where(distance * np.cos(angle) > farthest, np.float32(np.nan), grey)
+
+
+_VARIATIONS = (
+    (_TEXTURED, _textured), (_RELIT, _relit), (_SOFT, _softened), (_HIDDEN, _hidden), (_CUT, _cut),
+)  # fmt: skip
 
 
 def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int) -> _Member:
@@ -154,11 +230,12 @@ def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int
     first = [np.zeros_like(w) for w in member.weights]
     second = [np.zeros_like(w) for w in member.weights]
     steps = shape.epochs * -(-len(used) // _BATCH)
+    others = used[~looks.is_disc[used]]
     orders = (rng.permutation(used) for _ in range(shape.epochs))
     batches = (order[k : k + _BATCH] for order in orders for k in range(0, len(order), _BATCH))
     for t, chosen in enumerate(batches, 1):
-        odds = member.log_odds(_varied(looks, chosen, rng))
-        d_odds = (1.0 / (1.0 + np.exp(-odds)) - target[chosen]) * weight[chosen] / len(chosen)
+        odds = member.log_odds(_varied(looks, chosen, others, rng))
+        d_odds = (expit(odds) - target[chosen]) * weight[chosen] / len(chosen)
         gradient = member.gradient(d_odds.astype(np.float32))
         done = t / steps
         rate = done / _RISING
@@ -236,14 +313,15 @@ class TrainRimNetwork(Study):
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
     every: int = 4  # Every n-th frame of the recorded run is used.
-    scenes: int = 1000  # Rendered floors with disturbed discs.
+    scenes: int = 1500  # Rendered floors with disturbed discs.
+    without: str = ""  # Folder of a rendered building that is not used.
     seed: int = 1  # Of the disturbances and the networks.
     output: Path = Path("build/rim_network.npz")
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
     force: bool = False  # Replace that file.
 
     def measured(self) -> Figures:
-        glances, looks = gather(self.data, self.every, self.scenes, self.seed)
+        glances, looks = gather(self.data, self.every, self.scenes, self.seed, self.without)
         for kind, of in (("glances", glances), ("looks", looks)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
         networks = train_all(glances, looks, self.seed)

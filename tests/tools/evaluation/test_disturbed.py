@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from camera import Camera
+from detect.circles import detect_circles, disc_table
 from detect.settings import CircleSettings
+from lut.outlines import floor_positions
 from tools.evaluation.disturbances import (
     DISTURBANCES,
     LOOK_ALIKES,
     Surroundings,
     _size_for,
     look_alike,
+    with_disc,
 )
 from tools.evaluation.disturbed import BLURRED, BORDER, Stage, measure, render_scene
 
@@ -71,6 +74,18 @@ def test_a_disc_is_cut_by_the_border_as_asked(stage: Stage) -> None:
         _, places = render_scene(stage, BORDER, 0.3, np.random.default_rng(seed))
         for place in places:
             assert 1.0 - stage.seen_share(place) == pytest.approx(0.3, abs=0.06)
+
+
+def test_a_disc_that_is_painted_into_an_image_is_found_there(stage: Stage) -> None:
+    camera, rng = stage.camera, np.random.default_rng(4)
+    image = stage.exposed(stage.floors["tiles"], (0.0, 0.7), rng)
+    places = np.array([(-0.4, -1.5), (0.5, -2.0), (0.0, -3.0)])
+    for place in places:
+        image = with_disc(image, floor_positions(camera), place, 0.1, rng)
+    found = detect_circles(image, camera, disc_table(camera, SETTINGS), SETTINGS)
+    off = np.linalg.norm(found.floor_xy[None] - places[:, None], axis=-1)
+    assert len(found) == 3
+    assert (off.min(axis=1) < 0.02).all()
 
 
 @pytest.mark.long

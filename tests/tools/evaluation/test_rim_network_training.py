@@ -65,3 +65,34 @@ def test_a_glance_loses_few_discs() -> None:
     passed = training.log_odds(training.train_glance(looks, every, 1), looks, every) >= 0.0
     assert passed[looks.is_disc].mean() >= 0.97
     assert not passed[~looks.is_disc].any()
+
+
+def test_variations_of_looks_change_what_they_say() -> None:
+    rng, looks = np.random.default_rng(7), looks_of(60, 6)
+    grey, other = looks.grey[:30, 0], looks.grey[30:, 0] + 1000.0
+    hidden = training._hidden(grey, other, rng)
+    shown = (hidden == other).all(axis=2)
+    assert ((hidden == grey).all(axis=2) == ~shown).all()
+    # One sector, of a sixteenth to a quarter of the directions.
+    assert (np.count_nonzero(shown != np.roll(shown, 1, axis=1), axis=1) == 2).all()
+    assert ((shown.sum(axis=1) >= 2) & (shown.sum(axis=1) <= DIRECTIONS // 4 + 1)).all()
+    cut = training._cut(grey, other, rng)
+    outside = np.isnan(cut)
+    assert (cut[~outside] == grey[~outside]).all()
+    # A straight border: no more than half of the directions, and nothing behind it.
+    assert (outside.any(axis=2).sum(axis=1) <= DIRECTIONS // 2).all()
+    assert (outside[:, :, 1:] >= outside[:, :, :-1]).all()
+    textured = training._textured(grey, other, rng) - grey
+    inside = np.abs(textured[:, :, : STEPS // 8]).max(axis=(1, 2))
+    assert 0.4 < np.mean(inside < 0.1) < 0.95
+    assert (np.abs(textured[:, :, -2:]).max(axis=(1, 2)) > 0.5).all()
+    soft = training._softened(grey, other, rng)
+    assert (np.diff(soft, axis=2).std(axis=(1, 2)) < np.diff(grey, axis=2).std(axis=(1, 2))).all()
+
+
+def test_looks_at_discs_remain_so_in_other_light() -> None:
+    looks, rng = looks_of(60, 8), np.random.default_rng(9)
+    grey = training._relit(looks.grey[:, 0], looks.grey[:, 1], rng)
+    assert ((grey >= 0.0) & (grey <= 255.0)).all()
+    step = grey[:, :, : STEPS // 4].mean(axis=(1, 2)) - grey[:, :, STEPS // 4 :].mean(axis=(1, 2))
+    assert ((step > 15.0) == looks.is_disc).all()
