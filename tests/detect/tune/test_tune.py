@@ -192,7 +192,8 @@ def test_covariances_have_the_usual_tilt_of_the_run(project_root: Path, tmp_path
     leaning = leaning_camera(read_camera(run / "e.cam"), (0.01, 0.0))
     write_camera(leaning, tmp_path / "leaning.cam")
     some = [str(run), "--camera", str(tmp_path / "leaning.cam")]
-    trials = ["tune", *some, "--frames", "20", "--vary", "evidence=-0.1"]
+    default = f"evidence={CircleSettings().evidence}"
+    trials = ["tune", *some, "--frames", "20", "--vary", default]
     assert main([*trials, "-o", str(tmp_path / "t")]) == 0
     (trial,) = json.loads((tmp_path / "t" / "table.json").read_text())["trials"]
     assert main(["circles", *some, "--frames", "20", "-o", str(rows)]) == 0
