@@ -229,13 +229,9 @@ def look_alike(about: Surroundings, kind: str, rng: np.random.Generator) -> Floa
 
 
 def disturbed(
-    image: ByteArray,
-    floor_xy: Float32Array,
-    place: FloatArray,
-    radius: float,
-    kind: str,
+    image: ByteArray, floor_xy: Float32Array, place: FloatArray, radius: float, kind: str,
     rng: np.random.Generator,
-) -> ByteArray:
+) -> ByteArray:  # fmt: skip
     """An image with one light disc disturbed, at a random share of its rim.
     `image` (H, W); `floor_xy` (H, W, 2); `place` (2,).
     """
@@ -245,25 +241,18 @@ def disturbed(
 
 
 def replaced(
-    image: ByteArray,
-    floor_xy: Float32Array,
-    place: FloatArray,
-    radius: float,
-    kind: str,
+    image: ByteArray, floor_xy: Float32Array, place: FloatArray, radius: float, kind: str,
     rng: np.random.Generator,
-) -> ByteArray:
+) -> ByteArray:  # fmt: skip
     """An image with one of `LOOK_ALIKES` instead of a disc; parameters as of `disturbed`."""
     window, about = _surroundings(image, floor_xy, place, radius)
     return _with(image, window, about.grey, look_alike(about, kind, rng), rng)
 
 
 def with_disc(
-    image: ByteArray,
-    floor_xy: Float32Array,
-    place: FloatArray,
-    radius: float,
+    image: ByteArray, floor_xy: Float32Array, place: FloatArray, radius: float,
     rng: np.random.Generator,
-) -> ByteArray:
+) -> ByteArray:  # fmt: skip
     """An image with a light disc on the floor; parameters as of `disturbed`."""
     window, about = _surroundings(image, floor_xy, place, radius)
     light = min(max(about.floor * math.exp(rng.uniform(0.2, 1.4)), about.floor + 15.0), 252.0)
