@@ -80,8 +80,9 @@ def test_a_disc_that_is_painted_into_an_image_is_found_there(stage: Stage) -> No
     camera, rng = stage.camera, np.random.default_rng(4)
     image = stage.exposed(stage.floors["tiles"], (0.0, 0.7), rng)
     places = np.array([(-0.4, -1.5), (0.5, -2.0), (0.0, -3.0)])
+    floor_xy = floor_positions(camera).astype(np.float32)
     for place in places:
-        image = with_disc(image, floor_positions(camera), place, 0.1, rng)
+        image = with_disc(image, floor_xy, place, 0.1, rng)
     found = detect_circles(image, camera, disc_table(camera, SETTINGS), SETTINGS)
     off = np.linalg.norm(found.floor_xy[None] - places[:, None], axis=-1)
     assert len(found) == 3
