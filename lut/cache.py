@@ -145,7 +145,7 @@ def _delete_least_recent(kept: Path) -> None:
     """Delete the tables not used for the longest time, but `kept`, until the cache is small."""
     tables = [(table, table.stat()) for table in kept.parent.glob("*-*.table") if table != kept]
     total = kept.stat().st_size
-    # Many file systems record reading once a day only, or never.
+    # Many file systems record once a day that a file was read, or never.
     tables.sort(key=lambda table: max(table[1].st_atime, table[1].st_mtime), reverse=True)
     for table, state in tables:
         total += state.st_size

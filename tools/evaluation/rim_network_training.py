@@ -36,16 +36,20 @@ _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
 #: A look is never taken for certain.
 _SMOOTHING = 0.01
-#: Looks vary in several ways, each with a share of them. Another look's deviations are added in
-#: part, mostly to the floor alone, from this distance on (nominal radii; width of the transition).
+#: Shares of looks that are varied in each way, and how much. Of another look's deviations from its
+#: mean a part is added, mostly to the floor alone: from this distance on, with a transition of this
+#: width (nominal radii).
 _TEXTURED, _TEXTURE, _ONLY_FLOOR, _FLOOR_FROM = 0.35, (0.1, 0.7), 0.7, (1.08, 0.04)
-#: Light comes from one side, N(0, x) grey levels per radius, and a power exp(N(0, x)) of it.
+#: A gradient of N(0, x) grey levels per radius is added; grey values have the power exp(N(0, x)).
 _RELIT, _SIDE_LIGHT, _POWER = 0.5, 12.0, 0.35
-#: Distances are smoothed by neighbours of up to this weight.
+#: Each sample is averaged with its neighbours along the radius, which have up to this weight.
 _SOFT, _NEIGHBOUR = 0.3, 0.33
-#: A sector shows another look (radians); the image ends somewhere within so many nominal radii.
-_HIDDEN, _SECTOR, _CUT, _CUT_AT = 0.2, (0.4, 1.6), 0.1, 1.2
-#: All are multiplied by exp(N(0, x)); noise has up to so many levels, for some thrice as many.
+#: A sector of this angle (rad) shows another look.
+_HIDDEN, _SECTOR = 0.2, (0.4, 1.6)
+#: The image ends at up to this distance from the centre, nominal radii.
+_CUT, _CUT_AT = 0.1, 1.2
+#: All grey values are multiplied by exp(N(0, x)), and have noise of up to so many levels; this
+#: share has three times the noise.
 _GAIN, _NOISE, _NOISY = 0.3, 4.0, 0.3
 
 
@@ -175,6 +179,7 @@ def _positions(grey: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, 
 
 
 def _each(values: FloatArray) -> FloatArray:
+    """One value for each of N looks, as (N, 1, 1)."""
     return values.astype(np.float32)[:, None, None]
 
 
@@ -311,7 +316,7 @@ def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> ND
 class TrainRimNetwork(Study):
     """Train the networks that judge candidates of discs."""
 
-    data: Positional[Path] = Path("../shared/data")  # Folder with `rendered` and `dlr`.
+    data: Positional[Path] = Path("../shared/data")  # Folder with `rendered`, `york` and `dlr`.
     every: int = 4  # Every n-th frame of the recorded run is used.
     scenes: int = 1500  # Rendered floors with disturbed discs.
     without: str = ""  # Folder of a rendered building that is not used.
