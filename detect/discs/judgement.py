@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from camera.kernels import distance_of_floor_point, project_floor_point
 from detect.discs.hough import HoughCandidates
+from detect.discs.model import F32
 from detect.discs.rim import (
+    AROUND_AT,
     COS,
     DIRECTIONS,
     FARTHEST,
@@ -29,6 +31,7 @@ from detect.discs.rim import (
     follow_rim,
     median,
     profiles,
+    surroundings,
 )
 from detect.discs.rim_network import (
     HOPELESS,
@@ -48,6 +51,9 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
+#: Distances of what the network sees about a rim, nominal radii: means of pairs of steps, and the
+#: surroundings.
+LOOKED_AT = np.append(np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1), AROUND_AT)
 _AT_ONCE = 16  #: Candidates at which a network glances at a time.
 _LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
@@ -131,8 +137,9 @@ def judge(
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
+    at_a_glance, look = networks
     contrast, glanced = _glance_odds(
-        image, candidates, nominal, least_step, camera_numbers, networks.glance
+        image, candidates, nominal, least_step, camera_numbers, at_a_glance
     )
     for i in range(n):
         if contrast[i] == 0.0:
@@ -151,13 +158,15 @@ def judge(
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.look)
+        odds, rim_features = _rim_odds(image, camera_numbers, radial, rim, score, sign, look)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, radial, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, features_again = _rim_odds(radial_again, again, score, sign, networks.look)
+                more, features_again = _rim_odds(
+                    image, camera_numbers, radial_again, again, score, sign, look
+                )
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
@@ -212,7 +221,7 @@ def _glance_odds(
         end = min(first + _AT_ONCE, n)
         sign, score = candidates.sign[first:end], candidates.score[first:end]
         grey, scale = glance(image, camera_numbers, candidates.floor_xy[first:end], nominal)
-        inputs, scales = network_inputs(grey, scale, sign)
+        inputs, scales = network_inputs(grey, scale, sign, len(GLANCED_AT))
         log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)
         for k in range(end - first):
             contrast[first + k] = _contrast(grey[k], sign[k], least_step)
@@ -258,14 +267,17 @@ def glance(
 
 
 @kernel()
-def pairs_of_steps(grey: Float32Array) -> Float32Array:
-    """Profiles as the network sees them: means of pairs of steps."""
+def look_at(image: GreyImage, camera_numbers: FloatArray, radial: Profiles) -> Float32Array:
+    """(DIRECTIONS, len(LOOKED_AT)) grey values about a point, as the network sees them."""
     # Loops, here and below: expressions of arrays take several times as long to compile.
-    pairs = np.empty((len(grey), grey.shape[1] // 2), np.float32)
-    for k in range(len(grey)):
-        for m in range(grey.shape[1] // 2):
-            pairs[k, m] = np.float32(0.5) * (grey[k, 2 * m] + grey[k, 2 * m + 1])
-    return pairs
+    seen = np.empty((DIRECTIONS, len(LOOKED_AT)), np.float32)
+    around = surroundings(image, camera_numbers, radial.x, radial.y, radial.radius)
+    for k in range(DIRECTIONS):
+        for m in range(STEPS // 2):
+            seen[k, m] = F32(0.5) * (radial.grey[k, 2 * m] + radial.grey[k, 2 * m + 1])
+        for m in range(len(AROUND_AT)):
+            seen[k, STEPS // 2 + m] = around[k, m]
+    return seen
 
 
 @kernel()
@@ -305,8 +317,9 @@ def _quality(grey: Float32Array) -> tuple[float, float]:
 
 @kernel()
 def _rim_odds(
-    radial: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
-) -> tuple[float, FloatArray]:
+    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, rim: Rim, score: float,
+    sign: float, network: RimNetwork,
+) -> tuple[float, FloatArray]:  # fmt: skip
     """Log-odds that a rim, seen from its centre, is a disc's; and its features.
 
     Each feature is bounded, so that no single one decides.
@@ -320,7 +333,7 @@ def _rim_odds(
     features[4] = 10.0 * off * off
     features[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     features[6] = min(score, 12.0)
-    grey, scale = pairs_of_steps(radial.grey), radial.pixels_per_radius
-    signs = np.full(1, sign)
-    inputs, scales = network_inputs(grey.reshape(1, DIRECTIONS, -1), scale.reshape(1, -1), signs)
+    grey = look_at(image, camera_numbers, radial).reshape(1, DIRECTIONS, -1)
+    scale = radial.pixels_per_radius.reshape(1, -1)
+    inputs, scales = network_inputs(grey, scale, np.full(1, sign), STEPS // 2)
     return network_log_odds(inputs, scales, features.reshape(1, -1), network)[0], features

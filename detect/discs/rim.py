@@ -30,6 +30,8 @@ DIRECTIONS = 32  #: Directions from the centre of a candidate.
 STEPS = 32  #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
+#: Distances of the surroundings, nominal radii.
+AROUND_AT = np.array([2.0, 2.5, 3.2, 4.0])
 LEAST_STEP = 0.35  #: Least step of the grey value, as a share of the disc's contrast.
 #: Tolerance of a point on the circle: a share of the radius plus a number of pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
@@ -143,6 +145,23 @@ def profiles(
                 lower += across[m] * (F32(pixels[at + below + one]) - lower)
                 grey[k, m] = upper + down[m] * (lower - upper)
     return Profiles(x, y, radius, grey, scale)
+
+
+@kernel()
+def surroundings(
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
+) -> Float32Array:
+    """(DIRECTIONS, len(AROUND_AT)) nearest-pixel grey values of the surroundings, as `profiles`."""
+    grey = np.empty((DIRECTIONS, len(AROUND_AT)), np.float32)
+    height, width = image.shape
+    for k in range(DIRECTIONS):
+        for m in range(len(AROUND_AT)):
+            away = radius * AROUND_AT[m]
+            u, v = project_floor_point(camera_numbers, x + away * COS[k], y + away * SIN[k])
+            u, v = u + 0.5, v + 0.5
+            inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
+            grey[k, m] = image[np.uint64(v), np.uint64(u)] if inside else math.nan
+    return grey
 
 
 @kernel()

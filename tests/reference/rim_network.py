@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.rim_network import CERTAIN, HOPELESS, RimNetwork
+from detect.discs.rim_network import CERTAIN, HOPELESS, MOST, RimNetwork
 
 FloatArray = NDArray[np.floating]
 
 
 def inputs_of(
-    grey: FloatArray, pixels_per_radius: FloatArray, sign: float
+    grey: FloatArray, pixels_per_radius: FloatArray, sign: float, near: int
 ) -> tuple[FloatArray, FloatArray]:
     """See `detect.discs.rim_network.network_inputs`; the inputs as (K, I)."""
     values = sign * grey
     outside = np.isnan(values)
-    off = values - np.nanmean(values)
-    deviation = np.sqrt(np.nanmean(off**2) + 9.0)
+    off = values - np.nanmean(values[:, :near])
+    deviation = np.sqrt(np.nanmean(off[:, :near] ** 2) + 9.0)
     size = np.log(pixels_per_radius) - 1.5
-    inputs = np.column_stack([np.nan_to_num(off / deviation), size, outside.mean(axis=1)])
+    relative = np.clip(np.nan_to_num(off / deviation), -MOST, MOST)
+    inputs = np.column_stack([relative, size, outside.mean(axis=1)])
     return inputs, np.array([size.mean(), np.log(deviation) - 2.5])
 
 

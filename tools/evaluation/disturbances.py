@@ -258,7 +258,9 @@ def with_disc(
     light = min(max(about.floor * math.exp(rng.uniform(0.2, 1.4)), about.floor + 15.0), 252.0)
     distance = 1.0 - np.hypot(about.offset[..., 0], about.offset[..., 1])
     share = about.share(distance, about.pixel * rng.uniform(0.3, 0.8))
-    grey = about.grey * (1.0 - share) + share * light
+    # In places the floor's own light and shadow are seen on the disc, too.
+    shade = (np.maximum(about.grey, 1.0) / max(about.floor, 1.0)) ** rng.uniform(0.0, 0.7)
+    grey = about.grey * (1.0 - share) + share * np.minimum(light * shade, 255.0)
     return _with(image, window, about.grey, grey, rng)
 
 

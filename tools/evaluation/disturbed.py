@@ -184,7 +184,7 @@ def render_scene(
     stage: Stage, kind: str, share: float, rng: np.random.Generator
 ) -> tuple[ByteArray, list[FloatArray]]:
     """(H, W) image of a floor with discs of one family of disturbances, or look-alikes."""
-    grey = stage.floors[str(rng.choice(FLOORS))].copy()
+    grey = stage.floors[str(rng.choice(list(stage.floors)))].copy()
     places = _places(stage, share if kind == BORDER else 0.0, rng)
     for place in places:
         window = stage.window(place)

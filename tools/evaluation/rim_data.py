@@ -1,10 +1,11 @@
 """Candidates of known truth (`detect.discs.judgement`), for training the networks.
 
 They come from rendered buildings and floors with known truth, from boards of many discs, from
-photographs of buildings with discs painted on the floor, from discs of the buildings, photographs
-and real images that were disturbed (`tools.evaluation.disturbances`), and from a recorded run with
-its map: there discs are the shipped rows of mapped ones, and what is far from every mapped disc is
-none. Other cameras than the run's see a part of the floors, the photographs and the boards.
+photographs of buildings, which discs are painted into and which cover floors, from discs of the
+buildings, photographs and real images that were disturbed (`tools.evaluation.disturbances`), and
+from a recorded run with its map: there discs are the shipped rows of mapped ones, and what is far
+from every mapped disc is none, but for some that the map lacks. Other cameras than the run's see a
+part of the floors, the photographs and the boards.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
 from detect.circles import candidates_of, judged, scene_of, vote_shape
-from detect.discs.judgement import FEATURES, GLANCED_AT, Fate, glance, pairs_of_steps
-from detect.discs.rim import DIRECTIONS, STEPS, profiles
+from detect.discs.judgement import FEATURES, GLANCED_AT, LOOKED_AT, Fate, glance, look_at
+from detect.discs.rim import DIRECTIONS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.settings import CircleSettings
 from lut import cached_vote_table
@@ -40,7 +41,7 @@ _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
 #: rendered floor, a board, a photograph; and how much less what is of the other polarity than the
 #: discs there.
-_BUILDING, _DISTURBED, _REAL = (4.0, 4.0), (0.2, 0.2), (3.0, 1.5)
+_BUILDING, _DISTURBED, _REAL = (4.0, 4.0), (0.2, 0.2), (2.0, 0.9)
 _SCENE, _BOARD, _PHOTOGRAPH, _OTHER_SIGN = (0.15, 0.25), (0.04, 0.2), (0.3, 0.5), 0.3
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
@@ -49,8 +50,13 @@ _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
 _SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
 _FARTHEST_M = (4.0, 7.0)  #: Of discs on rendered floors, by turns.
-#: How often discs are painted into a photograph, how many, and how far apart.
-_PHOTOGRAPH_ROUNDS, _PER_PHOTOGRAPH, _APART_M = 4, 6, 0.5
+#: How often discs are painted into a photograph, how many, and how far apart; and into an image of
+#: a rendered building.
+_PHOTOGRAPH_ROUNDS, _PAINTED, _APART_M = 8, 6, 0.5
+#: Photographs that are floors of each stage, and how long an image is there.
+_PHOTOGRAPHED_FLOORS, _FLOOR_M = 4, (1.5, 5.0)
+#: Share of what is no disc on rendered floors and about boards that is used: there is plenty.
+_KEPT = 0.35
 #: Views of each rim, and how far all but the first are off its place (metres) and size (relative).
 _VIEWS, _OFF_PLACE, _OFF_SIZE = 5, 0.007, 0.06
 #: A disc of fewer pixels than this from its middle up is not told from others.
@@ -71,7 +77,7 @@ def _network_by(features: int, decisive: int, inputs: int) -> RimNetwork:
 #: Glances pass; of the looks at one place, the one with most of a rim is the best.
 _BY_RIM = Networks(
     _network_by(1, 0, len(GLANCED_AT) + OTHERS),
-    _network_by(len(FEATURES), FEATURES.index("rim"), STEPS // 2 + OTHERS),
+    _network_by(len(FEATURES), FEATURES.index("rim"), len(LOOKED_AT) + OTHERS),
 )
 
 
@@ -85,6 +91,9 @@ class Looks(NamedTuple):
     weight: FloatArray  # (N,)
     source: NDArray[np.str_]  # (N,)
 
+
+#: Discs of the recorded run that are not mapped, and what may be one, found by looking at images.
+_UNMAPPED = Path(__file__).with_name("unmapped.csv")
 
 _NOWHERE = np.zeros((0, 4))
 
@@ -109,9 +118,10 @@ class _Gathering:
 
     def add(
         self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float],
-        source: str, other_sign: float = 1.0,
+        source: str, other_sign: float = 1.0, kept: float = 1.0,
     ) -> None:  # fmt: skip
-        """Look at an image."""
+        """Look at an image; a share of what is no disc is kept, and all of `truth.others`."""
+        kept = kept if truth.others is None else 1.0
         table = cached_vote_table(camera, vote_shape(_SETTINGS))
         scene = scene_of(image, camera, table, _SETTINGS)
         signs = len(truth.light) > 0, len(truth.dark) > 0
@@ -124,13 +134,13 @@ class _Gathering:
                 elsewhere = min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
                 if truth.others is not None:
                     elsewhere = _nearest(uv, truth.others) < 0.6
-                if is_disc or elsewhere:
-                    counted = weight[0 if is_disc else 1] * (other_sign if other else 1.0)
-                    yield k, is_disc, counted, source
+                if is_disc or (elsewhere and self._rng.random() < kept):
+                    counted = weight[0] if is_disc else weight[1] / kept
+                    yield k, is_disc, counted * (other_sign if other else 1.0), source
 
         candidates = candidates_of(scene, table, _SETTINGS)
         grey, scale = glance(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
-        grey *= candidates.sign[:, None, None]
+        grey = _as_light(grey, candidates.sign[:, None, None])
         for k, *row in known(candidates.floor_xy, candidates.sign):
             seen: tuple[Any, ...] = candidates.score[k, None], grey[k, None], scale[k, None]
             self.glances.append((*seen, *row))
@@ -144,16 +154,22 @@ class _Gathering:
     def _views(
         self, image: ByteArray, camera: Camera, place: FloatArray, sign: float
     ) -> tuple[Float32Array, Float32Array]:
-        grey = np.empty((_VIEWS, DIRECTIONS, STEPS // 2), np.float32)
+        grey = np.empty((_VIEWS, DIRECTIONS, len(LOOKED_AT)), np.float32)
         scale = np.empty((_VIEWS, DIRECTIONS), np.float32)
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
         off[0] = 0.0
         numbers = camera_numbers(camera)
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
-            seen = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
-            grey[k], scale[k] = sign * pairs_of_steps(seen.grey), seen.pixels_per_radius
+            radial = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
+            grey[k] = _as_light(look_at(image, numbers, radial), sign)
+            scale[k] = radial.pixels_per_radius
         return grey, scale
+
+
+def _as_light(grey: Float32Array, sign: FloatArray | float) -> Float32Array:
+    """Grey values at discs as of light ones; `sign` is -1 for dark ones."""
+    return np.asarray(np.where(np.asarray(sign) > 0.0, grey, 255.0 - grey), np.float32)
 
 
 def _looks_of(rows: list[_Row]) -> Looks:
@@ -202,7 +218,10 @@ def gather(
     buildings = [of for of in sorted((data / "rendered").glob("r*")) if of.name != without]
     frames = [frame for frame in frames[::every] if frame[0].is_file()]
     parts: list[tuple[Any, ...]] = [
-        *((_scenes, camera, kinds, _SCENES_PER_STAGE) for _ in range(scenes // _SCENES_PER_STAGE)),
+        *(
+            (_scenes, camera, kinds, photographs, _SCENES_PER_STAGE)
+            for _ in range(scenes // _SCENES_PER_STAGE)
+        ),
         *(
             (_boards, photographs, _SCENES_PER_STAGE // 5)
             for _ in range(scenes // _SCENES_PER_STAGE)
@@ -228,11 +247,13 @@ def _gather(seed: list[int], add: Any, *of: Any) -> tuple[list[_Row], list[_Row]
 
 def _scenes(
     gathering: _Gathering, rng: np.random.Generator, number: int, camera: Camera,
-    kinds: list[str], count: int,
+    kinds: list[str], photographs: list[Path], count: int,
 ) -> None:  # fmt: skip
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
     farthest_m = _FARTHEST_M[number // 2 % 2]
     stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, farthest_m)
+    for path in rng.choice(np.array(photographs), _PHOTOGRAPHED_FLOORS):
+        stage.floors[path.stem] = _photographed(_read(path), stage.floor_xy, rng)
     for _ in range(count):
         kind = str(rng.choice(kinds))
         image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
@@ -242,8 +263,26 @@ def _scenes(
         else:
             heights = np.array([np.ptp(stage.outline(place)[:, 1]) for place in places])
             clear = heights >= 2.0 * _LEAST_HALF_PX
+            clear &= np.array([_contrast(image, stage.camera, at) for at in places]) > 6.0
             truth = Truth(at[clear], unsure=at[~clear])
-        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN)
+        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN, _KEPT)
+
+
+def _photographed(
+    photograph: ByteArray, floor_xy: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Grey values of a floor that is covered with a photograph, again and again."""
+    angle, length = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*_FLOOR_M)
+    turned = np.nan_to_num(floor_xy) @ np.array(
+        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    )
+    height, width = photograph.shape
+    at = np.asarray(np.clip(turned, -50.0, 50.0) * (width / length) + 60.0 * width, np.float32)
+    # Mirrored, so that there are no seams.
+    u = np.abs(np.mod(at[..., 0], 2.0 * width) - width)
+    v = np.abs(np.mod(at[..., 1], 2.0 * height) - height)
+    seen = cv2.remap(photograph, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(rng.uniform(100.0, 200.0) * (seen / 255.0) ** rng.uniform(0.8, 1.8))
 
 
 def _boards(
@@ -257,7 +296,7 @@ def _boards(
         truth = Truth(dark=at)
         if k % 2:
             image, truth = np.asarray(255 - image, np.uint8), Truth(light=at)
-        gathering.add(image, camera, truth, _BOARD, "boards")
+        gathering.add(image, camera, truth, _BOARD, "boards", kept=_KEPT)
 
 
 def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
@@ -271,33 +310,41 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
         truth = Truth(_images(camera, seen[sure]), unsure=_images(camera, seen[~sure]))
         gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
         _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
+        _add_painted(gathering, image, camera, seen, rng, f"{folder.name} painted")
 
 
 def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
     """Look at a photograph of a building, as it is and with discs on its floor."""
     camera = read_camera(folder / f"{folder.name}.cam")
     photograph = _read(folder / "images" / f"{folder.name}.jpg")
-    floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
     gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs")
     for _ in range(_PHOTOGRAPH_ROUNDS):
         grey = 255.0 * (photograph / 255.0) ** rng.uniform(0.7, 1.5)
         blurred = cv2.GaussianBlur(grey, (0, 0), rng.uniform(0.3, 1.2))
         image = np.asarray(np.rint(blurred), np.uint8)
-        places: list[FloatArray] = []
-        for place in camera.floor_from_pixel(
-            rng.uniform(0.0, [camera.width, camera.height], (200, 2))
-        ):
-            apart = all(np.hypot(*(place - other)) > _APART_M for other in places)
-            seen = _images(camera, place)
-            if apart and len(seen) > 0 and seen[0, 3] > 1.5 * _LEAST_HALF_PX:
-                places.append(place)
-                image = with_disc(image, floor_xy, place, _RADIUS, rng)
-            if len(places) == _PER_PHOTOGRAPH:
-                break
-        at = np.array(places).reshape(-1, 2)
-        truth = Truth(_images(camera, at))
-        gathering.add(image, camera, truth, _PHOTOGRAPH, "photographs", _OTHER_SIGN)
-        _add_disturbed(gathering, image, camera, at, rng, "photographs disturbed")
+        _add_painted(gathering, image, camera, np.zeros((0, 2)), rng, "photographs")
+
+
+def _add_painted(
+    gathering: _Gathering, image: ByteArray, camera: Camera, known: FloatArray,
+    rng: np.random.Generator, source: str,
+) -> None:  # fmt: skip
+    """Look at an image with more discs on the floor than are `known` (N, 2), also disturbed."""
+    floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
+    pixels = rng.uniform(0.0, [camera.width, camera.height], (200, 2))
+    places: list[FloatArray] = []
+    for place in camera.floor_from_pixel(pixels):
+        apart = all(np.hypot(*(place - other)) > _APART_M for other in [*known, *places])
+        seen = _images(camera, place)
+        if apart and len(seen) > 0 and seen[0, 3] > 1.5 * _LEAST_HALF_PX:
+            places.append(place)
+            image = with_disc(image, floor_xy, place, _RADIUS, rng)
+        if len(places) == _PAINTED:
+            break
+    at = np.array(places).reshape(-1, 2)
+    truth = Truth(_images(camera, at), unsure=_images(camera, known))
+    gathering.add(image, camera, truth, _PHOTOGRAPH, source, _OTHER_SIGN)
+    _add_disturbed(gathering, image, camera, at, rng, f"{source} disturbed")
 
 
 def _real(
@@ -309,20 +356,11 @@ def _real(
         image = _read(path)
         is_mapped = [_nearest(uv, mapped) < 1.0 for uv in camera.project_floor(rows_xy)]
         shipped = rows_xy[np.array(is_mapped, np.bool_)]
-        light = np.array([_is_light(image, camera, xy) for xy in shipped], np.bool_)
+        light = np.array([_contrast(image, camera, xy) for xy in shipped]) > 0.0
         of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
         gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
         if number % 6 == 0:
             _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
-    gathering.looks = [
-        row for row in gathering.looks if row[-1] != "real" or row[3] or not _is_clear(row[0])
-    ]
-
-
-def _is_clear(features: FloatArray) -> bool:
-    """Where no disc is mapped, that is a disc nevertheless."""
-    rim, _, scatter, radius_off, _, _, score = features
-    return bool(rim >= 0.65 and scatter < 0.45 and radius_off <= 0.06 and score >= 4.5)
 
 
 def other_camera(rng: np.random.Generator) -> Camera:
@@ -413,6 +451,7 @@ def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatA
     """Names of frames, places of mapped discs in the image with slack, and shipped rows (m)."""
     true = np.array(json.loads((run / "mounting.json").read_text())["robot_from_camera"])
     rows = list(csv.DictReader((run / "levelled_map.csv").open()))
+    rows += csv.DictReader(_UNMAPPED.open())
     discs = np.array([(float(d["x_m"]), float(d["y_m"])) for d in rows])
     shipped = {
         frame.step.prefix.split("/")[-1].rsplit(".ppm", 1)[0]: np.array(
@@ -431,9 +470,10 @@ def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatA
         yield pose["prefix"], _images(seen, near, 4.0), shipped[pose["prefix"]]
 
 
-def _is_light(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> bool:
+def _contrast(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> float:
+    """Grey levels by which a disc (2,) is lighter than the floor."""
     [grey], _ = glance(image, camera_numbers(camera), floor_xy[None], _RADIUS)
-    return bool(np.nanmean(grey[:, 1:3]) > np.nanmean(grey[:, 5:7]))
+    return float(np.nanmean(grey[:, 1:3]) - np.nanmean(grey[:, 5:7]))
 
 
 def _read(path: Path) -> ByteArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from detect.discs.judgement import LOOKED_AT
 from detect.discs.rim import DIRECTIONS, STEPS
 from detect.discs.rim_network import OTHERS, network_inputs, network_log_odds
 from tools.evaluation import rim_network_training as training
@@ -15,7 +16,7 @@ def looks_of(count: int, seed: int) -> Looks:
     """Half of them discs, whose outer steps are darker; their features say nothing."""
     rng = np.random.default_rng(seed)
     is_disc = np.arange(count) % 2 == 0
-    grey = 120.0 + rng.normal(0.0, 8.0, (count, 2, DIRECTIONS, STEPS // 2))
+    grey = 120.0 + rng.normal(0.0, 8.0, (count, 2, DIRECTIONS, len(LOOKED_AT)))
     grey[is_disc, :, :, STEPS // 4 :] -= 40.0
     return Looks(
         rng.normal(size=(count, 3)), grey.astype(np.float32),
@@ -31,7 +32,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
     )
     rng = np.random.default_rng(2)
     shape = training.Shape(5, 4, 1, 1)
-    first = training._first_weights(STEPS // 2 + OTHERS, 3, shape, rng)
+    first = training._first_weights(len(LOOKED_AT) + OTHERS, 3, shape, rng)
     member = training._Member([w + 0.05 * rng.normal(size=w.shape) for w in first])
     d_odds = rng.normal(size=6)
     member.log_odds(batch)
@@ -55,8 +56,17 @@ def test_training_learns_and_the_detector_computes_the_same() -> None:
     odds = training.log_odds(network, unseen, every[:40])
     assert ((odds > 0.0) == unseen.is_disc).all()
     grey, scale = unseen.grey[:, 0], unseen.pixels_per_radius[:, 0].astype(float)
-    found = network_log_odds(*network_inputs(grey, scale, np.ones(40)), unseen.features, network)
+    inputs = network_inputs(grey, scale, np.ones(40), STEPS // 2)
+    found = network_log_odds(*inputs, unseen.features, network)
     assert found == pytest.approx(odds, abs=1e-3)
+
+
+def test_every_second_network_ignores_the_surroundings() -> None:
+    looks = looks_of(60, 10)
+    network = training.train(looks, np.ones(60, np.bool_), training.Shape(3, 2, 2, 1), 1)
+    away = network.around[:, :, STEPS // 2 : len(LOOKED_AT)]
+    assert (away[0] == 0.0).all()
+    assert (away[1] != 0.0).all()
 
 
 def test_a_glance_loses_few_discs() -> None:
@@ -70,12 +80,13 @@ def test_a_glance_loses_few_discs() -> None:
 def test_variations_of_looks_change_what_they_say() -> None:
     rng, looks = np.random.default_rng(7), looks_of(60, 6)
     grey, other = looks.grey[:30, 0], looks.grey[30:, 0] + 1000.0
-    hidden = training._hidden(grey, other, rng)
-    shown = (hidden == other).all(axis=2)
-    assert ((hidden == grey).all(axis=2) == ~shown).all()
-    # One sector, of a sixteenth to a quarter of the directions.
-    assert (np.count_nonzero(shown != np.roll(shown, 1, axis=1), axis=1) == 2).all()
-    assert ((shown.sum(axis=1) >= 2) & (shown.sum(axis=1) <= DIRECTIONS // 4 + 1)).all()
+    covered = training._covered(grey, other, rng)
+    changed = np.abs(covered - grey) > 1.0
+    assert (changed.mean(axis=(1, 2)) < 0.8).all()
+    # Beside what is covered or in other light, most directions are as before.
+    assert 0.2 < changed.any(axis=2).mean() < 0.7
+    nowhere = np.full_like(other, np.nan)
+    assert np.isfinite(training._covered(grey, nowhere, rng)).all()
     cut = training._cut(grey, other, rng)
     outside = np.isnan(cut)
     assert (cut[~outside] == grey[~outside]).all()
