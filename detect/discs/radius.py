@@ -1,9 +1,9 @@
 """Estimates the radius of the discs in some images by maximising their total evidence.
 
 Discs are searched for at radii that grow by a constant factor, first at every second one, then
-beside the best of these; a parabola over the logarithms of the best three radii gives the peak.
-The evidence is a log-odds (`detect.discs.judgement`) that depends on the radius of each rim, so its
-sum over the discs is a likelihood of the radius.
+beside the best of these. The evidence is a log-odds (`detect.discs.judgement`) that depends on the
+radius of each rim, so its sum over the discs is a likelihood of the radius. From the best one on,
+the median radius of the rims is followed.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from redetect.array_types import GreyImage
 SMALLEST_M, LARGEST_M = 0.02, 0.5
 FACTOR = 1.1
 LEAST_DISCS = 3  #: Least number of discs at the best radius.
+_ROUNDS = 2  #: How often the radius of the rims is taken: each is found near the radius before.
 
 
 class RadiusEstimate(NamedTuple):
@@ -65,13 +66,9 @@ def find_radius(
     for k in {max(coarse - 1, 0), min(coarse + 1, count)} - {coarse}:
         try_radius(k)
     best = best_radius()
-    shift = 0.0
-    if 0 < best < count:
-        before, here, after = evidence[best - 1 : best + 2]
-        bend = 2.0 * here - before - after
-        # Neighbours with more evidence have too few discs.
-        shift = float(np.clip(0.5 * (after - before) / bend, -0.5, 0.5)) if bend > 0.0 else 0.0
-    radius_m = float(radii[best] * FACTOR**shift)
+    radius_m = float(radii[best])
+    for _ in range(_ROUNDS):
+        radius_m *= ratio_of_radii(images, camera, replace(settings, radius_m=radius_m)) or 1.0
     # If the camera's tilt is not as calibrated, discs look some percent larger or smaller.
     sigma_m = 0.5 * radius_m * math.log(FACTOR)
     return RadiusEstimate(radius_m, sigma_m, int(discs[best]))

@@ -1,6 +1,6 @@
 """Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: 230,000 looks and 23,000 weights take half an hour. Forward and backward pass are
+Plain NumPy: 240,000 looks and 24,000 weights take forty minutes. Forward and backward pass are
 written out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter,
 Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls once.
 

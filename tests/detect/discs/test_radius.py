@@ -56,7 +56,7 @@ def test_radius_comes_back(published_camera: Camera, radius_m: float) -> None:
 
     assert found is not None
     assert found.discs == len(PLACES)
-    assert abs(found.radius_m - radius_m) < min(0.03 * radius_m, 1.5 * found.sigma_m)
+    assert abs(found.radius_m - radius_m) < 0.01 * radius_m
 
 
 def test_an_empty_floor_has_no_radius(published_camera: Camera) -> None:
@@ -76,10 +76,11 @@ def test_a_radius_with_few_discs_beside_the_best(
         return Discs({0: [0.4, 0.3, 0.3], 1: [beside / 2.0] * 2}.get(steps, []))
 
     monkeypatch.setattr("detect.discs.radius.detect_circles", found)
+    monkeypatch.setattr("detect.discs.radius.ratio_of_radii", lambda *_: None)
     blank = np.zeros((4, 4), np.uint8)
     estimate = find_radius([blank], published_camera, CircleSettings())
     assert estimate is not None
-    assert best_m <= estimate.radius_m <= best_m * FACTOR**0.5
+    assert estimate.radius_m == pytest.approx(best_m)
 
 
 @pytest.mark.parametrize(
