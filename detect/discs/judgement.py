@@ -30,6 +30,7 @@ from detect.discs.rim import (
     Rim,
     follow_rim,
     median,
+    nearest_grey,
     profiles,
     surroundings,
 )
@@ -242,7 +243,6 @@ def glance(
     count = len(floor_xy)
     grey = np.empty((count, GLANCED, len(GLANCED_AT)), np.float32)
     scale = np.empty((count, GLANCED))
-    height, width = image.shape
     step = GLANCED_AT[1] - GLANCED_AT[0]
     for i in range(count):
         x, y = floor_xy[i]
@@ -260,9 +260,7 @@ def glance(
                 if not flat:
                     off = radius * GLANCED_AT[m]
                     u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
-                u, v = u + 0.5, v + 0.5
-                inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
-                grey[i, k, m] = image[np.uint64(v), np.uint64(u)] if inside else math.nan
+                grey[i, k, m] = nearest_grey(image, u, v)
     return grey, scale
 
 

@@ -153,15 +153,20 @@ def surroundings(
 ) -> Float32Array:
     """(DIRECTIONS, len(AROUND_AT)) nearest-pixel grey values of the surroundings, as `profiles`."""
     grey = np.empty((DIRECTIONS, len(AROUND_AT)), np.float32)
-    height, width = image.shape
     for k in range(DIRECTIONS):
         for m in range(len(AROUND_AT)):
             away = radius * AROUND_AT[m]
             u, v = project_floor_point(camera_numbers, x + away * COS[k], y + away * SIN[k])
-            u, v = u + 0.5, v + 0.5
-            inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
-            grey[k, m] = image[np.uint64(v), np.uint64(u)] if inside else math.nan
+            grey[k, m] = nearest_grey(image, u, v)
     return grey
+
+
+@kernel(inline="always")
+def nearest_grey(image: GreyImage, u: float, v: float) -> float:
+    """Grey value of the pixel at (u, v); NaN outside the image."""
+    u, v = u + 0.5, v + 0.5
+    inside = 0.0 <= u < image.shape[1] and 0.0 <= v < image.shape[0]  # not if NaN
+    return float(image[np.uint64(v), np.uint64(u)]) if inside else math.nan
 
 
 @kernel()

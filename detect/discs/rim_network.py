@@ -34,7 +34,7 @@ WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 OTHERS, SCALES = 2, 2
 #: Added to the variance of the grey values, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-MOST = 6.0  #: Largest deviation, root mean squares.
+LARGEST_DEVIATION = 6.0  #: Of a grey value from the mean, root mean squares.
 #: Mean log-odds below and above which further networks are skipped.
 HOPELESS, CERTAIN = -3.0, 3.0
 
@@ -82,9 +82,9 @@ def network_inputs(
 
     Grey values are NaN outside the image. `sign` (N,) is -1 for dark discs, which are seen as light
     ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean of the values at the first
-    `near` distances relative to their root mean square, at most `MOST` of it and 0 outside the
-    image; the logarithm of the pixels per radius; the share outside.
-    Those of each look are padded by the last direction in front and the first at the end. The
+    `near` distances relative to their root mean square, at most `LARGEST_DEVIATION` and 0 outside
+    the image; the logarithm of the pixels per radius; the share outside. Those of each look are
+    padded by the last direction in front and the first at the end. The
     scales (N, SCALES) are logarithms of the pixels per radius and of the root mean square, relative
     to usual ones.
     """
@@ -113,7 +113,9 @@ def network_inputs(
             for m in range(distances):
                 value = np.float64(grey[look, k, m])
                 if value == value:
-                    inputs[m, first + k] = min(max(scale * (value - mean), -MOST), MOST)
+                    inputs[m, first + k] = min(
+                        max(scale * (value - mean), -LARGEST_DEVIATION), LARGEST_DEVIATION
+                    )
                 else:
                     outside += 1
             log_size = math.log(np.float32(pixels_per_radius[look, k])) - 1.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.rim_network import CERTAIN, HOPELESS, MOST, RimNetwork
+from detect.discs.rim_network import CERTAIN, HOPELESS, LARGEST_DEVIATION, RimNetwork
 
 FloatArray = NDArray[np.floating]
 
@@ -19,7 +19,7 @@ def inputs_of(
     off = values - np.nanmean(values[:, :near])
     deviation = np.sqrt(np.nanmean(off[:, :near] ** 2) + 9.0)
     size = np.log(pixels_per_radius) - 1.5
-    relative = np.clip(np.nan_to_num(off / deviation), -MOST, MOST)
+    relative = np.clip(np.nan_to_num(off / deviation), -LARGEST_DEVIATION, LARGEST_DEVIATION)
     inputs = np.column_stack([relative, size, outside.mean(axis=1)])
     return inputs, np.array([size.mean(), np.log(deviation) - 2.5])
 

@@ -50,8 +50,8 @@ _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
 _SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
 _FARTHEST_M = (4.0, 7.0)  #: Of discs on rendered floors, by turns.
-#: How often discs are painted into a photograph, how many, and how far apart; and into an image of
-#: a rendered building.
+#: How often discs are painted into a photograph (into an image of a rendered building: once), how
+#: many, and how far apart.
 _PHOTOGRAPH_ROUNDS, _PAINTED, _APART_M = 8, 6, 0.5
 #: Photographs that are floors of each stage, and how long an image is there.
 _PHOTOGRAPHED_FLOORS, _FLOOR_M = 4, (1.5, 5.0)

@@ -23,7 +23,15 @@ from tyro.conf import Positional
 
 from detect.discs.judgement import GLANCED_AT, LOOKED_AT
 from detect.discs.rim import AROUND_AT
-from detect.discs.rim_network import CERTAIN, HOPELESS, MOST, OTHERS, SCALES, Networks, RimNetwork
+from detect.discs.rim_network import (
+    CERTAIN,
+    HOPELESS,
+    LARGEST_DEVIATION,
+    OTHERS,
+    SCALES,
+    Networks,
+    RimNetwork,
+)
 from redetect.array_types import Float32Array
 from redetect.storage import write_whole
 from tools.evaluation.figures import Figures, Study
@@ -93,7 +101,7 @@ def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArr
     size = np.log(pixels_per_radius) - 1.5
     inputs = np.concatenate(
         [
-            np.clip(off / deviation, -MOST, MOST),
+            np.clip(off / deviation, -LARGEST_DEVIATION, LARGEST_DEVIATION),
             size[..., None],
             outside.mean(axis=-1, keepdims=True),
         ],
@@ -258,8 +266,8 @@ def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int
     rng = np.random.default_rng(seed)
     inputs, features = looks.grey.shape[-1] + OTHERS, looks.features.shape[1]
     member = _Member(_first_weights(inputs, features, shape, rng))
-    # Every second network does not see the surroundings. These reject more of what is no disc, but
-    # are learnt by heart: in a building of which nothing was used, fewer discs are found with them.
+    # Networks that see the surroundings reject more of what is no disc, but learn buildings by
+    # heart, and find fewer discs in one that was not used. So every second one does not see them.
     ignored = np.flatnonzero((_distances(looks.grey) >= AROUND_AT[0]) & (seed % 2 == 1))
     target = looks.is_disc * (1.0 - 2.0 * _SMOOTHING) + _SMOOTHING
     weight = looks.weight / looks.weight[used].mean()
