@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
-from camera import Camera
 from detect.drawing import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
-from detect.projection import leaning_camera
 from detect.row_files import KINDS, RunRows
-from detect.runs.hints import hints, some_images
+from detect.runs.hints import hints, leaning_as, some_images
 from detect.runs.outputs import depth_sentence, frames_tilt_place, lean_sentence
 from detect.runs.plan import (
     FramePlan,
@@ -33,12 +28,8 @@ from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
-from redetect.array_types import GreyImage
 from redetect.landmarks.files import read_head
 from redetect.messages import counted
-
-_FEWEST_TILTS = 4  #: Images that have to show the camera's lean for it to count in the radius.
-_LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
 def perform(command: DetectorFlags) -> int:
@@ -130,7 +121,7 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     from detect.discs.radius import find_radius
 
     images = list(some_images(run))
-    found = find_radius(images, _leaning_as(images, run.camera), settings)
+    found = find_radius(images, leaning_as(images, run.camera), settings)
     if found is None:
         raise DetectError(
             f"{len(images)} images: the radius of the discs cannot be estimated from them: "
@@ -142,23 +133,6 @@ def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
         file=sys.stderr,
     )
     return replace(settings, radius_m=round(found.radius_m, 4))
-
-
-def _leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
-    """The camera with the lean that the verticals show in most of the images.
-
-    Discs look larger or smaller to a camera that leans.
-    """
-    from detect.lines import detect_lines
-    from lut import cached_vertical_table
-
-    table = cached_vertical_table(camera)
-    tilts = [tilt for tilt in (detect_lines(image, table).tilt for image in images) if tilt]
-    if 2 * len(tilts) < len(images) or len(tilts) < _FEWEST_TILTS:
-        return camera
-    pitch, roll = np.median([(tilt.pitch_rad, tilt.roll_rad) for tilt in tilts], axis=0).tolist()
-    small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
-    return camera if small else leaning_camera(camera, (pitch, roll))
 
 
 def _output(command: DetectorFlags, run: ImageRun, kind: str) -> Path:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+
+import numpy as np
 
 from camera import Camera
 from detect.errors import DetectError, FrameError
@@ -13,7 +15,7 @@ from detect.projection import leaning_camera
 from detect.runs.plan import Job, Known, RunSummary
 from detect.settings import UNREFINED, CircleSettings
 from detect.sources.interface import Run, read_image, spread_frames
-from redetect.array_types import ByteArray
+from redetect.array_types import ByteArray, GreyImage
 from redetect.messages import counted
 
 #: Approximate number of images from which the radius of the discs is estimated.
@@ -25,8 +27,10 @@ _FEWEST_FRAMES, _FEW_DISCS, _OTHER_RADIUS = 10, 3, 0.15
 #: Other settings are worth mentioning if they find this many times as many discs.
 _MANY = 3
 #: Number of images in which the discs' size is compared with their radius, and the difference of
-#: logarithms that is reported: .06 on run e, whose camera leans by 2.5 degrees.
+#: logarithms that is reported.
 _COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
+_FEWEST_TILTS = 4  #: Images that have to show the camera's lean for it to count in the radius.
+_LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
 def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
@@ -36,6 +40,29 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
     for frame in spread_frames(run.frames, count):
         with suppress(FrameError):
             yield read_image(frame, run.camera)
+
+
+def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
+    """The camera with the lean that the verticals show in most of the images.
+
+    Discs look larger or smaller to a camera that leans.
+    """
+    from detect.lines import detect_lines
+    from lut import cached_vertical_table
+
+    table = cached_vertical_table(camera)
+    tilts = [tilt for tilt in (detect_lines(image, table).tilt for image in images) if tilt]
+    if 2 * len(tilts) < len(images) or len(tilts) < _FEWEST_TILTS:
+        return camera
+    pitch, roll = np.median([(tilt.pitch_rad, tilt.roll_rad) for tilt in tilts], axis=0).tolist()
+    small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
+    return camera if small else leaning_camera(camera, (pitch, roll))
+
+
+def _leaning(images: Sequence[GreyImage], camera: Camera, summary: RunSummary) -> Camera:
+    """The camera with the lean of the run, or that of the images."""
+    lean = summary.lean
+    return leaning_as(images, camera) if lean is None else leaning_camera(camera, lean)
 
 
 def hints(job: Job, summary: RunSummary) -> Iterator[str]:
@@ -81,16 +108,16 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     run, settings = job.run, plan.circles
     if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
         return
-    leaning = camera if summary.lean is None else leaning_camera(camera, summary.lean)
     on_discs: list[str] = []
     few = processed >= _FEWEST_FRAMES and found["discs"] < _FEW_DISCS * processed
     if few or not found["discs"]:
-        on_discs = list(_hints_on_discs(run, leaning, settings, summary))
+        on_discs = list(_hints_on_discs(run, settings, summary))
     yield from on_discs
     if not on_discs and found["discs"] >= processed >= _FEWEST_FRAMES:
         from detect.discs.radius import ratio_of_radii
 
-        ratio = ratio_of_radii(list(some_images(run, _COMPARED_IMAGES)), leaning, settings)
+        images = list(some_images(run, _COMPARED_IMAGES))
+        ratio = ratio_of_radii(images, _leaning(images, camera, summary), settings)
         if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
             yield (
                 f"the discs look {ratio:.2f} times as large as with a radius of "
@@ -100,9 +127,7 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
             )
 
 
-def _hints_on_discs(
-    run: Run, camera: Camera, settings: CircleSettings, summary: RunSummary
-) -> Iterator[str]:
+def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
     """Why a run has few discs per frame; nothing if no other settings find more."""
     from detect.discs.explanation import why_none
     from detect.discs.radius import find_radius
@@ -111,6 +136,7 @@ def _hints_on_discs(
     processed = summary.frames - summary.failed
     if not images:  # by chance, all of these failed
         return
+    camera = _leaning(images, run.camera, summary)
     in_images = f"in {len(images)} of the images"
     frames = counted(processed, "frame")
     discs = f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in {frames}. "
