@@ -35,8 +35,6 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     Body,
     FixedScanners,
     NewReadings,
-    OutlineFit,
-    OutlinePose,
     ScanSet,
     explain_set,
     new_points,
@@ -49,9 +47,20 @@ from redetect.plane import compose, invert, rotation
 # Least standard deviation of a beam's readings (m); a reading is new if it is this many of them
 # nearer than the beam's nearest object, which is at this quantile of its readings.
 _LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
-# Steps of the refinement, and largest chi2 per degree of freedom of an acquired robot.
-_STEPS = 8
-_LARGEST_CHI2 = 4.0
+#: Least number of readings for a pose.
+LEAST_READINGS = 8
+#: The ICP ends after this number of steps.
+MOST_STEPS = 60
+# Least number of readings for finding the robot, and largest chi2 per degree of freedom then.
+_ACQUIRED_READINGS, _LARGEST_CHI2 = 16, 4.0
+# Number of headings from which the search begins.
+_HEADINGS = 24
+# New readings closer together than this may belong to one object.
+_LINK_M = 0.3
+# Least share of agreeing beams among those that should see the robot, or see something beside.
+_LEAST_AGREEMENT = 0.75
+# Tolerance of the outline's symmetry under rotation.
+_SYMMETRY_M = 0.12
 
 
 class Background(NamedTuple):
@@ -264,28 +273,13 @@ def _divides(face: FloatArray, other: FloatArray) -> bool:
     return bool(sides[0] * sides[1] < 0.0)
 
 
-def refine(
-    seen: NewReadings, start: FloatArray, fixed: FixedScanners, body: Body,
-    settings: LaserSettings, prior_m: float,
-) -> OutlinePose:  # fmt: skip
-    """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
-    s = settings
-    fit = OutlineFit(
-        s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
-        _STEPS,
-    )  # fmt: skip
-    return refine_outline(seen, body.faces, start, fixed.origins, fixed.sigmas_m, fit)
-
-
-def robot_body(
-    outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m, outward_m: float = 0.0
-) -> Body:
+def robot_body(outline: ArrayLike, outward_m: float = 0.0) -> Body:
     """Prepare an outline (k, 2), moved outward; raises `GroundTruthError` if it is not valid."""
     faces = outline_faces(outline, outward_m)
     corners = faces[:, :2]
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     radius = float(np.max(np.hypot(*(corners - middle).T)))
-    return Body(faces, middle, radius, outline_symmetries(faces, symmetry_m))
+    return Body(faces, face_normals(faces), middle, radius, outline_symmetries(faces, _SYMMETRY_M))
 
 
 def acquire(
@@ -300,12 +294,12 @@ def acquire(
     one of the equivalent poses.
     """
     seen = new_points(scans, fixed, np.zeros(2), math.inf, np.zeros(5))
-    if len(seen.points) < settings.acquire_readings:
+    if len(seen.points) < _ACQUIRED_READINGS:
         return None
     found: list[tuple[float, FloatArray]] = []
-    for place in _places(seen.points, body, settings):
+    for place in _places(seen.points, body.radius_m):
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
-        if np.count_nonzero(near) >= settings.acquire_readings:
+        if np.count_nonzero(near) >= _ACQUIRED_READINGS:
             found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
@@ -315,22 +309,22 @@ def acquire(
     return pose
 
 
-def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
+def _places(points: FloatArray, radius_m: float) -> list[FloatArray]:
     """Possible centres of the robot: the centres of clusters, and of parts of large clusters."""
-    label = fclusterdata(points, settings.link_m, criterion="distance", method="single")
+    label = fclusterdata(points, _LINK_M, criterion="distance", method="single")
     places: list[FloatArray] = []
     for k in np.unique(label):
         cluster = points[label == k]
-        if len(cluster) < settings.least_readings:
+        if len(cluster) < LEAST_READINGS:
             continue
         low, high = cluster.min(axis=0), cluster.max(axis=0)
-        if math.hypot(*(high - low)) <= 2.2 * body.radius_m:
+        if math.hypot(*(high - low)) <= 2.2 * radius_m:
             places.append(0.5 * (low + high))
             continue
-        cell = np.floor((cluster - low) / body.radius_m).astype(np.int64)
+        cell = np.floor((cluster - low) / radius_m).astype(np.int64)
         for corner in np.unique(cell, axis=0):
             part = cluster[np.max(np.abs(cell - corner), axis=1) <= 1]
-            if len(part) >= settings.least_readings:
+            if len(part) >= LEAST_READINGS:
                 places.append(np.asarray(part.mean(axis=0)))
     return places
 
@@ -342,23 +336,23 @@ def _search(
     """Poses that explain the beams, with a score: beams that agree less those that disagree."""
     found: list[tuple[float, FloatArray]] = []
     tried: list[FloatArray] = []
-    for k in range(settings.headings):
-        theta = 2.0 * math.pi * k / settings.headings
+    for k in range(_HEADINGS):
+        theta = 2.0 * math.pi * k / _HEADINGS
         start = np.array([*(place - rotation(theta) @ body.middle), theta])
         pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
         pose, _, count = fit_outline(
-            seen.points, body.faces, pose, settings.gate_m, settings.keep, 1e-4, settings.most_steps
+            seen.points, body.faces, pose, settings.gate_m, settings.keep, 1e-4, MOST_STEPS
         )
-        if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
+        if count < _ACQUIRED_READINGS or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
-        refined = refine(seen, pose, fixed, body, settings, 0.1)
-        if refined.used < settings.acquire_readings or refined.open_directions:
+        refined = refine_outline(seen, body, pose, fixed, settings.gate_m, 0.1)
+        if refined.used < _ACQUIRED_READINGS or refined.open_directions:
             continue
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
         _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
-        if agree >= settings.least_agreement * (agree + through + hidden + beside):
+        if agree >= _LEAST_AGREEMENT * (agree + through + hidden + beside):
             found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 
