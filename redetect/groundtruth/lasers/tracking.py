@@ -23,9 +23,9 @@ from redetect.groundtruth.lasers.acquisition import (
     MOST_STEPS,
     ScanSets,
     acquire,
-    robot_body,
 )
 from redetect.groundtruth.lasers.icp import fit_outline, nearest_on_segments
+from redetect.groundtruth.lasers.outline import robot_body
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking_kernels import (
     GATE_SIGMA,

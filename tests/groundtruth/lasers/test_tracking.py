@@ -16,10 +16,10 @@ from redetect.groundtruth.lasers.acquisition import (
     ScanSets,
     acquire,
     fixed_scanners,
-    robot_body,
     sets_of_scans,
 )
 from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import robot_body
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.lasers.tracking import (
     SetStatus,
