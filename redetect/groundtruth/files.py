@@ -8,7 +8,7 @@ import json
 import os
 import re
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -134,6 +134,22 @@ class JsonObject:
         if np.linalg.eigvalsh(correlation)[0] < -_ROUNDING:
             raise GroundTruthError(f"{place}: has a negative eigenvalue: expected a covariance")
         return np.asarray(0.5 * (matrix + matrix.T))
+
+    def joint_covariance(self, key: str, names: Sequence[str], size: int) -> FloatArray:
+        """(size N, size N) covariance of all N `names`, in their order: the object `covariance`,
+        which lists them, in any order, as `key` beside its matrix.
+        """
+        joint = self.values.get("covariance")
+        if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
+            raise self.wrong("covariance", f"an object with {key} and matrix")
+        place, order = f"{self.place}: covariance", [str(name) for name in joint[key]]
+        if sorted(order) != sorted(names):
+            raise GroundTruthError(
+                f"{place}: {key} are {excerpt(order)}: expected {excerpt(list(names))}"
+            )
+        matrix = JsonObject(place, joint).covariance("matrix", size * len(names))
+        index = np.concatenate([size * order.index(name) + np.arange(size) for name in names])
+        return np.asarray(matrix[np.ix_(index, index)])
 
     def uncertainty(self, size: int, sigmas: str = "sigmas") -> FloatArray:
         """(size, size) covariance by `covariance`, or by standard deviations, named by `sigmas`, in

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 from math import inf
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from redetect.bounds import (
     PROBABILITY,
@@ -100,39 +100,6 @@ class LaserSettings(Bounded, error=GroundTruthError):
 
     gate_m: Positive = 0.2  # Largest distance of a reading from the robot's outline (m).
     keep: ShareAbove0 = 0.95  # Share of the readings within the gate that the ICP uses: the best.
-
-    # The ICP ends when its root mean square error changes by less, or after this number of steps.
-    threshold_m: ClassVar[float] = 1e-5
-    most_steps: ClassVar[int] = 60
-    # Standard deviation of a reading's distance from the outline in addition to the scanner's
-    # noise: the outline is drawn to millimetres.
-    floor_m: ClassVar[float] = 0.001
-    # Lower bound of the cosine between beam and normal: readings along a face are close to it
-    # whatever the pose.
-    least_slope: ClassVar[float] = 0.35
-    # The final pose uses readings up to this many standard deviations off.
-    gate_sigma: ClassVar[float] = 3.5
-    # A direction is undetermined if the pose's standard deviation along it is larger (a turn is
-    # measured at the farthest corner).
-    weak_sigma_m: ClassVar[float] = 0.03
-    # Least number of readings for a pose, and for finding the robot again.
-    least_readings: ClassVar[int] = 8
-    acquire_readings: ClassVar[int] = 16
-    # The robot is lost after this time without a pose, and then searched for at this interval.
-    coast_s: ClassVar[float] = 0.25
-    acquire_s: ClassVar[float] = 0.05
-    # Number of headings from which the search begins.
-    headings: ClassVar[int] = 24
-    # New readings closer together than this may belong to one object.
-    link_m: ClassVar[float] = 0.3
-    # Least share of agreeing beams among those that should see the robot, or see something beside.
-    least_agreement: ClassVar[float] = 0.75
-    # Tolerance of the outline's symmetry under rotation.
-    symmetry_m: ClassVar[float] = 0.12
-    # The readings identify the front if the residuals differ by this many standard errors;
-    # otherwise it is known after the robot has driven this much farther forward than backward.
-    front_sigma: ClassVar[float] = 5.0
-    forward_m: ClassVar[float] = 0.3
 
 
 @dataclass(frozen=True)

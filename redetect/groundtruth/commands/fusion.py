@@ -13,14 +13,7 @@ import numpy as np
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.fusion import stream_errors
-from redetect.groundtruth.fusion.clock import (
-    ClockModel,
-    ClockSegment,
-    compare_with_ptpd,
-    read_clock,
-    read_ptpd,
-)
+from redetect.groundtruth.fusion import clock, stream_errors
 from redetect.groundtruth.fusion.fuse import Fusion, LeftOut, fuse, leave_out
 from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.options import Fuse, Sync
@@ -40,7 +33,7 @@ def perform_sync(options: Sync) -> int:
     check_outputs([options.output], options.force)
     odometry = read_planar_poses(options.odometry)
     truth = read_planar_poses(options.groundtruth)
-    log = None if options.ptpd is None else read_ptpd(options.ptpd)
+    log = None if options.ptpd is None else clock.read_ptpd(options.ptpd)
     segments = synchronise(odometry, truth, options.settings)
     for segment in segments:
         print(_line(segment))
@@ -52,7 +45,7 @@ def perform_sync(options: Sync) -> int:
         "segments": segments,
     }
     if log is not None:
-        document["ptpd"] = compare_with_ptpd(ClockModel(segments), log)
+        document["ptpd"] = clock.compare_with_ptpd(clock.ClockModel(segments), log)
         rms, inside = (document["ptpd"][k] for k in ("rms_difference_s", "reports_in_segments"))
         print(
             f"ptpd: {len(log.offset_s)} reports, {inside} compared, "
@@ -62,7 +55,7 @@ def perform_sync(options: Sync) -> int:
     return 0
 
 
-def _line(segment: ClockSegment) -> str:
+def _line(segment: clock.ClockSegment) -> str:
     head = f"{segment.from_s:.2f} .. {segment.to_s:.2f} s: "
     if not segment.is_determined:
         return head + f"cannot be synchronised: {segment.note}"
@@ -88,7 +81,7 @@ def perform_fuse(options: Fuse) -> int:
     settings = options.settings
     odometry = read_planar_poses(options.odometry)
     if options.clock is not None:
-        times = read_clock(options.clock).groundtruth_times(odometry.times_s)
+        times = clock.read_clock(options.clock).groundtruth_times(odometry.times_s)
         odometry = PlanarPoses(times, odometry.poses)
     streams = {name: read_planar_poses(path) for name, path in files.items()}
     for name, stream in streams.items():

@@ -9,26 +9,24 @@ from typing import Any
 from redetect.groundtruth.commands.outputs import check_outputs
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.options import Score
-from redetect.groundtruth.trajectories.streams import (
-    matched_streams,
-    moved_poses,
-    planar_alignment,
-    read_planar_poses,
-)
+from redetect.groundtruth.trajectories import streams
 from redetect.groundtruth.validation import scoring
 
 
 def perform(command: Score) -> int:
     """Carry out ``groundtruth score``; returns the exit code."""
     check_outputs((command.json,), command.force)
-    solution, truth = read_planar_poses(command.poses), read_planar_poses(command.truth)
+    solution, truth = (
+        streams.read_planar_poses(command.poses),
+        streams.read_planar_poses(command.truth),
+    )
     relations = None if command.relations is None else scoring.read_relations(command.relations)
-    poses, truth, unmatched = matched_streams(
+    poses, truth, unmatched = streams.matched_streams(
         solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
     )
-    alignment = planar_alignment(poses, truth) if command.align else None
+    alignment = streams.planar_alignment(poses, truth) if command.align else None
     if alignment is not None:
-        poses = moved_poses(poses, alignment)
+        poses = streams.moved_poses(poses, alignment)
     score = scoring.score_poses(poses, truth, unmatched)
     print(f"poses              {score.poses} ({score.unmatched} without the other at their time)")
     print(*score.lines(), sep="\n")

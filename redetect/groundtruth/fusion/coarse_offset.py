@@ -54,15 +54,14 @@ class Movements:
         first = int(np.floor(poses.times_s[0] / _STEP_S))
         middle = _STEP_S * np.arange(first, int(np.ceil(poses.times_s[-1] / _STEP_S)) + 1)
         longest = max(_LONGEST_GAP_S, _INTERVALS * float(np.median(np.diff(poses.times_s))))
-        columns = (*poses.poses[:, :2].T, np.unwrap(poses.poses[:, 2]))
         ends, known = [], np.ones(len(middle), dtype=np.bool_)
         for times in (middle - 0.5 * _WINDOW_S, middle + 0.5 * _WINDOW_S):
             at = np.clip(np.searchsorted(poses.times_s, times), 1, len(poses) - 1)
             known &= poses.times_s[at] - poses.times_s[at - 1] <= longest
             known &= (times >= poses.times_s[0]) & (times <= poses.times_s[-1])
-            ends.append([np.interp(times, poses.times_s, values) for values in columns])
+            ends.append([np.interp(times, poses.times_s, values) for values in poses.continuous.T])
         dx, dy, turn = np.array(ends[1]) - np.array(ends[0])
-        x, y, heading = (roughness(values) for values in columns)
+        x, y, heading = roughness(poses)
         noise = 2.0 * np.array([heading**2, 0.5 * (x**2 + y**2)])
         return cls(first, np.column_stack([turn, np.hypot(dx, dy)]), known, noise)
 

@@ -363,37 +363,17 @@ def smooth_backward(history: FilterHistory) -> tuple[FloatArray, FloatArray]:
     reached = history.transitions[1:] @ history.filtered_covariance[:-1]
     gains = np.linalg.solve(expected, reached).swapaxes(1, 2)
     states, covariances = history.filtered.copy(), history.filtered_covariance.copy()
-    _smooth_in_place(
-        states, covariances, np.ascontiguousarray(gains), history.predicted,
-        history.predicted_covariance,
-    )  # fmt: skip
+    _smooth_in_place(states, covariances, np.ascontiguousarray(gains), history)
     return states, covariances
 
 
 @kernel()
 def _smooth_in_place(
-    states: FloatArray,
-    covariances: FloatArray,
-    gains: FloatArray,
-    predicted: FloatArray,
-    predicted_covariance: FloatArray,
+    states: FloatArray, covariances: FloatArray, gains: FloatArray, history: FilterHistory
 ) -> None:
     """Replace filtered states and covariances by smoothed ones, in place; `gains` (N - 1, d, d)."""
-    count, size = states.shape
-    change = np.empty((size, size))
-    for k in range(count - 2, -1, -1):
-        gain = gains[k]
-        for i in range(size):
-            for j in range(size):
-                states[k, i] += gain[i, j] * (states[k + 1, j] - predicted[k + 1, j])
-                total = 0.0
-                for n in range(size):
-                    off = covariances[k + 1, n, j] - predicted_covariance[k + 1, n, j]
-                    total += gain[i, n] * off
-                change[i, j] = total
-        for i in range(size):
-            for j in range(i + 1):
-                total = covariances[k, i, j]
-                for n in range(size):
-                    total += change[i, n] * gain[j, n]
-                covariances[k, i, j] = covariances[k, j, i] = total
+    for k in range(len(gains) - 1, -1, -1):
+        state, covariance, gain = states[k], covariances[k], gains[k]
+        state += gain @ (states[k + 1] - history.predicted[k + 1])
+        change = covariances[k + 1] - history.predicted_covariance[k + 1]
+        covariance += gain @ change @ gain.T

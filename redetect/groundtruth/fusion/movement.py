@@ -78,6 +78,29 @@ class Smoothed(NamedTuple):
     slips: FloatArray  # (N, 3): variances of movements that were added where odometry slipped
 
 
+def _follow_from_end(
+    smoothed: Smoothed, odometry: kernels.Odometry, begin: int, carried: bool
+) -> None:
+    """In the second half of a gap that was cut, follow odometry from the measurements after it.
+
+    In place; `odometry` is that of the gap's nodes from `begin` on. A robot that was `carried` in
+    the gap may have been anywhere along its path then, so covariances include the other end's path
+    as a possibility.
+    """
+    count = len(odometry.controls)
+    states, covariances = (v[begin : begin + count] for v in smoothed[:2])
+    back, spreads = predicted_backward(odometry, states[-1], covariances[-1])
+    way = np.cumsum(np.hypot(odometry.controls[:, 0], odometry.controls[:, 1]))
+    way -= way[0]
+    half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
+    apart = pose_differences(back[1:-1, : kernels.POSE], states[1:-1, : kernels.POSE])
+    states[half:-1], covariances[half:-1] = back[half:-1], spreads[half:-1]
+    if carried:
+        share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
+        other = share[:, None, None] * apart[:, :, None] * apart[:, None]
+        covariances[1:-1, : kernels.POSE, : kernels.POSE] += other
+
+
 @dataclass(frozen=True, eq=False)
 class MovementProblem:
     """Odometry and measured poses on common nodes, independent of odometry's random errors."""
@@ -175,13 +198,7 @@ class MovementProblem:
         slips = slip_variances(self, variances)
         variances += slips
         history = kernels.empty_history(len(self.times_s))
-        cuts = np.zeros(len(self.times_s), dtype=np.bool_)
-        while True:
-            innovations = self.forward(variances, cuts=cuts, history=history)
-            unfit = self._ends_that_did_not_fit(innovations)
-            if not unfit:
-                break
-            cuts[unfit] = True
+        innovations, carried = self._filtered_with_cuts(variances, history)
         states, covariances = kernels.smooth_backward(history)
         good = nodes[innovations.accepted]
         # The nodes of the last measurement before and the first one after each gap that was cut.
@@ -189,7 +206,7 @@ class MovementProblem:
             (int(good[np.searchsorted(good, end) - 1]), int(end))
             for end in np.flatnonzero(innovations.restarted == kernels.WHERE_LOST)
         ]
-        carried = cuts.copy()
+        cuts = carried.copy()
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):
             before = states
@@ -197,24 +214,23 @@ class MovementProblem:
             states, covariances = kernels.smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
-        # The second half of a gap that was cut follows odometry from the measurements after it.
+        smoothed = Smoothed(states, covariances, innovations, slips)
         for begin, end in gaps:
-            gap, inner = slice(begin, end + 1), slice(begin + 1, end)
-            odometry = kernels.Odometry(self.controls[gap], variances[gap])
-            back, spreads = predicted_backward(odometry, states[end], covariances[end])
-            way = np.cumsum(np.hypot(self.controls[gap, 0], self.controls[gap, 1]))
-            way -= way[0]
-            half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
-            apart = pose_differences(back[1:-1, : kernels.POSE], states[inner, : kernels.POSE])
-            states[begin + half : end] = back[half:-1]
-            covariances[begin + half : end] = spreads[half:-1]
-            # A robot that was carried in the gap may have been anywhere along its path then, so
-            # covariances include the other end's path as a possibility.
-            if carried[end]:
-                share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
-                other = share[:, None, None] * apart[:, :, None] * apart[:, None]
-                covariances[inner, : kernels.POSE, : kernels.POSE] += other
-        return Smoothed(states, covariances, innovations, slips)
+            odometry = kernels.Odometry(self.controls[begin : end + 1], variances[begin : end + 1])
+            _follow_from_end(smoothed, odometry, begin, bool(carried[end]))
+        return smoothed
+
+    def _filtered_with_cuts(
+        self, variances: FloatArray, history: kernels.FilterHistory
+    ) -> tuple[kernels.Innovations, BoolArray]:
+        """Filter forward, and at which nodes (N,) the robot was carried: the path is cut there."""
+        carried = np.zeros(len(self.times_s), dtype=np.bool_)
+        while True:
+            innovations = self.forward(variances, cuts=carried, history=history)
+            unfit = self._ends_that_did_not_fit(innovations)
+            if not unfit:
+                return innovations, carried
+            carried[unfit] = True
 
     def _ends_that_did_not_fit(self, innovations: kernels.Innovations) -> list[int]:
         """Nodes after gaps at which the rejections began that made the filter restart."""

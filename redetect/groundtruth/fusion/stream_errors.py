@@ -36,13 +36,13 @@ _NEGLIGIBLE = 0.05
 _LEAST_OWN = 0.02
 
 
-def roughness(values: FloatArray) -> float:
-    """Standard deviation of the noise of values (N,), in their unit, from third differences."""
-    third = np.diff(values, 3)
+def roughness(poses: PlanarPoses) -> FloatArray:
+    """(3,) standard deviations of the noise of x, y and the heading, from third differences."""
+    third = np.diff(poses.continuous, 3, axis=0)
     if not len(third):
-        return 0.0
+        return np.zeros(3)
     # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
-    return float(np.median(np.abs(third)) / _MEDIAN_OF_NORMAL / np.sqrt(20.0))
+    return np.asarray(np.median(np.abs(third), axis=0) / _MEDIAN_OF_NORMAL / np.sqrt(20.0))
 
 
 def jitter_ratio(poses: PlanarPoses) -> float:
@@ -59,10 +59,10 @@ def jitter_ratio(poses: PlanarPoses) -> float:
     if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
         return 0.0
     weights = np.array([comb(_ORDER, k) for k in range(_ORDER + 1)], dtype=np.float64)
-    values = np.column_stack([poses.poses[:, :2], np.unwrap(poses.poses[:, 2])])
     variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
     expected = sum(w**2 * variances[k : k + count] for k, w in enumerate(weights))
-    normalised = np.abs(np.diff(values, _ORDER, axis=0)) / np.sqrt(np.maximum(expected, 1e-18))
+    normalised = np.abs(np.diff(poses.continuous, _ORDER, axis=0))
+    normalised /= np.sqrt(np.maximum(expected, 1e-18))
     return float(np.max(np.median(normalised[counted], axis=0)) / _MEDIAN_OF_NORMAL)
 
 

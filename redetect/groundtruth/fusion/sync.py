@@ -35,7 +35,6 @@ from redetect.groundtruth.trajectories.streams import (
 )
 
 _FEWEST_SAMPLES = 20
-_MOST_SAMPLES = 400
 # Deviation of a position that was not measured (m).
 _UNKNOWN_M = 1e4
 _LEAST_WAY_M = 1.0
@@ -154,9 +153,9 @@ def _segment(
 
     `start_s`: an offset from which the refinement by whole poses also starts.
     """
-    headings = np.unwrap(segment.poses[:, 2])
     # Means of ten, with less noise.
-    means = [part.mean() for part in np.array_split(headings, max(len(segment) // 10, 1))]
+    tens = np.array_split(segment.continuous[:, 2], max(len(segment) // 10, 1))
+    means = [part.mean() for part in tens]
     turned = float(np.sum(np.abs(np.diff(means))))
     reach = bounds.largest_offset_s + bounds.largest_drift * float(np.ptp(segment.times_s))
     near = odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
@@ -167,23 +166,10 @@ def _segment(
     measured = segment.only(segment.during(own.times_s[0] + reach, own.times_s[-1] - reach))
     if len(measured) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
-    # By maximum likelihood of headings, and of whole poses.
-    reference_s, start = float(np.mean(measured.times_s)), np.array([start_s, 0.0])
     jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
-    headings_alone = with_common(jittered, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]))
-    best = _most_likely_clock(own, headings_alone, reference_s, start, bounds)
-    if best is None or not best.sigmas[0] < _LEAST_DETERMINED * bounds.largest_offset_s:
+    best = _fit_of_segment(own, jittered, start_s, bounds, measured.covariances is not None)
+    if best is None:
         return [_undetermined(segment, turned, "turns too little to determine the offset")]
-    driven = np.sum(np.hypot(*np.diff(own.poses[:, :2], axis=0).T))
-    if measured.covariances is not None and driven >= _LEAST_WAY_M:
-        # Headings of a robot that hardly turns are a poor start.
-        far = abs(start_s - best.clock[0]) > _ANOTHER_START_S
-        starts = [best.clock, start] if far else [best.clock]
-        fits = [_most_likely_clock(own, jittered, reference_s, at, bounds) for at in starts]
-        maxima = [fit for fit in fits if fit is not None]
-        moving = min(maxima, key=lambda fit: fit.deviance, default=best)
-        if moving.uncertainty(measured) < best.uncertainty(measured):
-            best = moving
     # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, bounds) if jumps_left > 0 else None
     if place is not None:
@@ -192,9 +178,10 @@ def _segment(
             parts += _segment(odometry, segment.only(which), bounds, start_s, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
+    reference_s = float(np.mean(measured.times_s))
     offset_s, drift = best.clock.tolist()
     times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
-    angles = measured.poses[:, 2] - np.interp(times_s, own.times_s, np.unwrap(own.poses[:, 2]))
+    angles = measured.poses[:, 2] - np.interp(times_s, own.times_s, own.continuous[:, 2])
     at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
     return [
         ClockSegment(
@@ -210,6 +197,31 @@ def _segment(
             status=ClockStatus.AT_A_BOUND if at_bound else ClockStatus.OK,
         )
     ]
+
+
+def _fit_of_segment(
+    odometry: PlanarPoses, measured: PlanarPoses, start_s: float, bounds: SyncSettings, whole: bool
+) -> ClockFit | None:
+    """The more certain of the clocks by headings alone and by whole poses, if these are known.
+
+    None if turns do not determine the offset.
+    """
+    start = np.array([start_s, 0.0])
+    headings_alone = with_common(measured, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]))
+    by_headings = _most_likely_clock(odometry, headings_alone, start, bounds)
+    least = _LEAST_DETERMINED * bounds.largest_offset_s
+    if by_headings is None or not by_headings.sigmas[0] < least:
+        return None
+    driven = np.sum(np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T))
+    if not whole or driven < _LEAST_WAY_M:
+        return by_headings
+    # Headings of a robot that hardly turns are a poor start.
+    far = abs(start_s - by_headings.clock[0]) > _ANOTHER_START_S
+    starts = [by_headings.clock, start] if far else [by_headings.clock]
+    fits = [_most_likely_clock(odometry, measured, at, bounds) for at in starts]
+    maxima = [fit for fit in fits if fit is not None]
+    by_poses = min(maxima, key=lambda fit: fit.deviance, default=by_headings)
+    return min((by_headings, by_poses), key=lambda fit: fit.uncertainty(measured))
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
@@ -244,10 +256,10 @@ class ClockFit(NamedTuple):
 
 
 def _most_likely_clock(
-    odometry: PlanarPoses, measured: PlanarPoses, reference_s: float, start: FloatArray,
-    bounds: SyncSettings,
-) -> ClockFit | None:  # fmt: skip
+    odometry: PlanarPoses, measured: PlanarPoses, start: FloatArray, bounds: SyncSettings
+) -> ClockFit | None:
     """The most likely clock near a start and within the bounds; None without a maximum."""
+    reference_s = float(np.mean(measured.times_s))
     largest = np.array(bounds.largest)
     half = 0.5 * float(np.ptp(measured.times_s))
 
@@ -347,12 +359,11 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
     """
     covariances = measured.covariances
     if covariances is None:
-        covariances = np.diag([0.0, 0.0, roughness(np.unwrap(measured.poses[:, 2])) ** 2])
-    columns = (*odometry.poses[:, :2].T, np.unwrap(odometry.poses[:, 2]))
-    jitter = np.array([roughness(values) for values in columns])
+        covariances = np.diag([0.0, 0.0, roughness(measured)[2] ** 2])
     # Between two samples odometry's path is unknown by the sag of what it bends.
-    sag = np.array([np.sqrt(np.mean(np.square(np.diff(values, 2)))) / 8.0 for values in columns])
-    own = np.tile(np.diag(jitter**2 + sag**2 + rounding**2), (len(measured), 1, 1))
+    sag = np.sqrt(np.mean(np.square(np.diff(odometry.continuous, 2, axis=0)), axis=0)) / 8.0
+    variances = roughness(odometry) ** 2 + sag**2 + rounding**2
+    own = np.tile(np.diag(variances), (len(measured), 1, 1))
     return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 
 
@@ -364,8 +375,7 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     """
     # Relative to the first one, since sums of times since 1970 lose digits.
     begin_s = odometry.times_s[0]
-    columns = np.column_stack([odometry.times_s - begin_s, odometry.poses])
-    columns[:, 3] = np.unwrap(columns[:, 3])
+    columns = np.column_stack([odometry.times_s - begin_s, odometry.continuous])
     interval_s = float(np.median(np.diff(odometry.times_s)))
     aside = min(_SMOOTHED_SAMPLES, int(_SMOOTHED_S / interval_s)) // 2
     means = uniform_filter1d(columns, 1 + 2 * aside, axis=0)

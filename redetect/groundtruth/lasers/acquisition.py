@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fclusterdata
 from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.icp import face_normals, fit_outline, moved, nearest_on_segments
+from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
@@ -35,8 +35,6 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     Body,
     FixedScanners,
     NewReadings,
-    OutlineFit,
-    OutlinePose,
     ScanSet,
     explain_set,
     new_points,
@@ -44,14 +42,23 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 )
 from redetect.groundtruth.settings import LaserSettings
 from redetect.landmarks import wrap_angle
-from redetect.plane import compose, invert, rotation
+from redetect.plane import compose, rotation
 
 # Least standard deviation of a beam's readings (m); a reading is new if it is this many of them
 # nearer than the beam's nearest object, which is at this quantile of its readings.
 _LEAST_SIGMA_M, _MARGIN_SIGMA, _PASSING = 0.005, 5.0, 0.02
-# Steps of the refinement, and largest chi2 per degree of freedom of an acquired robot.
-_STEPS = 8
-_LARGEST_CHI2 = 4.0
+#: Least number of readings for a pose.
+LEAST_READINGS = 8
+#: The ICP ends after this number of steps.
+MOST_STEPS = 60
+# Least number of readings for finding the robot, and largest chi2 per degree of freedom then.
+_ACQUIRED_READINGS, _LARGEST_CHI2 = 16, 4.0
+# Number of headings from which the search begins.
+_HEADINGS = 24
+# New readings closer together than this may belong to one object.
+_LINK_M = 0.3
+# Least share of agreeing beams among those that should see the robot, or see something beside.
+_LEAST_AGREEMENT = 0.75
 
 
 class Background(NamedTuple):
@@ -190,104 +197,6 @@ def load_session(
     return scanners, robot, fixed, sets_of_scans(scans)
 
 
-def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
-    """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
-
-    `outline`: corners (k, 2) in order, in either direction (m); `outward_m`: by how much all faces
-    are moved. Raises `GroundTruthError` if corners coincide, faces cross, or there is no area.
-    """
-    corners = np.asarray(outline, dtype=np.float64)
-    following = np.roll(corners, -1, axis=0)
-    if np.any(np.hypot(*(following - corners).T) < 1e-6):
-        raise GroundTruthError("outline: two consecutive corners are the same")
-    area = 0.5 * float(np.sum(corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]))
-    if abs(area) < 1e-6:
-        raise GroundTruthError(f"outline: encloses {abs(area):g} m2")
-    if area < 0.0:
-        corners = corners[::-1]
-    normals = face_normals(np.hstack([corners, np.roll(corners, -1, axis=0)]))
-    before = np.roll(normals, 1, axis=0)
-    shared = 1.0 + np.sum(normals * before, axis=1, keepdims=True)
-    corners = corners + outward_m * (normals + before) / shared
-    faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
-    for i in range(len(faces)):
-        for j in range(i + 2, len(faces) - (i == 0)):
-            if _divides(faces[i], faces[j]) and _divides(faces[j], faces[i]):
-                raise GroundTruthError(f"outline: faces {i + 1} and {j + 1} cross")
-    return faces
-
-
-def outline_symmetries(faces: FloatArray, tolerance_m: float = 0.015) -> FloatArray:
-    """Motions (s, 3) but the identity that map the outline onto itself, in order of theta from -pi.
-
-    A robot of which only the outline is seen may be at `pose` or at `compose(pose, symmetry)`. s is
-    0 for an outline without symmetries, 1 for a box, 3 for a square. No point of the turned outline
-    is farther from the outline than the tolerance.
-    """
-    along = np.linspace(0.0, 1.0, 40, endpoint=False)[None, :, None]
-    points = (faces[:, None, :2] + along * (faces[:, None, 2:] - faces[:, None, :2])).reshape(-1, 2)
-    points = np.ascontiguousarray(points)
-    # A symmetry keeps the centroid in place.
-    x1, y1, x2, y2 = faces.T
-    twice = x1 * y2 - x2 * y1
-    centre = np.array([np.sum((x1 + x2) * twice), np.sum((y1 + y2) * twice)]) / 3.0 / twice.sum()
-    angles = [math.radians(degrees) for degrees in range(-180, 180, 3)]
-    poses = [np.array([*(centre - rotation(angle) @ centre), angle]) for angle in angles]
-    errors = [_farthest_m(points, faces, pose) for pose in poses]
-    found: list[FloatArray] = []
-    for i, error in enumerate(errors):
-        if poses[i][2] == 0.0 or error > min(errors[i - 1], errors[(i + 1) % len(errors)]):
-            continue
-        # Refined by an ICP of the whole outline to itself.
-        pose = invert(fit_outline(points, faces, invert(poses[i]), np.inf, 1.0, 0.0, 200)[0])
-        pose[2] = _turn(pose[2])
-        far = all(abs(_turn(pose[2] - k[2])) > 0.2 for k in [np.zeros(3), *found])
-        if far and _farthest_m(points, faces, pose) <= tolerance_m:
-            found.append(pose)
-    return np.array(sorted(found, key=lambda p: p[2])).reshape(-1, 3)
-
-
-def _farthest_m(points: FloatArray, faces: FloatArray, pose: FloatArray) -> float:
-    _, _, squared = nearest_on_segments(moved(points, pose), faces)
-    return math.sqrt(float(squared.max()))
-
-
-def _turn(angle: float) -> float:
-    """An angle wrapped to [-pi, pi); -pi also if rounding made it slightly less than pi."""
-    return (angle + math.pi + 1e-9) % (2.0 * math.pi) - math.pi - 1e-9
-
-
-def _divides(face: FloatArray, other: FloatArray) -> bool:
-    """Whether the ends of another face are on both sides of the line through a face."""
-    (x, y), (ex, ey) = face[:2], face[2:] - face[:2]
-    sides = ex * (other[1::2] - y) - ey * (other[::2] - x)
-    return bool(sides[0] * sides[1] < 0.0)
-
-
-def refine(
-    seen: NewReadings, start: FloatArray, fixed: FixedScanners, body: Body,
-    settings: LaserSettings, prior_m: float,
-) -> OutlinePose:  # fmt: skip
-    """Most likely pose near a start; undetermined directions are held by a prior `prior_m`."""
-    s = settings
-    fit = OutlineFit(
-        s.floor_m, s.least_slope, s.gate_sigma, s.gate_m, prior_m, s.weak_sigma_m, body.radius_m,
-        _STEPS,
-    )  # fmt: skip
-    return refine_outline(seen, body.faces, start, fixed.origins, fixed.sigmas_m, fit)
-
-
-def robot_body(
-    outline: ArrayLike, symmetry_m: float = LaserSettings().symmetry_m, outward_m: float = 0.0
-) -> Body:
-    """Prepare an outline (k, 2), moved outward; raises `GroundTruthError` if it is not valid."""
-    faces = outline_faces(outline, outward_m)
-    corners = faces[:, :2]
-    middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    radius = float(np.max(np.hypot(*(corners - middle).T)))
-    return Body(faces, middle, radius, outline_symmetries(faces, symmetry_m))
-
-
 def acquire(
     scans: ScanSet, fixed: FixedScanners, body: Body, settings: LaserSettings
 ) -> FloatArray | None:
@@ -300,12 +209,12 @@ def acquire(
     one of the equivalent poses.
     """
     seen = new_points(scans, fixed, np.zeros(2), math.inf, np.zeros(5))
-    if len(seen.points) < settings.acquire_readings:
+    if len(seen.points) < _ACQUIRED_READINGS:
         return None
     found: list[tuple[float, FloatArray]] = []
-    for place in _places(seen.points, body, settings):
+    for place in _places(seen.points, body.radius_m):
         near = np.hypot(*(seen.points - place).T) <= 2.0 * body.radius_m + settings.gate_m
-        if np.count_nonzero(near) >= settings.acquire_readings:
+        if np.count_nonzero(near) >= _ACQUIRED_READINGS:
             found += _search(place, seen.where(near), scans, fixed, body, settings)
     if not found:
         return None
@@ -315,22 +224,22 @@ def acquire(
     return pose
 
 
-def _places(points: FloatArray, body: Body, settings: LaserSettings) -> list[FloatArray]:
+def _places(points: FloatArray, radius_m: float) -> list[FloatArray]:
     """Possible centres of the robot: the centres of clusters, and of parts of large clusters."""
-    label = fclusterdata(points, settings.link_m, criterion="distance", method="single")
+    label = fclusterdata(points, _LINK_M, criterion="distance", method="single")
     places: list[FloatArray] = []
     for k in np.unique(label):
         cluster = points[label == k]
-        if len(cluster) < settings.least_readings:
+        if len(cluster) < LEAST_READINGS:
             continue
         low, high = cluster.min(axis=0), cluster.max(axis=0)
-        if math.hypot(*(high - low)) <= 2.2 * body.radius_m:
+        if math.hypot(*(high - low)) <= 2.2 * radius_m:
             places.append(0.5 * (low + high))
             continue
-        cell = np.floor((cluster - low) / body.radius_m).astype(np.int64)
+        cell = np.floor((cluster - low) / radius_m).astype(np.int64)
         for corner in np.unique(cell, axis=0):
             part = cluster[np.max(np.abs(cell - corner), axis=1) <= 1]
-            if len(part) >= settings.least_readings:
+            if len(part) >= LEAST_READINGS:
                 places.append(np.asarray(part.mean(axis=0)))
     return places
 
@@ -342,23 +251,23 @@ def _search(
     """Poses that explain the beams, with a score: beams that agree less those that disagree."""
     found: list[tuple[float, FloatArray]] = []
     tried: list[FloatArray] = []
-    for k in range(settings.headings):
-        theta = 2.0 * math.pi * k / settings.headings
+    for k in range(_HEADINGS):
+        theta = 2.0 * math.pi * k / _HEADINGS
         start = np.array([*(place - rotation(theta) @ body.middle), theta])
         pose, _, count = fit_outline(seen.points, body.faces, start, 0.5, 0.9, 1e-3, 15)
         pose, _, count = fit_outline(
-            seen.points, body.faces, pose, settings.gate_m, settings.keep, 1e-4, settings.most_steps
+            seen.points, body.faces, pose, settings.gate_m, settings.keep, 1e-4, MOST_STEPS
         )
-        if count < settings.acquire_readings or any(_close(pose, t, 0.02, 2.0) for t in tried):
+        if count < _ACQUIRED_READINGS or any(_close(pose, t, 0.02, 2.0) for t in tried):
             continue
         tried.append(pose)
-        refined = refine(seen, pose, fixed, body, settings, 0.1)
-        if refined.used < settings.acquire_readings or refined.open_directions:
+        refined = refine_outline(seen, body, pose, fixed, settings.gate_m, 0.1)
+        if refined.used < _ACQUIRED_READINGS or refined.open_directions:
             continue
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue
         _, agree, through, hidden, _, beside = explain_set(scans, fixed, body, refined.pose)
-        if agree >= settings.least_agreement * (agree + through + hidden + beside):
+        if agree >= _LEAST_AGREEMENT * (agree + through + hidden + beside):
             found.append((agree - 2.0 * (through + beside) - hidden, refined.pose))
     return found
 

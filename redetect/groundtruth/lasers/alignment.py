@@ -12,21 +12,16 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.lasers import walls
 from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
-from redetect.groundtruth.lasers.walls import (
-    MapProblem,
-    StillScan,
-    WallCurves,
-    still_scan,
-    wall_curves,
-)
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
 
@@ -97,7 +92,7 @@ def align_scanners(
     s = AlignmentSettings() if settings is None else settings
     if not scanners:
         raise GroundTruthError("no scanners: expected some")
-    stills = [still_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
+    stills = [walls.still_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
     for scanner, still in zip(scanners, stills):
         if len(still.range_m) < 10:
             raise GroundTruthError(
@@ -117,13 +112,13 @@ def align_scanners(
     starts, others = [], []
     for one, still, pose, prior in zip(scanners, stills, whole, priors):
         try:
-            lone = MapProblem([still], one.pose[None], prior, building, curves)
+            lone = walls.MapProblem([still], one.pose[None], prior, building, curves)
             start, other = lone.likely_pose(pose, coarse)
         except GeometryError as error:
             raise GeometryError(f"scanner {one.name}: {error}") from None
         starts.append(start)
         others.append(other)
-    problem = MapProblem(stills, measured, block_diag(*priors), building, curves)
+    problem = walls.MapProblem(stills, measured, block_diag(*priors), building, curves)
     fit = problem.fit(np.stack(starts), narrowing, _WEAK_M)
     steps["each to the map"] = fit.poses
     covariance = fit.covariance + block_diag(*others)
@@ -161,8 +156,8 @@ def _together(
 ) -> tuple[dict[tuple[int, int], float], dict[str, FloatArray]]:
     """Align scans with each other: overlaps of pairs, and the poses after each step."""
     steps: dict[str, FloatArray] = {}
-    shares, relative = _pairs(scans, measured, s)
-    steps["pairs"], order = _chained(measured, shares, relative)
+    pairs = _pairs(scans, measured, s)
+    steps["pairs"], order = _chained(measured, pairs)
     # One scan after the other, the best overlapping first, with those merged already.
     targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
     gates = np.geomspace(s.gate_m, 0.08, 8)
@@ -172,6 +167,7 @@ def _together(
         before, together = together, _round(scans, together, s)
         if np.abs(together - before).max() < 1e-5:
             break
+    shares = {pair: found.share for pair, found in pairs.items()}
     return shares, steps | {"together": together}
 
 
@@ -194,40 +190,44 @@ def _contradicts(scans: list[Scan], poses: FloatArray, aligned: FloatArray, k: i
     return best - on_map > _MUCH_WORSE
 
 
+class _AlignedPair(NamedTuple):
+    """Two scans after their ICP."""
+
+    share: float  # Of their points that coincide
+    a_from_b: FloatArray  # (3,)
+
+
 def _pairs(
     scans: list[Scan], measured: FloatArray, s: AlignmentSettings
-) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], FloatArray]]:
-    """ICP of every pair from the measured poses: shares explained, and poses of j in i."""
-    shares: dict[tuple[int, int], float] = {}
-    relative: dict[tuple[int, int], FloatArray] = {}
+) -> dict[tuple[int, int], _AlignedPair]:
+    """ICP of every pair from the measured poses."""
+    found: dict[tuple[int, int], _AlignedPair] = {}
     gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
     for i, j in combinations(range(len(scans)), 2):
         apart = between(measured[i], measured[j])
         target, points = scans[i], scans[j].points
-        best = (0.0, apart)
+        tried = [_AlignedPair(0.0, apart)]
         for turn in np.radians(_TURNS_DEG):
             start = apart + np.array([0.0, 0.0, turn])
             pose = align_scans(points, target, start, gates, s.keep, 1e-6)
             if np.isfinite(pose).all():
-                share = explained(points, target, pose, _JUDGED_M)
-                best = max(best, (share, pose), key=lambda entry: entry[0])
-        shares[i, j], relative[i, j] = best
-    return shares, relative
+                tried.append(_AlignedPair(explained(points, target, pose, _JUDGED_M), pose))
+        found[i, j] = max(tried, key=lambda pair: pair.share)
+    return found
 
 
 def _chained(
-    measured: FloatArray,
-    shares: dict[tuple[int, int], float],
-    relative: dict[tuple[int, int], FloatArray],
+    measured: FloatArray, pairs: dict[tuple[int, int], _AlignedPair]
 ) -> tuple[FloatArray, list[int]]:
     """Poses chained along the best-matching pairs, from the first scanner, and in which order."""
     poses = measured.copy()
     placed = [0]
     while len(placed) < len(measured):
-        joining = (pair for pair in shares if (pair[0] in placed) != (pair[1] in placed))
-        pair = max(joining, key=shares.__getitem__)
-        a, b = pair if pair[0] in placed else pair[::-1]
-        a_from_b = relative[pair] if a == pair[0] else invert(relative[pair])
+        joining = [(a, b) for a, b in pairs if (a in placed) != (b in placed)]
+        a, b = max(joining, key=lambda pair: pairs[pair].share)
+        a_from_b = pairs[a, b].a_from_b
+        if b in placed:
+            a, b, a_from_b = b, a, invert(a_from_b)
         poses[b] = compose(poses[a], a_from_b)
         placed.append(b)
     return poses, placed
@@ -261,12 +261,12 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
 
 
 def _whole_to_map(
-    stills: list[StillScan],
+    stills: list[walls.StillScan],
     poses: FloatArray,
     measured: FloatArray,
     building: FloatArray,
     narrowing_m: list[float],
-) -> tuple[FloatArray, WallCurves]:
+) -> tuple[FloatArray, walls.WallCurves]:
     """Align all scanners, as one rigid body, with the map, from their measured poses.
 
     Also says which walls are chords of curves: whether coarse ones are, the readings decide.
@@ -277,9 +277,9 @@ def _whole_to_map(
         body = compose(measured[0], invert(poses[0]))
     prior = np.eye(3) / _UNKNOWN_SIGMA**2
     start, least = body[None], inf
-    curves = wall_curves(building)
-    for tried in (curves, wall_curves(building, _MOST_BULGE_M)):
-        problem = MapProblem(stills, start, prior, building, tried, poses)
+    curves = walls.wall_curves(building)
+    for tried in (curves, walls.wall_curves(building, _MOST_BULGE_M)):
+        problem = walls.MapProblem(stills, start, prior, building, tried, poses)
         with suppress(GeometryError):  # then each scanner is searched around its measured pose
             found, _, cost = problem.narrowed(start, narrowing_m)
             if cost < least:

@@ -106,16 +106,12 @@ class Robot:
 def read_joint_covariance(path: PathLike, scanners: Sequence[Scanner]) -> FloatArray | None:
     """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
 
-    Raises `GroundTruthError` if it is not one of these scanners, in their order.
+    Raises `GroundTruthError` if it is not one of these scanners.
     """
     content = JsonObject.read(path)
     if "covariance" not in content:
         return None
-    joint = content.values["covariance"]
-    names = [scanner.name for scanner in scanners]
-    if not isinstance(joint, dict) or joint.get("scanners") != names:
-        raise content.wrong("covariance", f"an object with scanners {excerpt(names)} and matrix")
-    return JsonObject(f"{content.place}: covariance", joint).covariance("matrix", 3 * len(names))
+    return content.joint_covariance("scanners", [scanner.name for scanner in scanners], 3)
 
 
 def with_measured_noise(

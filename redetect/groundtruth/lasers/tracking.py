@@ -18,10 +18,17 @@ from scipy.stats import trim_mean
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
-from redetect.groundtruth.lasers.acquisition import ScanSets, acquire, refine, robot_body
-from redetect.groundtruth.lasers.icp import face_normals, fit_outline, nearest_on_segments
+from redetect.groundtruth.lasers.acquisition import (
+    LEAST_READINGS,
+    MOST_STEPS,
+    ScanSets,
+    acquire,
+)
+from redetect.groundtruth.lasers.icp import fit_outline, nearest_on_segments
+from redetect.groundtruth.lasers.outline import robot_body
 from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking_kernels import (
+    GATE_SIGMA,
     BeamCounts,
     Body,
     FixedScanners,
@@ -29,15 +36,22 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     OutlinePose,
     explain_set,
     new_points,
+    refine_outline,
 )
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, compose, invert, rotation
 
-#: Gains of the filter that predicts the start for the next set.
+# Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
-
+# The ICP ends when its root mean square error changes by less (m).
+_THRESHOLD_M = 1e-5
+# The robot is lost after this time without a pose, and then searched for at this interval (s).
+_COAST_S, _ACQUIRE_S = 0.25, 0.05
+# The readings identify the front if the residuals differ by this many standard errors; otherwise it
+# is known after the robot has driven this much farther forward than backward (m).
+_FRONT_SIGMA, _FORWARD_M = 5.0, 0.3
 # Residuals over this time show whether covariances are too small (s).
 _RESIDUALS_S = 0.48
 # Velocities are from this time before and after, at least from this number of sets; the robot is
@@ -142,11 +156,11 @@ class Tracker:
         # last search.
         before_s = posed_s = determined_s = searched_s = -math.inf
         segment, begun, tracked = -1, 0, False
-        coast_s = max(self.settings.coast_s, _COASTED_SETS * _interval_s(self.sets.times_s))
+        coast_s = max(_COAST_S, _COASTED_SETS * _interval_s(self.sets.times_s))
         for i, t in enumerate(self.sets.times_s.tolist()):
             tracked = tracked and t - posed_s <= coast_s
             if not tracked:
-                if t - searched_s < self.settings.acquire_s:
+                if t - searched_s < _ACQUIRE_S:
                     continue
                 searched_s = t
                 # From the scans of this set alone, if they show the robot.
@@ -186,16 +200,16 @@ class Tracker:
         self, i: int, predicted: FloatArray, motion: FloatArray, unseen_s: float
     ) -> FloatArray:
         """Pose of set i near a prediction over `unseen_s` without poses, or a `GeometryError`."""
-        s = self.settings
         seen = self._points(i, predicted, motion, unseen_s)
-        if len(seen.points) < s.least_readings:
+        if len(seen.points) < LEAST_READINGS:
             raise GeometryError(f"{len(seen.points)} new readings where the robot should be")
         start, count = self._aligned(seen, predicted)
-        if count < s.least_readings:
-            raise GeometryError(f"{count} readings within {s.gate_m:g} m of the outline")
-        found = self._refine(i, seen, start)
+        if count < LEAST_READINGS:
+            gate_m = self.settings.gate_m
+            raise GeometryError(f"{count} readings within {gate_m:g} m of the outline")
+        found = self._refined(seen, start, self.prior_m[i])
         pose, used, chi2 = found.pose, found.used, found.chi2
-        if used < s.least_readings:
+        if used < LEAST_READINGS:
             raise GeometryError(f"{used} readings on the outline")
         if chi2 > _LARGEST_CHI2 * (used - 3.0):
             raise GeometryError(f"squared normalised residuals {chi2:.0f} of {used} readings")
@@ -214,7 +228,7 @@ class Tracker:
         """Pose by the trimmed ICP from a start, and the number of readings used."""
         s = self.settings
         pose, _, count = fit_outline(
-            seen.points, self.body.faces, start, s.gate_m, s.keep, s.threshold_m, s.most_steps
+            seen.points, self.body.faces, start, s.gate_m, s.keep, _THRESHOLD_M, MOST_STEPS
         )
         return pose, count
 
@@ -224,15 +238,14 @@ class Tracker:
         reach = self.body.radius_m + self.settings.gate_m + self.speed * unseen_s
         return new_points(self.sets[i], self.fixed, centre, reach, np.array([*motion, *pose[:2]]))
 
-    def _refine(self, i: int, seen: NewReadings, start: FloatArray) -> OutlinePose:
-        found = refine(seen, start, self.fixed, self.body, self.settings, float(self.prior_m[i]))
+    def _refined(self, seen: NewReadings, start: FloatArray, prior_m: float) -> OutlinePose:
+        return refine_outline(seen, self.body, start, self.fixed, self.settings.gate_m, prior_m)
+
+    def _store(self, i: int, found: OutlinePose, beams: BeamCounts) -> None:
         calibration = found.by_scanner @ self.fixed.covariance @ found.by_scanner.T
         self.track.noise[i] = found.covariance
         self.track.covariances[i] = found.covariance + calibration
         self.track.weak[i] = found.weak
-        return found
-
-    def _store(self, i: int, found: OutlinePose, beams: BeamCounts) -> None:
         self.track.poses[i] = found.pose
         self.track.poses[i, 2] = wrap_angle(found.pose[2])
         self.track.readings[i], self.track.rms_m[i] = found.used, found.rms_m
@@ -268,8 +281,8 @@ class Tracker:
         """The pose once more, from the motion before *and* after it."""
         status = int(self.track.status[i])
         seen = self._points(i, self.track.poses[i], motion, 0.0)
-        found = self._refine(i, seen, self.track.poses[i].copy())
-        if found.used < self.settings.least_readings:
+        found = self._refined(seen, self.track.poses[i], self.prior_m[i])
+        if found.used < LEAST_READINGS:
             self.track.reasons[i] = f"{found.used} readings on the outline"
             self.track.status[i], self.track.poses[i] = SetStatus.COASTING, np.nan
             return
@@ -288,7 +301,7 @@ class Tracker:
         have a covariance (3, 3), in the robot's frame.
         """
         rows = np.flatnonzero(self.track.is_determined)
-        faces, normals = self.body.faces, face_normals(self.body.faces)
+        faces, normals = self.body.faces, self.body.normals
         off, halves = [np.zeros(0)], [np.zeros(0, dtype=np.int64)]
         for i in rows[np.linspace(0, len(rows) - 1, min(len(rows), _SAMPLE)).astype(np.int64)]:
             pose = self.track.poses[i]
@@ -328,12 +341,12 @@ class Tracker:
         error = worse.std(axis=0) / math.sqrt(len(sample)) + 1e-9
         sigmas = float(np.min(worse.mean(axis=0) / error))
         by = f"outline, by {sigmas:.0f} sigma"
-        if sigmas < self.settings.front_sigma:
+        if sigmas < _FRONT_SIGMA:
             ahead = self._ahead(rows, velocity, choices)
             order = np.argsort(ahead)[::-1]
             best = int(order[0])
             by = f"driven forward, {ahead[best]:.2f} m"
-            if ahead[best] - ahead[int(order[1])] < 2.0 * self.settings.forward_m:
+            if ahead[best] - ahead[int(order[1])] < 2.0 * _FORWARD_M:
                 self.track.status[rows] = SetStatus.FRONT_UNKNOWN
                 return "unknown: the outline does not show it and the robot hardly drove"
         if best > 0:
@@ -348,10 +361,10 @@ class Tracker:
         start = compose(self.track.poses[i], choice)
         seen = self._points(i, start, np.zeros(3), 0.0)
         start, _ = self._aligned(seen, start)
-        found = refine(seen, start, self.fixed, self.body, self.settings, _PRIOR_M)
+        found = self._refined(seen, start, _PRIOR_M)
         beams = explain_set(self.sets[i], self.fixed, self.body, found.pose)
         wrong = beams.through + beams.hidden + beams.beside
-        return float(found.chi2 + self.settings.gate_sigma**2 * wrong)
+        return float(found.chi2 + GATE_SIGMA**2 * wrong)
 
     def _ahead(
         self, rows: IntArray, velocity: FloatArray, choices: list[FloatArray]
@@ -412,7 +425,7 @@ def track_by_lasers(
     settings = LaserSettings() if settings is None else settings
     allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0
     for _ in range(_OUTLINE_ROUNDS):
-        body = robot_body(robot.outline, settings.symmetry_m, moved_m)
+        body = robot_body(robot.outline, moved_m)
         tracker = Tracker(sets, fixed, body, robot.largest_speed_m_s, settings)
         track = replace(tracker.run(), outline_moved_m=moved_m)
         off_m, sigma_m, by_outline = tracker.outline_errors()

@@ -18,6 +18,18 @@ from redetect.compiled import kernel
 
 #: A reading within this of where a beam should meet the robot agrees (m).
 AGREES_M = 0.05
+#: A fit to the outline uses readings up to this many standard deviations off.
+GATE_SIGMA = 3.5
+# Standard deviation of a reading's distance from the outline in addition to the scanner's noise, as
+# the outline is drawn to millimetres.
+_FLOOR_M = 0.001
+# Lower bound of the cosine between beam and normal: readings along a face are close to it whatever
+# the pose.
+_LEAST_SLOPE = 0.35
+# A direction is undetermined if the pose's standard deviation along it is larger (a turn is
+# measured at the farthest corner).
+_WEAK_SIGMA_M = 0.03
+_MOST_STEPS = 8
 
 
 class ScanSet(NamedTuple):
@@ -43,6 +55,7 @@ class Body(NamedTuple):
     """The robot's outline in the scanners' plane."""
 
     faces: FloatArray  # (k, 4): counter-clockwise
+    normals: FloatArray  # (k, 2): their outward normals
     middle: FloatArray  # (2,): of its bounding box, in its frame
     radius_m: float  # Distance of its farthest corner from there
     symmetries: FloatArray  # (s, 3): motions that change its outline not at all, or not clearly
@@ -73,7 +86,7 @@ class OutlinePose(NamedTuple):
     chi2: float  # Their squared normalised residuals
     open_directions: int
     rms_m: float  # Of their distances from the outline
-    weak: FloatArray  # (3,): least determined direction of x, y, theta times `scale_m`
+    weak: FloatArray  # (3,): least determined direction of x, y, theta times the body's radius
     information: FloatArray  # (scanners, 3, 3): correction of each scanner's own pose
     gradient: FloatArray  # (scanners, 3): the same
 
@@ -87,19 +100,6 @@ class BeamCounts(NamedTuple):
     hidden: int  # readings that are nearer
     none: int  # without a reading
     beside: int  # New readings in the outline's circle, but outside the robot
-
-
-class OutlineFit(NamedTuple):
-    """Settings of the fit of an outline."""
-
-    floor_m: float  # Standard deviation of the outline's and the scanner's model errors
-    least_slope: float  # Lower bound of the sine of incidence, for beams along a face
-    gate_sigma: float  # Gate of readings, standard deviations
-    gate_m: float  # Gate in the first step
-    prior_sigma_m: float  # Prior deviation from the start, for undetermined directions
-    weak_sigma_m: float  # Standard deviation above which a direction is undetermined
-    scale_m: float  # Length that corresponds to a radian
-    steps: int  # Largest number
 
 
 @kernel()
@@ -151,14 +151,14 @@ def new_points(
 
 @kernel()
 def _face_of(
-    x: float, y: float, bx: float, by: float, range_m: float, faces: FloatArray,
-    normal: FloatArray, gate_m: float,
-) -> int:  # fmt: skip
+    x: float, y: float, bx: float, by: float, range_m: float, body: Body, gate_m: float
+) -> int:
     """The face of a reading at (x, y), -1 for none; (bx, by) is its beam's direction.
 
     Of faces turned to the scanner that which the beam meets first; without its range (below 0), the
     nearest one within the gate.
     """
+    faces, normal = body.faces, body.normals
     best, face = np.inf, -1
     for k in range(faces.shape[0]):
         slope = normal[k, 0] * bx + normal[k, 1] * by
@@ -184,34 +184,6 @@ def _face_of(
     return face
 
 
-@kernel()
-def _hold_open(
-    h: FloatArray, g: FloatArray, middle: FloatArray, to_start: FloatArray, fit: OutlineFit
-) -> tuple[int, FloatArray]:
-    """Add the start as a prior of the directions that the readings do not determine, in place.
-
-    `h` (3, 3) and `g` (3,) are the normal equations; directions are evaluated about the `middle`
-    (2,) of the points, theta in metres. Returns how many are open, and the least determined one.
-    """
-    scale = fit.scale_m
-    # Turning about the middle: xi' = (t + theta x middle, theta * scale).
-    back = np.array(
-        [[1.0, 0.0, middle[1] / scale], [0.0, 1.0, -middle[0] / scale], [0.0, 0.0, 1.0 / scale]]
-    )
-    values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
-    there = np.linalg.inv(back)
-    p = 1.0 / (fit.prior_sigma_m * fit.prior_sigma_m)
-    open_count = 0
-    for k in range(3):
-        if values[k] < 1.0 / (fit.weak_sigma_m * fit.weak_sigma_m):
-            open_count += 1
-            row = np.ascontiguousarray(vectors[:, k]) @ there
-            g -= p * row * (row @ to_start)
-            for a in range(3):  # np.outer takes longer to compile
-                h[a] += p * row[a] * row
-    return open_count, vectors[:, 0].copy()
-
-
 class _NormalEquations(NamedTuple):
     """Sums over the readings used; the pose's errors are in the outline's frame."""
 
@@ -227,13 +199,41 @@ class _NormalEquations(NamedTuple):
 
 
 @kernel()
+def _hold_open(
+    at: _NormalEquations, to_start: FloatArray, prior_m: float, scale: float
+) -> tuple[int, FloatArray]:
+    """Add the start as a prior of the directions that the readings do not determine, in place.
+
+    Directions are evaluated about the middle of the readings; a radian is as much as `scale` (m).
+    Returns how many are open, and the least determined one.
+    """
+    h, g, middle = at.h, at.g, at.middle
+    # Turning about the middle: xi' = (t + theta x middle, theta * scale).
+    back = np.array(
+        [[1.0, 0.0, middle[1] / scale], [0.0, 1.0, -middle[0] / scale], [0.0, 0.0, 1.0 / scale]]
+    )
+    values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
+    there = np.linalg.inv(back)
+    p = 1.0 / (prior_m * prior_m)
+    open_count = 0
+    for k in range(3):
+        if values[k] < 1.0 / _WEAK_SIGMA_M**2:
+            open_count += 1
+            row = np.ascontiguousarray(vectors[:, k]) @ there
+            g -= p * row * (row @ to_start)
+            for a in range(3):  # np.outer takes longer to compile
+                h[a] += p * row[a] * row
+    return open_count, vectors[:, 0].copy()
+
+
+@kernel()
 def _normal_equations(
-    seen: NewReadings, faces: FloatArray, normal: FloatArray, pose: FloatArray,
-    origins: FloatArray, sigmas_m: FloatArray, fit: OutlineFit, nearest: bool,
+    seen: NewReadings, body: Body, pose: FloatArray, fixed: FixedScanners, gate_m: float,
+    nearest: bool,
 ) -> _NormalEquations:  # fmt: skip
     """The normal equations at a pose; `nearest`: readings belong to the nearest faces."""
     points, scanner, direction, range_m = seen
-    many = sigmas_m.size
+    many = fixed.sigmas_m.size
     h = np.zeros((3, 3))
     g = np.zeros(3)
     cross = np.zeros((3, 3 * many))
@@ -248,14 +248,15 @@ def _normal_equations(
         bx = c * direction[i, 0] + s * direction[i, 1]
         by = -s * direction[i, 0] + c * direction[i, 1]
         reach = -1.0 if nearest else range_m[i]
-        face = _face_of(x, y, bx, by, reach, faces, normal, fit.gate_m)
+        face = _face_of(x, y, bx, by, reach, body, gate_m)
         if face < 0:
             continue
-        nx, ny = normal[face, 0], normal[face, 1]
-        e = nx * (x - faces[face, 0]) + ny * (y - faces[face, 1])
-        across = min(nx * bx + ny * by, -fit.least_slope) * sigmas_m[scanner[i]]
-        variance = across * across + fit.floor_m * fit.floor_m
-        if e * e > fit.gate_sigma * fit.gate_sigma * variance:
+        q = scanner[i]
+        nx, ny = body.normals[face, 0], body.normals[face, 1]
+        e = nx * (x - body.faces[face, 0]) + ny * (y - body.faces[face, 1])
+        across = min(nx * bx + ny * by, -_LEAST_SLOPE) * fixed.sigmas_m[q]
+        variance = across * across + _FLOOR_M**2
+        if e * e > GATE_SIGMA**2 * variance:
             continue
         w = 1.0 / variance
         used += 1
@@ -265,9 +266,9 @@ def _normal_equations(
         sy += y
         by_robot = (-nx, -ny, nx * y - ny * x)
         # By the scanner's pose: the normal in the world, and turning about the scanner.
-        q = scanner[i]
         wx, wy = c * nx - s * ny, s * nx + c * ny
-        lever = wy * (points[i, 0] - origins[q, 0]) - wx * (points[i, 1] - origins[q, 1])
+        from_x, from_y = points[i, 0] - fixed.origins[q, 0], points[i, 1] - fixed.origins[q, 1]
+        lever = wy * from_x - wx * from_y
         by_scanner = (wx, wy, lever)
         for a in range(3):
             g[a] += w * by_robot[a] * e
@@ -282,42 +283,37 @@ def _normal_equations(
 
 @kernel()
 def refine_outline(
-    seen: NewReadings, faces: FloatArray, start: FloatArray, origins: FloatArray,
-    sigmas_m: FloatArray, fit: OutlineFit,
+    seen: NewReadings, body: Body, start: FloatArray, fixed: FixedScanners, gate_m: float,
+    prior_m: float,
 ) -> OutlinePose:  # fmt: skip
     """Maximum likelihood pose of the outline near a start, by Gauss-Newton.
 
     A reading is uncertain along its beam: its distance from a face has the standard deviation
     sigma |n . beam|, and a floor for model errors of the outline and the scanner. A reading belongs
     to the face that its beam meets first, whatever its noise; at first, while the pose may be off,
-    to the nearest one facing the scanner. Readings beyond the gate are ignored, and undetermined
-    directions stay at the start (see `OutlineFit`).
+    to the nearest one facing the scanner, within `gate_m`. Readings beyond the gate are ignored.
+    Undetermined directions are held at the start, with the standard deviation `prior_m`.
     """
     pose = start.copy()
-    normal = np.empty((faces.shape[0], 2))
-    for k in range(faces.shape[0]):
-        ex, ey = faces[k, 2] - faces[k, 0], faces[k, 3] - faces[k, 1]
-        length = math.sqrt(ex * ex + ey * ey)
-        normal[k, 0], normal[k, 1] = ey / length, -ex / length
     covariance = np.full((3, 3), np.nan)
-    calibration = np.zeros((3, 3 * sigmas_m.size))
+    calibration = np.zeros((3, 3 * fixed.sigmas_m.size))
     rms, open_count = 0.0, 0
     weak = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
-    for step in range(fit.steps):
+    for step in range(_MOST_STEPS):
         # While the pose may be off, the nearest faces.
-        at = _normal_equations(seen, faces, normal, pose, origins, sigmas_m, fit, step == 0)
+        at = _normal_equations(seen, body, pose, fixed, gate_m, step == 0)
         if at.used < 3:
             break
         rms = math.sqrt(at.squares / at.used)
         c, s = math.cos(pose[2]), math.sin(pose[2])
         dx, dy = start[0] - pose[0], start[1] - pose[1]
         to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
-        open_count, v = _hold_open(at.h, at.g, at.middle, to_start, fit)
+        open_count, v = _hold_open(at, to_start, prior_m, body.radius_m)
         weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance = np.ascontiguousarray(np.linalg.inv(at.h))
         delta = -local_covariance @ at.g
-        if step == fit.steps - 1 or (
+        if step == _MOST_STEPS - 1 or (
             step > 0 and math.sqrt(delta[0] ** 2 + delta[1] ** 2) + abs(delta[2]) < 1e-6
         ):
             break

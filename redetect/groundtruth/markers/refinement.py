@@ -118,9 +118,6 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
     `world_from_robot`. Raises `GeometryError` if a corner is behind its camera there, or the
     corners do not determine a pose.
     """
-    if _corners(problem, start) is None:
-        raise GeometryError("the start has a corner behind its camera or outside its lens")
-
     pose, damping = start, _DAMPING
     now = _linearised(problem, pose)
     for _ in range(_MOST_STEPS):
@@ -145,7 +142,6 @@ def refine_pose(problem: PoseProblem, start: FloatArray) -> RefinedPose:
         else:
             damping *= 10.0
     here = _corners(problem, pose)
-    assert here is not None
     squares = np.sum(here.residuals.reshape(-1, 2) ** 2, axis=1)
     count = np.bincount(problem.view, minlength=problem.views)
     return RefinedPose(
@@ -178,7 +174,6 @@ class _Linearised(NamedTuple):
 
 def _linearised(problem: PoseProblem, pose: FloatArray) -> _Linearised:
     here = _corners(problem, pose)
-    assert here is not None
     weights = 1.0 / np.maximum(_view_errors(problem, here) / _HUBER, 1.0)
     covariance = _covariance(problem, here, weights)
     stacked = np.concatenate([here.residuals[:, None], -here.jacobian], axis=1)
@@ -194,8 +189,8 @@ def predicted_errors(
     errors = np.full(problem.views, np.inf)
     for view in range(problem.views):
         alone = problem.only(np.arange(problem.views) == view)
-        here = _corners(alone, pose)
-        if here is not None:
+        with suppress(GeometryError):
+            here = _corners(alone, pose)
             covariance = _covariance(alone, here, np.ones(1))
             covariance += here.jacobian @ pose_covariance @ here.jacobian.T
             squared = squared_mahalanobis(here.residuals, covariance)
@@ -203,13 +198,13 @@ def predicted_errors(
     return errors
 
 
-def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners | None:
-    """None if one cannot be seen."""
+def _corners(problem: PoseProblem, pose: FloatArray) -> _Corners:
+    """Residuals at a pose; in a descent, only the start may be one that does not see a corner."""
     network, rig, seen = problem.network, problem.rig, problem.seen
     projection = project_chain_with_jacobians(problem.chain(pose), seen)
     residuals = (seen.pixels - projection.pixels).ravel()
     if not np.all(np.isfinite(residuals)):
-        return None
+        raise GeometryError("the start has a corner behind its camera or outside its lens")
     common = np.zeros((len(residuals), len(residuals)))
     for jacobian, index, covariance in (
         (projection.by_camera, seen.camera, network.covariance),

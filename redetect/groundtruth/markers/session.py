@@ -23,7 +23,6 @@ from redetect.groundtruth.files import JsonObject, PathLike, write_json
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.frames import read_times
-from redetect.messages import excerpt
 
 _QUATERNION_TOLERANCE = 1e-3
 _WIDTH = Bounds("metres above 0", lambda x: x > 0.0)
@@ -174,16 +173,7 @@ def _joint_covariance(
             f"{content.place}: a joint covariance of all {key}, and one of a single entry: "
             "expected only one of them"
         )
-    joint = content.values["covariance"]
-    if not isinstance(joint, dict) or not isinstance(joint.get(key), list):
-        raise content.wrong("covariance", f"an object with {key} and matrix")
-    order, names = [str(name) for name in joint[key]], list(entries)
-    place = f"{content.place}: covariance"
-    if sorted(order) != sorted(names):
-        raise GroundTruthError(f"{place}: {key} are {excerpt(order)}: expected {excerpt(names)}")
-    matrix = JsonObject(place, joint).covariance("matrix", 6 * len(names))
-    index = np.concatenate([6 * order.index(name) + np.arange(6) for name in names])
-    return np.asarray(matrix[np.ix_(index, index)])
+    return content.joint_covariance(key, list(entries), 6)
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,11 @@ class PlanarPoses:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    @property
+    def continuous(self) -> FloatArray:
+        """(N, 3) the poses, with headings that do not jump by full turns."""
+        return np.column_stack([self.poses[:, :2], np.unwrap(self.poses[:, 2])])
+
     def only(self, chosen: NDArray[Any] | slice) -> PlanarPoses:
         """The chosen poses, by a mask, indices or a slice."""
         covariances = None if self.covariances is None else self.covariances[chosen]

@@ -32,7 +32,7 @@ from redetect.groundtruth.lasers.walls import (
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose, DistanceStatus
 from redetect.landmarks import wrap_angle
-from redetect.least_squares.solver import whitening
+from redetect.least_squares.solver import Block, normal_equations, stack, whitening
 from redetect.plane import apply, compose, rotation
 
 # The robot is assumed at rest for this long before and after the time of the distances.
@@ -260,33 +260,35 @@ def refine_mounts(
     along = segments[:, 2:] - segments[:, :2]
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     normals /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-12)[:, None]
+    # The unknowns are the mounts, then the poses.
+    unknowns, of_poses = 3 * (count + len(used)), 3 * (count + np.arange(len(used)))
     for gate in _GATES_M:
-        rows, errors = [], []
+        blocks = []
         for r, still in enumerate(stills):
             for m, scan in enumerate(still.scans):
                 world = apply(compose(poses[r], mounts[m]), scan.points)
                 target, index, squared = nearest_on_segments(world, segments)
                 near = squared <= gate * gate
                 normal, world = normals[index[near]], world[near]
-                row = np.zeros((len(world), count + len(used), 3))
-                row[:, m, :2] = normal @ rotation(poses[r, 2])
-                row[:, m, 2] = _moment(world - apply(poses[r], mounts[m, :2]), normal)
-                row[:, count + r, :2] = normal
-                row[:, count + r, 2] = _moment(world - poses[r, :2], normal)
-                rows.append(row)
-                errors.append(np.sum(normal * (world - target[near]), axis=1))
-        error = np.concatenate(errors)
-        sigma = max(float(np.sqrt(np.mean(error**2))), _LEAST_SIGMA_M)
-        of_prior = np.zeros((len(used), 3, count + len(used), 3))
-        of_prior[range(len(used)), :, range(count, count + len(used))] = roots
-        missing = pose_differences(poses, priors)
-        unknowns = 3 * (count + len(used))
-        of_walls = np.concatenate(rows).reshape(-1, unknowns) / sigma
-        jacobian = np.concatenate([of_walls, of_prior.reshape(-1, unknowns)])
-        residual = np.concatenate([error / sigma, (roots @ missing[..., None]).ravel()])
-        covariance = np.linalg.inv(jacobian.T @ jacobian)
-        step = -(covariance @ (jacobian.T @ residual)).reshape(-1, 3)
-        mounts, poses = mounts + step[:count], poses + step[count:]
+                error = np.sum(normal * (world - target[near]), axis=1)
+                about_mount = _moment(world - apply(poses[r], mounts[m, :2]), normal)
+                by_mount = np.column_stack([normal @ rotation(poses[r, 2]), about_mount])
+                by_pose = np.column_stack([normal, _moment(world - poses[r, :2], normal)])
+                by = [
+                    (np.full(len(error), 3 * m), by_mount[:, None]),
+                    (np.full(len(error), of_poses[r]), by_pose[:, None]),
+                ]
+                blocks.append(Block(error[:, None], by))
+        missing = (roots @ pose_differences(poses, priors)[..., None])[..., 0]
+        of_priors = normal_equations(stack([Block(missing, [(of_poses, roots)])], unknowns, 0))
+        walls = stack(blocks, unknowns, 0)
+        of_walls = normal_equations(walls)
+        variance = max(float(np.mean(walls.residual**2)), _LEAST_SIGMA_M**2)
+        information = of_walls.matrix / variance + of_priors.matrix
+        covariance = np.linalg.inv(information.toarray())
+        step = -covariance @ (of_walls.gradient / variance + of_priors.gradient)
+        mounts = mounts + step.reshape(-1, 3)[:count]
+        poses = poses + step.reshape(-1, 3)[count:]
     return RefinedMounts(mounts, covariance[: 3 * count, : 3 * count])
 
 

@@ -201,8 +201,9 @@ def test_a_clock_that_was_set_back_has_no_inverse() -> None:
 def test_noise_of_headings_is_told_from_turning() -> None:
     rng = np.random.default_rng(2)
     times = np.arange(0, 100, 0.02)
-    noise = roughness(3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times)))
-    assert noise == pytest.approx(0.01, rel=0.05)
+    turning = 3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times))
+    noise = roughness(headings_only(times, turning))
+    assert noise == pytest.approx([0.0, 0.0, 0.01], rel=0.05)
 
 
 def test_cuts_are_where_the_pauses_are() -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.lasers.acquisition import (
+from redetect.groundtruth.lasers.outline import (
     outline_faces,
     outline_symmetries,
     robot_body,

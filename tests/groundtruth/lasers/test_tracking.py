@@ -16,11 +16,10 @@ from redetect.groundtruth.lasers.acquisition import (
     ScanSets,
     acquire,
     fixed_scanners,
-    refine,
-    robot_body,
     sets_of_scans,
 )
 from redetect.groundtruth.lasers.icp import fit_outline
+from redetect.groundtruth.lasers.outline import robot_body
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.lasers.tracking import (
     SetStatus,
@@ -35,6 +34,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     ScanSet,
     explain_set,
     new_points,
+    refine_outline,
 )
 from redetect.groundtruth.options import Laser
 from redetect.groundtruth.settings import LaserSettings
@@ -56,6 +56,8 @@ from tests.groundtruth.lasers.scene import (
 )
 
 FloatArray = NDArray[np.float64]
+
+GATE_M = LaserSettings().gate_m
 
 
 def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
@@ -145,7 +147,7 @@ def test_exact_readings_give_the_exact_pose(
     assert found == pytest.approx(pose, abs=2e-3)
     assert rms < 1e-3
     assert count >= 0.9 * len(seen.points)
-    refined = refine(seen, found, tables, body, LaserSettings(), 0.02)
+    refined = refine_outline(seen, body, found, tables, GATE_M, 0.02)
     assert refined.pose == pytest.approx(pose, abs=1e-8)
     assert refined.used == len(seen.points)
     assert refined.open_directions == 0
@@ -155,9 +157,9 @@ def test_derivatives_by_the_scanners_poses(
     scanners: tuple[Scanner, ...], tables: FixedScanners
 ) -> None:
     """Moving a scanner moves the pose as the kernel says: finite differences."""
-    pose, body, settings = np.array([4.0, 2.9, 0.5]), robot_body(FRONTED), LaserSettings()
+    pose, body = np.array([4.0, 2.9, 0.5]), robot_body(FRONTED)
     seen = exact(scanners, pose, tables)
-    refined = refine(seen, pose, tables, body, settings, 0.02)
+    refined = refine_outline(seen, body, pose, tables, GATE_M, 0.02)
     h = 1e-6
     for k in range(len(scanners)):
         mine = seen.scanner == k
@@ -173,20 +175,20 @@ def test_derivatives_by_the_scanners_poses(
                 points[mine] = tables.origins[k] + shift[:2] + arm @ turn.T
                 direction[mine] = direction[mine] @ turn.T
                 other = seen._replace(points=points, direction=direction)
-                moved.append(refine(other, pose, tables, body, settings, 0.02).pose)
+                moved.append(refine_outline(other, body, pose, tables, GATE_M, 0.02).pose)
             numeric = (moved[0] - moved[1]) / (2 * h)
             assert refined.by_scanner[:, 3 * k + axis] == pytest.approx(numeric, abs=2e-3)
 
 
 def test_covariance_of_a_set_is_right(scanners: tuple[Scanner, ...], tables: FixedScanners) -> None:
-    rng, body, settings = np.random.default_rng(3), robot_body(FRONTED), LaserSettings()
+    rng, body = np.random.default_rng(3), robot_body(FRONTED)
     squared = []
     for _ in range(300):
         pose = np.array([*rng.uniform([2.0, 1.5], [6.0, 4.5]), rng.uniform(-np.pi, np.pi)])
         sets = one_set(scanners, pose, FRONTED, rng)
         seen = seen_in(sets, tables, pose)
         start = fit_outline(seen.points, body.faces, pose, 0.2, 0.95, 1e-5, 60)[0]
-        found = refine(seen, start, tables, body, settings, 0.02)
+        found = refine_outline(seen, body, start, tables, GATE_M, 0.02)
         error = found.pose - pose
         error[2] = wrap_angle(error[2])
         squared.append(error @ np.linalg.solve(found.covariance, error) / 3.0)
@@ -215,7 +217,7 @@ def test_one_scanner_before_a_flat_side_leaves_a_direction_open() -> None:
     tables, body = tables_of(lone), robot_body(PLAIN)
     pose = np.array([4.0, 3.0, 0.0])  # its long side to the scanner
     seen = seen_in(one_set(lone, pose, PLAIN, np.random.default_rng(4)), tables, pose)
-    found = refine(seen, pose + np.array([0.05, 0.0, 0.0]), tables, body, LaserSettings(), 0.3)
+    found = refine_outline(seen, body, pose + np.array([0.05, 0.0, 0.0]), tables, GATE_M, 0.3)
     assert found.open_directions == 1
     assert np.abs(found.weak) == pytest.approx([1.0, 0.0, 0.0], abs=0.1)
     # Along it the pose stays where it was, and says so; across it is known.
