@@ -178,9 +178,8 @@ def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray
     """A bare floor with light discs, blurred and noisy. `places` (N, 2); returns (H, W)."""
     grey = np.full((camera.height, camera.width), _FLOOR)
     for place in places:
-        crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX, rounded=False)
-        height, width = crop.grey.shape
-        grey[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width] += crop.grey - _FLOOR
+        crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX)
+        grey[crop.window] += crop.grey - _FLOOR
     return _taken(grey, seed)
 
 
