@@ -92,4 +92,4 @@ def _rendered(
     blur_px: float,
 ) -> DiscCrop:  # fmt: skip
     """Half of all discs of the tests are painted more than once."""
-    return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px, rounded=False)
+    return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px)
