@@ -15,7 +15,7 @@ from detect.markers.candidates import closing
 from detect.markers.detect import detect_markers
 from detect.settings import MarkerSettings
 from tools.benchmark.material import decode, jpeg_picture
-from tools.benchmark.timing import measure_in_turn
+from tools.benchmark.timing import decodings, measure_in_turn
 from tools.evaluation.figures import WRONG, Figures, Study
 from tools.evaluation.markers_statistics import (
     FOUND,
@@ -150,9 +150,8 @@ def time_searches(
     seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
     columns = ("decodings", "lower", "upper", "ms")
     table = Table({"": "<24", **dict.fromkeys(columns, "8.2f")})
-    for name, taken in seconds.items():
-        lower, median, upper = np.nanpercentile(taken / seconds[DECODING], [25, 50, 75])
-        table.row(name, median, lower, upper, 1e3 * np.nanmedian(taken))
+    for name, of in decodings(seconds, DECODING).items():
+        table.row(name, of["median"], of["lower"], of["upper"], of["ms"])
     return table.figures
 
 
