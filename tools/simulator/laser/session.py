@@ -106,14 +106,12 @@ def _robot(settings: LaserSettings) -> Robot:
     front, back, half, cut = 0.35, -0.45, 0.3, settings.front_cut_m
     corners = [(back, half), (back, -half), (front - cut, -half), (front, cut - half),
                (front, half - cut), (front - cut, half)]  # fmt: skip
-    if cut == 0.0:
-        corners = [(back, half), (back, -half), (front, -half), (front, half)]
     mounts = (("front", (0.36, 0.0, 0.0)), ("rear", (-0.46, 0.0, np.pi)))
     onboard = tuple(sick(name, np.array(pose), settings) for name, pose in mounts)
     limits = settings.driving
-    return Robot(
-        np.array(corners), 1.25 * limits.speed_m_s, 1.25 * limits.turn_rad_s, onboard
-    )  # fmt: skip
+    # Without a cut there are two corners less.
+    outline = np.array(list(dict.fromkeys(corners)))
+    return Robot(outline, 1.25 * limits.speed_m_s, 1.25 * limits.turn_rad_s, onboard)
 
 
 def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:
