@@ -23,34 +23,27 @@ LOCKED_FOR = ("Linux", "x86_64", (3, 11))
 _WRONG_HASH = "DO NOT MATCH THE HASHES"
 
 
-def main() -> int:
-    """Make the environment named on the command line; 0 when it is ready."""
+def main() -> None:
+    """Make the environment named on the command line; ends with 1 if that fails."""
     # Whatever python3 is installed runs this: it may be older than the project's code.
     if sys.version_info < (3, 11):  # noqa: UP036
         found = ".".join(str(part) for part in sys.version_info[:3])
-        print(
-            f"error: python3 is {found}: expected 3.11 or newer (make PYTHON=...)", file=sys.stderr
-        )
-        return 1
+        sys.exit(f"error: python3 is {found}: expected 3.11 or newer (make PYTHON=...)")
     environment = Path(sys.argv[1]).absolute()
     if environment.is_symlink():
-        print(
+        sys.exit(
             f"error: {environment} is a link to {environment.resolve()}: expected a folder of "
-            "this checkout: what is made anew there would be missing elsewhere",
-            file=sys.stderr,
+            "this checkout: what is made anew there would be missing elsewhere"
         )
-        return 1
     environment = environment.resolve()
     stamp = environment / "ready"
     wanted = _fingerprint(environment)
     if stamp.is_file() and stamp.read_text() == wanted:
-        return 0
+        return
     print(f"setting up {environment.name} (once; a few minutes on a slow connection)", flush=True)
     if not _installed(environment):
-        print("error: the packages could not be installed (see above)", file=sys.stderr)
-        return 1
+        sys.exit("error: the packages could not be installed (see above)")
     stamp.write_text(wanted)
-    return 0
 
 
 def _installed(environment: Path) -> bool:
@@ -97,9 +90,8 @@ def _compile_modules(environment: Path) -> None:
 
 def _installed_unlocked(environment: Path, why: str) -> bool:
     print(f"{why}: installing what pyproject.toml allows, without hashes", flush=True)
-    pip = _new_environment(environment)
-    command = [*pip, "install", "--quiet", "--editable", f"{ROOT}[dev]"]
-    return subprocess.run(command, check=False).returncode == 0
+    own = [*_new_environment(environment), "install", "--quiet", "--editable", f"{ROOT}[dev]"]
+    return subprocess.run(own, check=False).returncode == 0
 
 
 def _new_environment(environment: Path) -> list[str]:
@@ -125,4 +117,4 @@ def _fingerprint(environment: Path) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -16,7 +16,7 @@ def test_held_out_photographs_are_explained_as_well_as_by_opencv(
 ) -> None:
     """Of some 500 discs of a photograph every sixth says as much."""
     photographs = shared_data / "discs" / "dev"
-    found = compare(photographs, group, free_aspect=True, peers=["rational"], every=every)
+    found = compare(photographs, group, peers=["rational"], every=every)
     assert found.views >= 5
     for split, errors in found.errors.items():
         assert errors["ours"] <= errors["rational"], split

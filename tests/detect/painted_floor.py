@@ -49,9 +49,7 @@ class PaintedFloor:
     ) -> PaintedFloor:
         x, y = np.asarray(floor_xy, np.float64).tolist()
         crop = _rendered(self.camera, (x, y), radius_m, grey, self.floor, blur_px)
-        height, width = crop.grey.shape
-        part = np.s_[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width]
-        self.grey[part] += crop.grey - self.floor
+        self.grey[crop.window] += crop.grey - self.floor
         return self
 
     def shape(self, floor_xy: ArrayLike, inside: Shape, grey: float = LIGHT) -> PaintedFloor:
@@ -94,4 +92,4 @@ def _rendered(
     blur_px: float,
 ) -> DiscCrop:  # fmt: skip
     """Half of all discs of the tests are painted more than once."""
-    return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px, rounded=False)
+    return render_disc(camera, floor_xy, radius_m, grey, floor, blur_px)

@@ -28,7 +28,7 @@ from lut import DiscTable, VoteTable, build_vertical_table, cached_disc_table, r
 from tests.detect.line_scene import mirrored
 from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
 from tools.detector_maps import quality_of_centres
-from tools.evaluation.accuracy import Scene, measure_accuracy
+from tools.evaluation.accuracy import measure_accuracy
 
 FloatArray = NDArray[np.float64]
 
@@ -344,7 +344,7 @@ def test_mirrored_discs_are_refined_alike(published_camera: Camera, seed: int) -
 
 @pytest.mark.long
 def test_refined_discs_are_accurate_and_their_covariance_honest(published_camera: Camera) -> None:
-    result = measure_accuracy(published_camera, DEFAULT, Scene(), discs=200, seed=4)
+    result = measure_accuracy(published_camera, DEFAULT, discs=200, seed=4)
     assert result.failed <= 2  # four rows high, and alone in their images
     assert np.sqrt(np.mean(result.error_px**2)) <= 0.02
     assert 0.5 <= float(np.mean(result.normalised_error)) <= 1.5

@@ -98,8 +98,7 @@ def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
     """A picture enlarged to a scaled camera's size, with a sensor's noise."""
     size = (camera.width, camera.height)
     grey = np.asarray(cv2.resize(picture.grey, size, interpolation=cv2.INTER_CUBIC), np.float64)
-    noisy = grey + np.random.default_rng(seed).normal(0.0, _SENSOR_NOISE, grey.shape)
-    return jpeg_picture(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return jpeg_picture(_taken(grey, _SENSOR_NOISE, seed))
 
 
 def repeated_run(run: Run, folder: Path, frames: int, most_copies: int | None = None) -> Path:
@@ -178,10 +177,9 @@ def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray
     """A bare floor with light discs, blurred and noisy. `places` (N, 2); returns (H, W)."""
     grey = np.full((camera.height, camera.width), _FLOOR)
     for place in places:
-        crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX, rounded=False)
-        height, width = crop.grey.shape
-        grey[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width] += crop.grey - _FLOOR
-    return _taken(grey, seed)
+        crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX)
+        grey[crop.window] += crop.grey - _FLOOR
+    return _taken(grey, _NOISE, seed)
 
 
 def wall_with_edges(camera: Camera, count: int, seed: int) -> ByteArray:
@@ -199,12 +197,12 @@ def wall_with_edges(camera: Camera, count: int, seed: int) -> ByteArray:
     edges = centre + half * (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)
     light = np.searchsorted(edges, bearing) % 2 == 1
     share = light.reshape(camera.height, _FINE, camera.width, _FINE).mean(axis=(1, 3))
-    return _taken(_DARK + (_LIGHT - _DARK) * share, seed)
+    return _taken(_DARK + (_LIGHT - _DARK) * share, _NOISE, seed)
 
 
-def _taken(grey: FloatArray, seed: int) -> ByteArray:
+def _taken(grey: FloatArray, noise: float, seed: int) -> ByteArray:
     """Grey values with the noise of a sensor, rounded."""
-    noisy = grey + np.random.default_rng(seed).normal(0.0, _NOISE, grey.shape)
+    noisy = grey + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
     return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
 
 

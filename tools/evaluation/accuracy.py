@@ -24,6 +24,8 @@ from tools.evaluation.tables import Table
 from tools.simulator.single_disc import render_disc
 
 _BLURS_PX = (0.3, 0.7, 1.2)
+#: Grey values of the disc and the floor, and the standard deviation of their noise.
+_LIGHT, _DARK, _NOISE = 220.0, 60.0, 2.0
 _BINS_M = ((0.0, 1.5), (1.5, 2.5), (2.5, 4.0), (4.0, 7.0))
 
 
@@ -38,18 +40,8 @@ class Accuracy:
     failed: int  # Discs that were not found.
 
 
-@dataclass(frozen=True)
-class Scene:
-    """A light disc on a floor, as the camera takes it."""
-
-    light: float = 220.0  # Grey value of the discs.
-    dark: float = 60.0  # Grey value of the floor.
-    blur_px: float = 0.7  # Standard deviation of the optics' blur along u.
-    noise: float = 2.0  # Standard deviation of the noise, grey levels.
-
-
 def measure_accuracy(
-    camera: Camera, settings: CircleSettings, scene: Scene, *, discs: int, seed: int
+    camera: Camera, settings: CircleSettings, *, discs: int, seed: int, blur_px: float = 0.7
 ) -> Accuracy:
     """Render and detect discs."""
     table = cached_vote_table(camera, vote_shape(settings))
@@ -61,7 +53,7 @@ def measure_accuracy(
     for index in rng.integers(len(rows), size=discs):
         nearest = np.array([columns[index], rows[index]], np.int64)
         true_xy = camera.floor_from_pixel(nearest + rng.uniform(-0.5, 0.5, 2))
-        image = _render(camera, scene, true_xy, settings.radius_m, rng)
+        image = _render(camera, true_xy, settings.radius_m, blur_px, rng)
         found = detect_circles(image, camera, table, settings)
         off = found.floor_xy - true_xy
         if not (np.hypot(*off.T) < 0.5 * settings.radius_m).any():
@@ -75,18 +67,14 @@ def measure_accuracy(
 
 
 def _render(
-    camera: Camera, scene: Scene, true_xy: FloatArray, radius_m: float, rng: np.random.Generator
+    camera: Camera, true_xy: FloatArray, radius_m: float, blur_px: float, rng: np.random.Generator
 ) -> ByteArray:
-    """An image of the bare floor with one disc on it."""
-    floor = scene.dark + rng.normal(0.0, scene.noise, (camera.height, camera.width))
-    image = np.clip(np.rint(floor), 0, 255).astype(np.uint8)
-    blur = (scene.blur_px, scene.blur_px * camera.scale_y / camera.scale_x)
-    crop = render_disc(
-        camera, true_xy, radius_m, scene.light, scene.dark, blur, scene.noise, rng=rng
-    )
-    height, width = crop.grey.shape
-    image[crop.v0 : crop.v0 + height, crop.u0 : crop.u0 + width] = crop.grey
-    return image
+    """An image of the bare floor with one light disc on it; `blur_px` is the blur along u."""
+    grey = _DARK + rng.normal(0.0, _NOISE, (camera.height, camera.width))
+    blur = (blur_px, blur_px * camera.scale_y / camera.scale_x)
+    crop = render_disc(camera, true_xy, radius_m, _LIGHT, _DARK, blur)
+    grey[crop.window] = crop.grey + rng.normal(0.0, _NOISE, crop.grey.shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -103,10 +91,12 @@ class AccuracyStudy(Study):
             {"blur px": ".1f", "distance m": "<10", "discs": "d", "rms u px": "9.4f",
              "rms v px": "9.4f", "both px": "8.4f", "normalised": ".3f"}, keys=2
         )  # fmt: skip
+        settings = CircleSettings(tilt_sigma_deg=0.0)
+        bins = [(f"{low:.1f}-{high:.1f}", low, high) for low, high in _BINS_M]
         for blur_px in _BLURS_PX:
-            settings, scene = CircleSettings(tilt_sigma_deg=0.0), Scene(blur_px=blur_px)
-            result = measure_accuracy(camera, settings, scene, discs=self.discs, seed=self.seed)
-            bins = [(f"{low:.1f}-{high:.1f}", low, high) for low, high in _BINS_M]
+            result = measure_accuracy(
+                camera, settings, discs=self.discs, seed=self.seed, blur_px=blur_px
+            )
             for label, low, high in [*bins, ("all", 0.0, np.inf)]:
                 chosen = (result.distance_m >= low) & (result.distance_m < high)
                 if chosen.any():

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from tyro.conf import Positional
 
 from camera import Camera, read_camera
 from camera.boards.board import Board, charuco_of
-from camera.calibration.model import project_points
-from camera.rotations import cross_matrices, rotation_of
-from camera.uncertainty import intrinsics_of, pixel_grid
+from camera.rotations import rotation_of
+from camera.uncertainty import pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError
 from tools.evaluation.figures import Figures, Study
@@ -163,17 +163,13 @@ def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True)
     pixels = pixel_grid(camera.width, camera.height, 49, 37)
     rays = camera.unproject(pixels)
     rotation = np.eye(3)
-    intrinsics = intrinsics_of(other)
-    for _ in range(10 if rotate else 0):
-        turned = rays @ rotation.T
-        found, _, by_point = project_points(intrinsics, turned)
-        turn = -by_point @ cross_matrices(turned)
-        good = np.all(np.isfinite(found), axis=1)
-        error = (pixels - found)[good].ravel()
-        step = np.linalg.lstsq(turn[good].reshape(-1, 3), error, rcond=None)[0]
-        rotation = rotation_of(np.asarray(step, dtype=np.float64)) @ rotation
-        if np.abs(step).max() < 1e-12:
-            break
+    if rotate:
+        seen = np.isfinite(other.project(rays)).all(axis=1)
+
+        def off(turn: FloatArray) -> FloatArray:
+            return (other.project(rays[seen] @ rotation_of(turn).T) - pixels[seen]).ravel()
+
+        rotation = rotation_of(least_squares(off, np.zeros(3), xtol=1e-14, ftol=1e-14).x)
     found = other.distort((rays @ rotation.T)[:, :2] / (rays @ rotation.T)[:, 2:])
     return np.asarray(np.linalg.norm(found - pixels, axis=1).reshape(37, 49))
 

@@ -50,14 +50,12 @@ def calibrate_rendered(
     *,
     views: int,
     seed: int,
-    blur_px: float = 0.6,
-    noise: float = 2.0,
 ) -> Rendered:
     """Render pictures of a board, find its points, calibrate."""
     rays = rays_of(camera)
     seen, poses = [], []
     for i, (R, t) in enumerate(board_poses(camera, board, views, seed, distances_m=distances_m)):
-        image = render_board(rays, board, R, t, blur_px=blur_px, noise=noise, seed=seed + i)
+        image = render_board(rays, board, R, t, seed=seed + i)
         try:
             indices, pixels = find_board(image, board)
         except CalibrationError:
@@ -99,7 +97,7 @@ class FixedBoard(Board):
 
 
 def read_group(
-    folder: Path, group: str, every: int = 1
+    folder: Path, group: str, every: int
 ) -> tuple[list[BoardView], Board, tuple[int, int]]:
     """Photographs of a camera below a folder, one of `every` discs each: views, board, size."""
     views: list[BoardView] = []
@@ -176,17 +174,13 @@ def compare(
     folder: Path,
     group: str,
     *,
-    free_aspect: bool,
-    polynomial: bool = False,
     peers: Sequence[str] = tuple(OPENCV),
     every: int = 1,
 ) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
-    settings = CalibrationSettings(
-        aspect=None if free_aspect else 1.0, polynomial=True if polynomial else None, robust=False,
-        keep_outliers=True,
-    )  # fmt: skip
+    # Both scales are free, as in OpenCV.
+    settings = CalibrationSettings(aspect=None, robust=False, keep_outliers=True)
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV has no correction for circles.
     points, lens = result.points, result.lens
@@ -208,8 +202,6 @@ class CameraRendered(Study):
     camera: Positional[Path]  # The true camera.
     boards: tuple[str, ...] = tuple(BOARDS)  # `checkerboard`, `charuco`, `asymmetric-circles`.
     views: int = 24  # Number of pictures.
-    blur_px: float = 0.6  # Standard deviation of a Gaussian blur.
-    noise: float = 2.0  # Standard deviation of a pixel's noise; ink and paper differ by 160.
     seed: int = 7  # Of everything random.
 
     def measured(self) -> Figures:
@@ -222,10 +214,7 @@ class CameraRendered(Study):
         )  # fmt: skip
         for name in self.boards:
             board, distances = BOARDS[name]
-            made = calibrate_rendered(
-                camera, board, distances, views=self.views, seed=self.seed,
-                blur_px=self.blur_px, noise=self.noise,
-            )  # fmt: skip
+            made = calibrate_rendered(camera, board, distances, views=self.views, seed=self.seed)
             result = made.calibration
             fixed = projection_difference(camera, made.camera, rotate=False).max()
             turned = projection_difference(camera, made.camera)
@@ -248,8 +237,6 @@ class CameraPhotographs(Study):
 
     folder: Positional[Path]  # Folder of photographs with truth.
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras, by prefix of the names.
-    free_aspect: bool = True  # Both scales free, as in OpenCV; else equal.
-    polynomial: bool = False  # Radial distortion k1 k2 k3; else chosen automatically.
 
     def measured(self) -> Figures:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
@@ -259,9 +246,7 @@ class CameraPhotographs(Study):
              "free here": "<"}
         )  # fmt: skip
         for group in self.groups:
-            r = compare(
-                self.folder, group, free_aspect=self.free_aspect, polynomial=self.polynomial
-            )
+            r = compare(self.folder, group)
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
         return table.figures

@@ -23,6 +23,7 @@ from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem, load_gtsam
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, read_recording
+from tools.benchmark.timing import measure_in_turn
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 from tools.simulator.driving import step_covariance
@@ -138,20 +139,22 @@ class MapSpeed(Study):
         solvers: dict[str, Callable[[], tuple[float, int]]] = {own: separable}
         for kind in ("LevenbergMarquardt", "Dogleg", "GaussNewton"):
             solvers[f"GTSAM {kind}"] = partial(_plain_gtsam, kind, graph, start)
-        seconds: dict[str, list[float]] = {name: [] for name in solvers}
-        reached = {}
-        for _ in range(self.repeats):
-            for name, solver in solvers.items():
-                begin = time.perf_counter()
-                reached[name] = solver()
-                seconds[name].append(time.perf_counter() - begin)
+        reached: dict[str, tuple[float, int]] = {}
+
+        def timed(name: str, _: int) -> None:
+            reached[name] = solvers[name]()
+
+        functions = {name: partial(timed, name) for name in solvers}
+        seconds = measure_in_turn(
+            functions, 1, self.repeats, np.inf, time.perf_counter, warm_up=False
+        )
         table = Table(
             {"solver": "<26", "steps": "d", "chi-squared": ".2f", "least s": ".2f",
              "median s": ".2f", "ratio": ".2f"}
         )  # fmt: skip
         for name, times in seconds.items():
             chi_squared, steps = reached[name]
-            ratio = min(seconds[own]) / min(times)
-            table.row(name, steps, chi_squared, min(times), float(np.median(times)), ratio)
+            ratio = seconds[own].min() / times.min()
+            table.row(name, steps, chi_squared, times.min(), np.median(times), ratio)
         print("ratio: time of slam map's solver by that of the row's, least of each")
         return table.figures

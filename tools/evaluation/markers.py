@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from detect.markers.candidates import closing
 from detect.markers.detect import detect_markers
 from detect.settings import MarkerSettings
 from tools.benchmark.material import decode, jpeg_picture
-from tools.benchmark.timing import measure_in_turn
+from tools.benchmark.timing import decodings, measure_in_turn
 from tools.evaluation.figures import WRONG, Figures, Study
 from tools.evaluation.markers_statistics import (
     FOUND,
@@ -23,12 +23,12 @@ from tools.evaluation.markers_statistics import (
     OURS,
     PEERS,
     ScoredFrame,
-    binned,
+    bins_of,
     counts_lines,
-    detector_of,
     known_to_opencv,
     print_bins,
     scored_frame,
+    search,
     table_of,
 )
 from tools.evaluation.tables import Table
@@ -56,14 +56,6 @@ _BUDGET_S = 20.0
 _WIDTH_WITHOUT_MARKER_PX = 60.0
 
 
-class Offence(NamedTuple):
-    """Something that must not happen, and where it did."""
-
-    detector: str
-    kind: str
-    place: str
-
-
 def score_frames(
     settings: SampleSettings, detectors: tuple[str, ...], frames: int, seed: int, jobs: int = 1
 ) -> list[ScoredFrame]:
@@ -75,30 +67,29 @@ def _score(
     settings: SampleSettings, detectors: tuple[str, ...], seed: int, index: int
 ) -> ScoredFrame:
     frame = sample_frame(settings, seed, index)
-    found = {name: detector_of(name)(frame.image, frame.camera, frame.dictionary)
-             for name in detectors}  # fmt: skip
-    return scored_frame(frame, found)
+    shown = frame.image, frame.camera, frame.dictionary
+    return scored_frame(frame, {name: search(name, *shown) for name in detectors})
 
 
-def offences(frames: Sequence[ScoredFrame]) -> list[Offence]:
-    """All false and misidentified markers in rendered frames."""
+def offences(frames: Sequence[ScoredFrame]) -> list[str]:
+    """All false and misidentified markers that we found in rendered frames."""
     result = []
     for frame in frames:
         place = f"seed {frame.seed} frame {frame.index} {frame.dictionary}"
-        for name, outcome in frame.outcomes.items():
-            result += [Offence(name, "false", f"{place} id {i}") for i in outcome.false]
-            for row in frame.rows[outcome.status == MISIDENTIFIED]:
-                about = (
-                    f"width {row[0]:.0f} px slant {row[1]:.0f} blur {row[2]:.1f} px "
-                    f"contrast {row[3]:.0f} clear {row[6]:.0f}"
-                )
-                result.append(Offence(name, "misidentified", f"{place} {about}"))
+        outcome = frame.outcomes[OURS]
+        result += [f"{OURS}: false: {place} id {i}" for i in outcome.false]
+        for row in frame.rows[outcome.status == MISIDENTIFIED]:
+            about = (
+                f"width {row[0]:.0f} px slant {row[1]:.0f} blur {row[2]:.1f} px "
+                f"contrast {row[3]:.0f} clear {row[6]:.0f}"
+            )
+            result.append(f"{OURS}: misidentified: {place} {about}")
     return result
 
 
 def search_photographs(
     folders: Sequence[Path], detector: str, dictionaries: tuple[str, ...], jobs: int = 1
-) -> tuple[int, list[Offence]]:
+) -> tuple[int, list[str]]:
     """Search photographs without markers: how many there were, and what was found.
 
     Raises
@@ -111,12 +102,12 @@ def search_photographs(
     return len(files), [offence for of_one in found for offence in of_one]
 
 
-def _search(name: str, dictionaries: tuple[str, ...], path: Path) -> list[Offence]:
+def _search(name: str, dictionaries: tuple[str, ...], path: Path) -> list[str]:
     image = photograph_of(path)
     return [
-        Offence(name, "false", f"{path.name} {dictionary} id {i}")
+        f"{name}: false: {path.name} {dictionary} id {i}"
         for dictionary in dictionaries
-        for i in detector_of(name)(image, None, dictionary).ids
+        for i in search(name, image, None, dictionary).ids
     ]
 
 
@@ -143,7 +134,7 @@ def time_searches(
         given.append(replace(plain, width_px=float(np.median(widths))))
 
     def peer(name: str, i: int) -> object:
-        return detector_of(name)(sampled[i].image, sampled[i].camera, dictionary)
+        return search(name, sampled[i].image, sampled[i].camera, dictionary)
 
     def close(radius: int, i: int) -> object:
         return closing(sampled[i].image, radius)
@@ -159,9 +150,8 @@ def time_searches(
     seconds = measure_in_turn(functions, frames, rounds, _BUDGET_S)
     columns = ("decodings", "lower", "upper", "ms")
     table = Table({"": "<24", **dict.fromkeys(columns, "8.2f")})
-    for name, taken in seconds.items():
-        lower, median, upper = np.nanpercentile(taken / seconds[DECODING], [25, 50, 75])
-        table.row(name, median, lower, upper, 1e3 * np.nanmedian(taken))
+    for name, of in decodings(seconds, DECODING).items():
+        table.row(name, of["median"], of["lower"], of["upper"], of["ms"])
     return table.figures
 
 
@@ -187,7 +177,7 @@ class Markers(Study):
     jobs: int = 1  # Number of processes.
 
     def measured(self) -> Figures:
-        wrong: list[Offence] = []
+        wrong: list[str] = []
         figures: dict[str, Any] = {}
         measured = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)
         if self.statistics:
@@ -195,8 +185,8 @@ class Markers(Study):
             table = table_of(frames)
             print(f"Statistics, dictionary {self.dictionary}, seed {self.seed}")
             print("\n".join(counts_lines(table)))
-            figures["statistics"] = print_bins(binned(table))
-            wrong += _printed([one for one in offences(frames) if one.detector == OURS])
+            figures["statistics"] = print_bins(table, bins_of(table))
+            wrong += _printed(offences(frames))
             if self.spot:
                 figures["spot"] = self._spot(measured)
         if self.timing:
@@ -230,11 +220,11 @@ class Markers(Study):
         figures = {}
         for label, settings in cases.items():
             print(f"Width 58-62 px, noise 3, {label}")
-            frames = self._scored(settings, max(20, self.statistics // 5))
-            figures[label] = print_bins(binned(table_of(frames))[:1])["all"]
+            table = table_of(self._scored(settings, max(20, self.statistics // 5)))
+            figures[label] = print_bins(table, {"all": bins_of(table)["all"]})["all"]
         return figures
 
-    def _search_frames(self) -> tuple[dict[str, Any], list[Offence]]:
+    def _search_frames(self) -> tuple[dict[str, Any], list[str]]:
         settings = SampleSettings(
             dictionaries=self.dictionaries, samples=_SEARCHED_SAMPLES, photographs=self.backgrounds
         )
@@ -254,9 +244,9 @@ class Markers(Study):
         return printed.figures, offences(frames)
 
 
-def _printed(found: list[Offence]) -> list[Offence]:
+def _printed(found: list[str]) -> list[str]:
     for one in found[:_SHOWN]:
-        print(f"  {one.detector}: {one.kind}: {one.place}")
+        print(f"  {one}")
     if len(found) > _SHOWN:
         print(f"  ... and {len(found) - _SHOWN} more")
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -45,33 +45,24 @@ class Found(NamedTuple):
     """(N, 4, 2, 2) Of the corners, if the detector says."""
 
 
-Detector = Callable[[ByteArray, Camera | None, str], Found]
-
-
-def detector_of(name: str) -> Detector:
-    """A detector: a function of image, calibration and the dictionary's name."""
-    if name == OURS:
-        return _ours
-    if name in _REFINEMENTS:
-        return lambda image, camera, dictionary: _aruco(name, image, dictionary)
-    raise ValueError(f"{name}: no such detector: expected {OURS} or one of {', '.join(PEERS)}")
-
-
 def known_to_opencv(dictionary: str) -> bool:
     """Whether OpenCV has a dictionary of that name."""
     return hasattr(aruco, f"DICT_{dictionary.upper()}")
 
 
-def _ours(image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
-    found = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
-    return Found(found.ids, found.corners, found.covariance)
-
-
-def _aruco(name: str, image: ByteArray, dictionary: str) -> Found:
-    corners, ids, _ = _aruco_detector(name, dictionary).detectMarkers(image)
+def search(detector: str, image: ByteArray, camera: Camera | None, dictionary: str) -> Found:
+    """What a detector, `OURS` or one of `PEERS`, finds in an image (H, W)."""
+    if detector == OURS:
+        own = detect_markers(image, MarkerSettings(dictionary=dictionary), camera)
+        return Found(own.ids, own.corners, own.covariance)
+    if detector not in PEERS:
+        raise ValueError(
+            f"{detector}: no such detector: expected {OURS} or one of {', '.join(PEERS)}"
+        )
+    corners, ids, _ = _aruco_detector(detector, dictionary).detectMarkers(image)
     if ids is None:
         return Found(np.zeros(0, np.int64), np.zeros((0, 4, 2)))
-    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2) - _REFINEMENTS[name][1]
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 2) - _REFINEMENTS[detector][1]
     return Found(np.asarray(ids, dtype=np.int64).ravel(), pixels)
 
 
@@ -203,73 +194,33 @@ BINS: dict[str, tuple[str, tuple[float, ...]]] = {
 _FEWEST = 5
 
 
-class Figures(NamedTuple):
-    """Figures of a detector for the clear markers of a bin; errors NaN if it found too few."""
-
-    rate: float  # Share of the markers that were found.
-    median_px: float  # Of the distances of corners from the truth.
-    rms_px: float
-    q95_px: float
-    normalised: float
-    """Mean squared error over the covariance per degree of freedom; NaN without covariances."""
-
-
-class Bin(NamedTuple):
-    """Figures of all detectors over the clear markers in one range of a quantity."""
-
-    label: str
-    markers: int
-    own: dict[str, Figures]  # By detector, over all markers that it found.
-    shared: dict[str, tuple[float, float]]
-    """By peer: our median error and the peer's over the markers that both found, pixels."""
-
-    @property
-    def ahead(self) -> bool:
-        """Whether we find at least as many as every peer, at smaller medians as far as known."""
-        fewer = any(f.rate > self.own[OURS].rate for f in self.own.values())
-        return not fewer and not any(ours >= peer for ours, peer in self.shared.values())
-
-
-def binned(table: Table) -> list[Bin]:
-    """Figures of all markers that are clearly in view, and by bins of each quantity."""
+def bins_of(table: Table) -> dict[str, BoolArray]:
+    """(M,) which markers are clearly in view, and which of them are in each bin of a quantity."""
     clear = table.columns["clear"] > 0.0
-    bins = [_bin(table, clear, "all")]
+    bins = {"all": clear}
     for quantity, (title, limits) in BINS.items():
         values = table.columns[quantity]
         for low, high in itertools.pairwise(limits):
             inside = (values >= low) & ((values < high) | (values == limits[-1]) & (values == high))
-            bins.append(_bin(table, clear & inside, f"{title} {low:g}-{high:g}"))
+            bins[f"{title} {low:g}-{high:g}"] = clear & inside
     return bins
 
 
-def _bin(table: Table, inside: BoolArray, label: str) -> Bin:
-    found = {name: inside & (of.status == FOUND) for name, of in table.outcomes.items()}
-    markers = int(inside.sum())
-    own = {
-        name: _figures(of, found[name], found[name].sum() / max(markers, 1))
-        for name, of in table.outcomes.items()
-    }
-    shared = {}
-    if OURS in found:
-        for name in (name for name in found if name != OURS):
-            both = found[OURS] & found[name]
-            ours, peer = (_figures(table.outcomes[of], both, 1.0) for of in (OURS, name))
-            shared[name] = ours.median_px, peer.median_px
-    return Bin(label, markers, own, shared)
-
-
-def _figures(outcome: Outcome, found: BoolArray, rate: float) -> Figures:
-    """Errors over some of the markers that were found."""
+def _errors(outcome: Outcome, found: BoolArray) -> tuple[float, float, float, float]:
+    """Median, root mean square and 95 % quantile of the distances of corners from the truth, and
+    the mean squared error over the covariance per degree of freedom; NaN if too few were found.
+    """
     if found.sum() < _FEWEST:
-        return Figures(rate, *[float("nan")] * 4)
+        return (np.nan,) * 4
     distances = np.linalg.norm(outcome.errors_px[found], axis=-1)
     normalised = outcome.normalised[found]
     known = np.isfinite(normalised)
-    return Figures(
-        rate, float(np.median(distances)), float(np.sqrt(np.mean(distances**2))),
+    return (
+        float(np.median(distances)),
+        float(np.sqrt(np.mean(distances**2))),
         float(np.quantile(distances, 0.95)),
-        float(np.mean(normalised[known])) if known.any() else float("nan"),
-    )  # fmt: skip
+        float(np.mean(normalised[known])) if known.any() else np.nan,
+    )
 
 
 def counts_lines(table: Table) -> list[str]:
@@ -285,20 +236,32 @@ def counts_lines(table: Table) -> list[str]:
     return lines
 
 
-def print_bins(bins: list[Bin]) -> dict[str, Any]:
+def print_bins(table: Table, bins: dict[str, BoolArray]) -> dict[str, Any]:
     """Print detection rate and corner errors (pixels) by bins, and where a peer is ahead.
 
     Errors over the markers that each detector found itself; then our median and the peer's over
     those that both found. Returns the figures.
     """
-    table = tables.Table(
+    printed = tables.Table(
         {"": "<28", "detector": "<14", "markers": "d", "found": ".3f", "median": ".3f",
          "rms": ".3f", "95 %": ".3f", "error^2/dof": ".2f", "both: ours": ".3f", "peer": ".3f"},
         keys=2,
     )  # fmt: skip
-    for b in (b for b in bins if b.markers):
-        for name, own in b.own.items():
-            table.row(b.label, name, b.markers, *own, *b.shared.get(name, (np.nan, np.nan)))
-    behind = [b.label for b in bins if not b.ahead]
+    behind = []
+    for label, inside in bins.items():
+        markers, own = int(inside.sum()), table.outcomes[OURS]
+        ours = inside & (own.status == FOUND)
+        ahead = True
+        for name, outcome in table.outcomes.items() if markers else ():
+            found = inside & (outcome.status == FOUND)
+            medians = np.nan, np.nan
+            if name != OURS:
+                medians = _errors(own, ours & found)[0], _errors(outcome, ours & found)[0]
+            # With too few in common, the medians are unknown.
+            ahead &= found.sum() <= ours.sum() and not medians[0] >= medians[1]
+            printed.row(label, name, markers, found.sum() / markers, *_errors(outcome, found),
+                        *medians)  # fmt: skip
+        if not ahead:
+            behind.append(label)
     print(f"BEHIND a peer in error or rate: {', '.join(behind) or 'nowhere'}")
-    return table.figures
+    return printed.figures

@@ -32,23 +32,11 @@ _LEAST, _WORST = 5, 10
 _FAR_SIGMAS = 4.0
 
 
-class DiscTilt(NamedTuple):
-    """Pitch and roll of one frame by its discs."""
+class Tilt(NamedTuple):
+    """Pitch and roll of one frame."""
 
-    discs: int
-    pitch_rad: float
-    roll_rad: float
+    angles: FloatArray  # (2,) radians.
     covariance: FloatArray  # (2, 2), square radians.
-
-
-@dataclass(frozen=True, eq=False)
-class TiltComparison:
-    """The two tilts of the frames that have enough lines and discs."""
-
-    prefixes: list[str]
-    by_lines: FloatArray  # (N, 2) Pitch and roll, radians.
-    by_discs: FloatArray  # (N, 2)
-    squared: FloatArray  # (N,) Squared difference in units of both covariances; 2 is expected.
 
 
 def tilt_of_discs(
@@ -57,10 +45,10 @@ def tilt_of_discs(
     map_xy: FloatArray,
     pose: FloatArray,
     raised_m: float = 0.0,
-    usual: tuple[float, float] | None = None,
-) -> DiscTilt:
+    usual: FloatArray | None = None,
+) -> Tilt:
     """Pose, pitch and roll that put discs of a map where the camera saw them, robustly.
-    `rows_xy` (N, 2); `map_xy` (N, 2); `pose` (3,).
+    `rows_xy` (N, 2); `map_xy` (N, 2); `pose` (3,); `usual` (2,).
     """
     seen = image_positions(camera, rows_xy)
     # Errors are about equal in all directions of the lens, whatever the shape of a pixel.
@@ -74,7 +62,7 @@ def tilt_of_discs(
             return np.asarray(of_discs)
         return np.concatenate([of_discs, (tilt - usual) / _SPREAD_RAD])
 
-    start = np.array([*pose, *(usual or (0.0, 0.0))])
+    start = np.array([*pose, *(np.zeros(2) if usual is None else usual)])
     scale = [0.1, 0.1, 0.1, 0.01, 0.01]
     found = least_squares(residuals, start, loss="soft_l1", x_scale=scale)
     # From there, errors beyond some standard deviations are another disc's.
@@ -82,73 +70,64 @@ def tilt_of_discs(
     freedom = len(found.fun) - _UNKNOWNS
     variance = max(2.0 * found.cost / max(freedom, 1), 1.0)
     covariance = variance * np.linalg.pinv(found.jac.T @ found.jac)
-    return DiscTilt(len(rows_xy), found.x[3], found.x[4], covariance[3:, 3:])
+    return Tilt(found.x[3:], covariance[3:, 3:])
 
 
 def compare_tilts(
     camera: Camera, rows: Path, tilts: Path, map_path: Path, path_path: Path, raised_m: float = 0.0
-) -> TiltComparison:
-    """Compare the tilts of a `.tilt` file with those of the discs of a map."""
+) -> dict[str, tuple[Tilt, Tilt]]:
+    """By image, the tilt of a `.tilt` file and that of the discs of a map, if there are enough."""
     discs = read_map(map_path).discs
     place = dict(zip(discs.ids.tolist(), discs.xy, strict=True))
     path = read_path(path_path)
     poses = {image_name(p): pose for p, pose in zip(path.prefixes, path.poses, strict=True)}
     by_lines = {image_name(prefix): tilt for prefix, tilt in read_tilts(tilts).items()}
-    prefixes, first, measured = [], [], []
+    of_lines, measured = {}, {}
     for frame in read_frames(rows):
         name = image_name(frame.step.prefix)
         tilt, pose = by_lines.get(name), poses.get(name)
-        known = [
-            ((row.px, row.py), place[row.ids[0]])
-            for row in frame.circles
-            if row.ids and row.ids[0] in place
-        ]
+        known = [row for row in frame.circles if row.ids and row.ids[0] in place]
         if tilt is None or pose is None or tilt.lines < _LEAST or len(known) < _LEAST:
             continue
-        rows_xy, map_xy = (np.array(side) for side in zip(*known, strict=True))
-        prefixes.append(name)
-        first.append(tilt)
-        measured.append((rows_xy, map_xy, pose))
-    alone = [tilt_of_discs(camera, *given, raised_m) for given in measured]
-    usual = np.median([(one.pitch_rad, one.roll_rad) for one in alone] or [(0.0, 0.0)], axis=0)
-    shown = [
-        tilt_of_discs(camera, *given, raised_m, (float(usual[0]), float(usual[1])))
-        for given in measured
-    ]
-    squared = []
-    for tilt, disc in zip(first, shown, strict=True):
-        covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]) + disc.covariance
-        off = tilt.pitch - disc.pitch_rad, tilt.roll - disc.roll_rad
-        squared.append(float(squared_mahalanobis(off, covariance)))
-    return TiltComparison(
-        prefixes,
-        np.array([(tilt.pitch, tilt.roll) for tilt in first]).reshape(-1, 2),
-        np.array([(disc.pitch_rad, disc.roll_rad) for disc in shown]).reshape(-1, 2),
-        np.array(squared),
-    )
+        covariance = np.array([[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]])
+        of_lines[name] = Tilt(np.array([tilt.pitch, tilt.roll]), covariance)
+        rows_xy = np.array([(row.px, row.py) for row in known])
+        measured[name] = rows_xy, np.array([place[row.ids[0]] for row in known]), pose
+    alone = [tilt_of_discs(camera, *given, raised_m).angles for given in measured.values()]
+    usual = np.median(alone, axis=0) if alone else None
+    return {
+        name: (of_lines[name], tilt_of_discs(camera, *given, raised_m, usual))
+        for name, given in measured.items()
+    }
 
 
-def figures_of(result: TiltComparison) -> dict[str, Any]:
+def figures_of(tilts: dict[str, tuple[Tilt, Tilt]]) -> dict[str, Any]:
     """Print medians, means and spreads (degrees), and the frames that differ most; the figures."""
-    names = (
+    columns = (
         f"{axis} {what}" for what in ("median", "mean", "spread") for axis in ("pitch", "roll")
     )
-    table = Table({"tilt of": "<11", **dict.fromkeys(names, "+.3f")})
-    off = np.degrees(result.by_lines - result.by_discs)
-    by_lines, by_discs = np.degrees(result.by_lines), np.degrees(result.by_discs)
+    table = Table({"tilt of": "<11", **dict.fromkeys(columns, "+.3f")})
+    by_lines, by_discs = (
+        np.degrees([tilt.angles for tilt in of]).reshape(-1, 2) for of in zip(*tilts.values())
+    )
+    off = np.degrees([lines.angles - discs.angles for lines, discs in tilts.values()])
     for name, values in (("verticals", by_lines), ("discs", by_discs), ("difference", off)):
         table.row(name, *np.median(values, axis=0), *values.mean(axis=0), *values.std(axis=0))
+    squared = np.array([
+        squared_mahalanobis(lines.angles - discs.angles, lines.covariance + discs.covariance)
+        for lines, discs in tilts.values()
+    ])  # fmt: skip
     # Of the differences in both covariances, per axis, as shares of the expected.
     squares = {
         "frames": len(off),
-        "mean square": result.squared.mean() / 2.0,
-        "median square": np.median(result.squared) / (2.0 * np.log(2.0)),
-        f"beyond {_FAR_SIGMAS:g} sigma": np.sum(result.squared > _FAR_SIGMAS**2),
+        "mean square": squared.mean() / 2.0,
+        "median square": np.median(squared) / (2.0 * np.log(2.0)),
+        f"beyond {_FAR_SIGMAS:g} sigma": np.sum(squared > _FAR_SIGMAS**2),
     }
     print_figures(squares)
-    for k in np.argsort(-result.squared)[:_WORST]:
-        sigmas = np.sqrt(result.squared[k])
-        print(f"  {result.prefixes[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, {sigmas:.1f} sigma")
+    for k in np.argsort(-squared)[:_WORST]:
+        sigmas = np.sqrt(squared[k])
+        print(f"  {list(tilts)[k]}: {off[k, 0]:+.2f} {off[k, 1]:+.2f}, {sigmas:.1f} sigma")
     return {**squares, **table.figures}
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -22,7 +23,6 @@ from detect.sources.interface import bounded_content, decode_gray, eight_bits, g
 from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses, velocity_poses
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
-from redetect.array_types import ByteArray
 from redetect.landmarks import LandmarkError
 from redetect.landmarks.files import read_head
 from redetect.storage.image_headers import claimed_size
@@ -86,20 +86,16 @@ def _encoded() -> tuple[bytes, ...]:
     return tuple(image.tobytes() for image in found)
 
 
-class _Message:
-    """An image message whose fields are at the beginning of a file."""
-
-    def __init__(self, content: bytes) -> None:
-        fields = struct.unpack("<IIIB", content[:13].ljust(13, b"\0"))
-        self.height, self.width, self.step, self.is_bigendian = fields
-        encoding, _, data = content[13:].partition(b"\n")
-        self.encoding = encoding.decode("utf-8", "replace")
-        self.data: ByteArray = np.frombuffer(data, np.uint8)
-
-
 def _image_message(path: Path) -> object:
-    stored = gray_of_pixels(pixels_of_message(_Message(path.read_bytes()), path), path)
-    image = eight_bits(stored, path)
+    """An image message whose fields are at the beginning of a file."""
+    content = path.read_bytes()
+    height, width, step, big = struct.unpack("<IIIB", content[:13].ljust(13, b"\0"))
+    encoding, _, data = content[13:].partition(b"\n")
+    message = SimpleNamespace(
+        height=height, width=width, step=step, is_bigendian=big,
+        encoding=encoding.decode("utf-8", "replace"), data=np.frombuffer(data, np.uint8),
+    )  # fmt: skip
+    image = eight_bits(gray_of_pixels(pixels_of_message(message, path), path), path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image

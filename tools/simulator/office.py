@@ -52,31 +52,30 @@ def _add_walls(office: Office, paint: Look, room_paint: Look, rng: np.random.Gen
     casing = Look(albedo=float(rng.choice([0.12, 0.2, 0.8])))
     leaf = leaves[int(rng.integers(len(leaves)))]
 
-    def doors(wall: str, line: float, begin: float, end: float, inward: int) -> list[Opening]:
-        """Doors of the rooms that lie along a corridor wall."""
-        found: list[Opening] = []
-        for room in rooms:
-            across = room.door[1] if wall in ("south", "north") else room.door[0]
-            if room.door_wall != wall or abs(across - line) > 1e-6:
-                continue
-            if not begin <= room.door_at <= end:
-                continue
-            opened: float | None = 0.0
-            if room.enterable:
-                opened = float(rng.choice([80.0, 92.0, 105.0])) if rng.random() < 0.85 else None
-            s = room.door_at - begin
-            found.append(
-                Door(
-                    s - 0.5 * _DOOR_M, s + 0.5 * _DOOR_M, 0.0, DOOR_HEIGHT_M, leaf_deg=opened,
-                    inward=inward, hinge_at_end=bool(rng.random() < 0.5), casing=casing, leaf=leaf,
-                )
-            )  # fmt: skip
-        return found
+    def door(room: Room, s: float, inward: int) -> Door:
+        opened: float | None = 0.0
+        if room.enterable:
+            opened = float(rng.choice([80.0, 92.0, 105.0])) if rng.random() < 0.85 else None
+        return Door(
+            s - 0.5 * _DOOR_M, s + 0.5 * _DOOR_M, 0.0, DOOR_HEIGHT_M, leaf_deg=opened,
+            inward=inward, hinge_at_end=bool(rng.random() < 0.5), casing=casing, leaf=leaf,
+        )  # fmt: skip
 
     def corridor_wall(
-        start: tuple[float, float], end: tuple[float, float], openings: list[Opening],
-        corridor_is_left: bool, extend: tuple[bool, bool],
+        side: str, start: tuple[float, float], end: tuple[float, float],
+        extend: tuple[bool, bool] = (True, True),
     ) -> None:  # fmt: skip
+        """A wall with the doors of the rooms beside it, whose door wall is on that side."""
+        # Doors open into the rooms, away from the corridor.
+        corridor_is_left = side in ("north", "west")
+        along = 0 if side in ("south", "north") else 1
+        openings: list[Opening] = [
+            door(room, room.door_at - start[along], -1 if corridor_is_left else 1)
+            for room in rooms
+            if room.door_wall == side
+            and abs(room.door[1 - along] - start[1 - along]) <= 1e-6
+            and start[along] <= room.door_at <= end[along]
+        ]
         left, right = (paint, room_paint) if corridor_is_left else (room_paint, paint)
         add_wall(building, start, end, openings, left, right, extend)
         p, q = np.array(start), np.array(end)
@@ -90,31 +89,18 @@ def _add_walls(office: Office, paint: Look, room_paint: Look, rng: np.random.Gen
                 office.free_spans.append((place, until - at))
             at = until if hole is None else hole.end + 0.12
 
-    # The rows of rooms south and north; their doors open into the rooms.
-    for wall, y, inward in (
-        ("north", low - HALF_CORRIDOR_M, -1),
-        ("south", high + HALF_CORRIDOR_M, 1),
-    ):
-        openings = doors(wall, y, 0.0, WIDTH_M, inward)
-        corridor_wall((0.0, y), (WIDTH_M, y), openings, inward < 0, (False, False))
-    # The blocks between the corridors.
     half = HALF_CORRIDOR_M
-    borders = [0.0, *(x + side for x in SHORT_CORRIDORS_X for side in (-half, half)), WIDTH_M]
-    pieces = list(zip(borders[::2], borders[1::2]))
-    for x0, x1 in pieces:
-        extend = (x0 > 0.0, x1 < WIDTH_M)
-        y = low + HALF_CORRIDOR_M
-        corridor_wall((x0, y), (x1, y), doors("south", y, x0, x1, 1), False, extend)
-        y = high - HALF_CORRIDOR_M
-        corridor_wall((x0, y), (x1, y), doors("north", y, x0, x1, -1), True, extend)
-    y0, y1 = low + HALF_CORRIDOR_M, high - HALF_CORRIDOR_M
-    for k, middle in enumerate(SHORT_CORRIDORS_X):
-        x = middle - half
-        openings = doors("east", x, y0, y1, 1) if k == 0 else []
-        corridor_wall((x, y0), (x, y1), openings, False, (True, True))
-        x = middle + half
-        openings = doors("west", x, y0, y1, -1) if k == 2 else []
-        corridor_wall((x, y0), (x, y1), openings, True, (True, True))
+    # The rows of rooms south and north.
+    for side, y in (("north", low - half), ("south", high + half)):
+        corridor_wall(side, (0.0, y), (WIDTH_M, y), (False, False))
+    # The blocks between the corridors.
+    borders = [0.0, *(x + off for x in SHORT_CORRIDORS_X for off in (-half, half)), WIDTH_M]
+    for x0, x1 in zip(borders[::2], borders[1::2]):
+        for side, y in (("south", low + half), ("north", high - half)):
+            corridor_wall(side, (x0, y), (x1, y), (x0 > 0.0, x1 < WIDTH_M))
+    for middle in SHORT_CORRIDORS_X:
+        for side, x in (("east", middle - half), ("west", middle + half)):
+            corridor_wall(side, (x, low + half), (x, high - half))
     _add_partitions(building, rooms, room_paint)
     _add_outer_walls(building, rooms, room_paint, rng)
 

@@ -75,7 +75,6 @@ class RunPlan:
     pictures: list[tuple[float, float, float, float, float, float]]
     disc_ids: IntArray
     disc_xy: FloatArray
-    disc_radius_m: float
     lookalikes: list[tuple[str, float, float]]
     poses: FloatArray  # (frames + 1, 3) true poses: before the first step and after each.
     tilts_rad: FloatArray  # (frames, 2) tilt (p, q) at each frame.
@@ -129,7 +128,6 @@ def plan_run(settings: RunSettings, *, lit: bool = True) -> RunPlan:
         pictures=office.building.pictures,
         disc_ids=np.array([m.disc_id for m in discs], dtype=np.int64),
         disc_xy=np.array([[m.x, m.y] for m in discs]).reshape(-1, 2),
-        disc_radius_m=DISC_RADIUS_M,
         lookalikes=[(m.label, m.x, m.y) for m in office.building.marks if m.disc_id < 0],
         poses=poses,
         tilts_rad=robot_tilt(frames, settings.style, random_for(seed, "tilt")),
@@ -235,9 +233,10 @@ def render_frame(plan: RunPlan, frame: int) -> FrameTruth:
 
 def _truth(plan: RunPlan, frame: int, jpeg: bytes | None, grey: ByteArray | None) -> FrameTruth:
     camera, pose = plan.true_camera(frame), plan.poses[frame + 1]
-    discs = see_discs(
-        plan.scene, plan.camera, camera, pose, plan.disc_ids, plan.disc_xy, plan.disc_radius_m
-    )
+    seen = partial(see_discs, plan.scene, plan.camera, camera, pose, radius_m=DISC_RADIUS_M)
+    discs = seen(plan.disc_ids, plan.disc_xy)
+    # What looks like a disc counts by its number in the plan.
+    alike_xy = np.array([(x, y) for _, x, y in plan.lookalikes]).reshape(-1, 2)
     edges = [] if grey is None else see_edges(plan.scene, camera, pose, plan.edges, grey)
     unknown = {int(disc) for disc in plan.disc_ids[plan.unlabelled[frame]]}
     return FrameTruth(
@@ -251,17 +250,8 @@ def _truth(plan: RunPlan, frame: int, jpeg: bytes | None, grey: ByteArray | None
         lines=tuple(line_row(e, plan.camera) for e in edges if e.listed),
         discs=tuple(discs),
         edges=tuple(edges),
-        lookalikes=_seen_lookalikes(plan, camera, pose),
+        lookalikes=tuple(seen(np.arange(len(alike_xy)), alike_xy)),
     )
-
-
-def _seen_lookalikes(plan: RunPlan, camera: Camera, pose: FloatArray) -> tuple[SeenDisc, ...]:
-    """What looks like a disc and is in view, by its number in the plan."""
-    if not plan.lookalikes:
-        return ()
-    xy = np.array([(x, y) for _, x, y in plan.lookalikes])
-    numbers = np.arange(len(xy))
-    return tuple(see_discs(plan.scene, plan.camera, camera, pose, numbers, xy, plan.disc_radius_m))
 
 
 def write_run(
@@ -292,7 +282,7 @@ def write_run(
     _write_seen(plan, folder, what, (_CIRCLE_FORMAT, circles), truths, overwrite)
     lines = [t.lines for t in truths]
     _write_landmarks(plan, folder / "map.lines", what, _LINE_FORMAT, lines, overwrite)
-    write_beside(plan, folder, what, truths, overwrite=overwrite)
+    _write_beside(plan, folder, what, truths, overwrite)
     return sum(map(len, circles))
 
 
@@ -311,8 +301,8 @@ def _write_seen(
     write_truth(folder / "truth.json", head, lists, overwrite=overwrite)
 
 
-def write_beside(
-    plan: RunPlan, folder: Path, what: str, truths: Sequence[FrameTruth], *, overwrite: bool
+def _write_beside(
+    plan: RunPlan, folder: Path, what: str, truths: Sequence[FrameTruth], overwrite: bool
 ) -> None:
     """Write what is in view besides the listed discs, as `detect compare` reads it."""
     unlisted = [tuple(_nominal_row(d) for d in truth.discs if not d.listed) for truth in truths]
@@ -401,7 +391,7 @@ def _truth_of(
             "picture": "x0, y0, x1, y1, z0, z1 of posters: edges inside them are not listed",
         },
         "settings": {k: v for k, v in asdict(plan.settings).items() if k != "camera_text"},
-        "disc_radius_m": plan.disc_radius_m,
+        "disc_radius_m": DISC_RADIUS_M,
         "start": rounded(plan.poses[0], 9),
     }
     used = sorted({e.edge_id for t in truths for e in t.edges})

@@ -7,11 +7,11 @@ here uses a detector's tables or models.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from camera import Camera
@@ -78,16 +78,16 @@ def polygon_coverage(x: FloatArray, y: FloatArray, width: int, height: int) -> F
 
 
 _OUTLINE_POINTS = 2048
+_CELLS = 8  # per pixel and axis, on which the blur is computed
 _BLUR_REACH = 5.0  # standard deviations after which the blur is cut off
-_WHITEST = 255
+_SURROUND = 2.0  # radii about the disc's centre that a crop shows, as far as they are in the image
 
 
 class DiscCrop(NamedTuple):
-    """The part of an image round one disc: ``grey[j, i]`` is pixel ``(u0 + i, v0 + j)``."""
+    """The part of an image round one disc."""
 
-    grey: NDArray[Any]  # (H, W) grey values: uint8 if they were rounded, else float64.
-    u0: int  # Column of the image that is the crop's first.
-    v0: int  # Row of the image that is the crop's first.
+    grey: FloatArray  # (H, W) grey values, neither rounded nor noisy.
+    window: tuple[slice, slice]  # Rows and columns of the image that it shows.
 
 
 def render_disc(
@@ -97,13 +97,6 @@ def render_disc(
     light: float = 200.0,
     dark: float = 100.0,
     blur_px: float | tuple[float, float] = 0.0,
-    noise_sigma: float = 0.0,
-    supersampling: int = 8,
-    rng: np.random.Generator | None = None,
-    *,
-    row_aperture: float = 1.0,
-    surround: float = 2.0,
-    rounded: bool = True,
 ) -> DiscCrop:
     """Render one disc on a uniform floor as the camera sees it.
 
@@ -116,30 +109,15 @@ def render_disc(
     blur_px : float or pair of floats
         Standard deviation of the optics' Gaussian blur in pixels, along u and v. (The optics of an
         interlaced camera blur a single field half as many pixels along v as along u.)
-    noise_sigma : float
-        Standard deviation of the Gaussian noise, grey values; needs `rng`.
-    supersampling : int
-        Cells per pixel and axis on which the blur is computed. Without blur and with a full
-        aperture every value gives the same exact coverage.
-    row_aperture : float
-        Height of a pixel's sensitive area in rows, (0, 1]: 1 for the data set's fields if a sensor
-        line pair is read out together, 0.5 if each row is one line of the full frame.
-    surround : float
-        The crop holds the image of a circle of this many radii (clipped to the image).
-    rounded : bool
-        Whether to round to grey values 0..255 (uint8) or to return floats.
 
     Raises
     ------
     ValueError
-        If there is noise without `rng`, or part of the disc is not in front of the camera.
+        If part of the disc is not in front of the camera, or none of it is in the image.
     """
     blur_u, blur_v = blur_px if isinstance(blur_px, tuple) else (blur_px, blur_px)
-    if noise_sigma > 0.0 and rng is None:
-        raise ValueError("rng is None: expected a numpy Generator, since there is noise")
-
     outline = _outline(camera, floor_xy, radius_m)
-    u0, v0, u1, v1 = _crop_bounds(camera, floor_xy, radius_m * surround, outline)
+    u0, v0, u1, v1 = _crop_bounds(camera, floor_xy, radius_m * _SURROUND, outline)
     # The blur reaches in from beyond the crop, so the grid is wider than the crop.
     pad_u = int(np.ceil(_BLUR_REACH * blur_u)) + 1
     pad_v = int(np.ceil(_BLUR_REACH * blur_v)) + 1
@@ -149,20 +127,15 @@ def render_disc(
     bottom = max(v1 + pad_v, int(np.ceil(outline[:, 1].max())) + 1)
 
     # Pixel centres are integers, cell corners are the kernel's: half a pixel between them.
-    x, y = np.ascontiguousarray(((outline - (left, top) + 0.5) * supersampling).T)
-    columns, rows = (right - left + 1) * supersampling, (bottom - top + 1) * supersampling
-    covered = np.abs(polygon_coverage(x, y, columns, rows))
-    sigmas = blur_u * supersampling, blur_v * supersampling
+    x, y = np.ascontiguousarray(((outline - (left, top) + 0.5) * _CELLS).T)
+    columns, rows = right - left + 1, bottom - top + 1
+    covered = np.abs(polygon_coverage(x, y, columns * _CELLS, rows * _CELLS))
+    sigmas = blur_u * _CELLS, blur_v * _CELLS
     blurred = gaussian_filter(covered.T, sigmas, mode="nearest", truncate=_BLUR_REACH)
-    share = _integrated(np.ascontiguousarray(blurred.T), supersampling, row_aperture)
+    cells = np.ascontiguousarray(blurred.T).reshape(rows, _CELLS, columns, _CELLS)
+    share = cells.mean(axis=3).mean(axis=1)
     share = share[v0 - top : v1 - top + 1, u0 - left : u1 - left + 1]
-
-    grey = dark + (light - dark) * share
-    if rng is not None and noise_sigma > 0.0:
-        grey = grey + rng.normal(0.0, noise_sigma, grey.shape)
-    if not rounded:
-        return DiscCrop(grey, u0, v0)
-    return DiscCrop(np.clip(np.rint(grey), 0, _WHITEST).astype(np.uint8), u0, v0)
+    return DiscCrop(dark + (light - dark) * share, (slice(v0, v1 + 1), slice(u0, u1 + 1)))
 
 
 def _outline(camera: Camera, floor_xy: ArrayLike, radius_m: float) -> FloatArray:
@@ -190,12 +163,3 @@ def _crop_bounds(
     if u0 > u1 or v0 > v1:
         raise ValueError(f"the disc at {floor_xy!r} is not in the image")
     return int(u0), int(v0), int(u1), int(v1)
-
-
-def _integrated(covered: FloatArray, supersampling: int, row_aperture: float) -> FloatArray:
-    """Mean over each pixel's sensitive area: full width, `row_aperture` of the height."""
-    height, width = (side // supersampling for side in covered.shape)
-    cells = covered.reshape(height, supersampling, width, supersampling).mean(axis=3)
-    border = np.arange(supersampling + 1) / supersampling - 0.5
-    inside = np.clip(border, -0.5 * row_aperture, 0.5 * row_aperture)
-    return np.asarray(np.einsum("hsw,s->hw", cells, np.diff(inside) / row_aperture))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
 from redetect.plane import apply
-from tools.simulator.laser.writers import write_robot, write_scans
+from tools.simulator.laser.session_files import write_robot, write_scans
 
 FloatArray = NDArray[np.float64]
 

@@ -37,7 +37,7 @@ from tests.groundtruth.lasers.scene import (
     scanner,
     write_session,
 )
-from tools.simulator.laser.writers import write_building, write_scans
+from tools.simulator.laser.session_files import write_building, write_scans
 
 FloatArray = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ from redetect.groundtruth.lasers.building import (
     read_building,
 )
 from redetect.storage import OutputExistsError
-from tools.simulator.laser.writers import write_building, write_drawing
+from tools.simulator.laser.session_files import write_building, write_drawing
 
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 

@@ -28,7 +28,7 @@ from redetect.groundtruth.lasers.scanners import (
     write_scanners,
 )
 from redetect.storage import OutputExistsError
-from tools.simulator.laser.writers import write_robot, write_scans
+from tools.simulator.laser.session_files import write_robot, write_scans
 
 
 def sick(name: str = "fixed0", **changes: Any) -> Scanner:

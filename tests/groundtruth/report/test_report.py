@@ -27,7 +27,7 @@ from redetect.groundtruth.report.pictures import (
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.reporting.page import Part, Section, page_of
 from tests.groundtruth.comparison import compare_streams
-from tools.simulator.laser.writers import write_building
+from tools.simulator.laser.session_files import write_building
 
 HOSTILE = "\"><script>alert(1)</script><img src=x onerror=alert(2)>\x00\ud800 </style> & 'onload="
 NAMES = """html head meta title style body a header nav ul li main section h1 h2 p div table caption

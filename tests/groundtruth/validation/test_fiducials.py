@@ -16,7 +16,7 @@ from redetect.groundtruth.validation.reference_poses import (
     read_distances,
     read_survey,
 )
-from tools.simulator.laser.writers import write_distances, write_survey
+from tools.simulator.laser.session_files import write_distances, write_survey
 
 SURVEY = Survey(
     {"SW": np.array([0.0, 0.5]), "column": np.array([6.25, -3.0])},

@@ -26,7 +26,7 @@ from redetect.groundtruth.validation.scoring import (
     reference_errors,
     score_poses,
 )
-from tools.simulator.laser.writers import (
+from tools.simulator.laser.session_files import (
     write_building,
     write_distances,
     write_robot,

@@ -29,12 +29,12 @@ from tools.evaluation.markers_statistics import (
     Found,
     Outcome,
     ScoredFrame,
-    binned,
+    bins_of,
     counts_lines,
-    detector_of,
     known_to_opencv,
     print_bins,
     score_frame,
+    search,
     table_of,
 )
 from tools.simulator.markers.samples import SampleSettings, sample_frame
@@ -100,22 +100,17 @@ def test_bins_compare_like_with_like(capsys: pytest.CaptureFixture[str]) -> None
     every = np.ones(20, bool)
     large = widths > 100.0
     table = table_of(_scored(widths, {OURS: 0.1, "aruco": 0.3}, {OURS: every, "aruco": large}))
-    bins = binned(table)
-    assert bins[0].label == "all"
-    assert bins[0].own[OURS].rate == 1.0
-    assert bins[0].own["aruco"].rate == 0.5
-    assert bins[0].own[OURS].median_px == pytest.approx(0.1)
-    assert bins[0].shared["aruco"] == pytest.approx((0.1, 0.3))
-    assert bins[0].ahead
-    by_width = {b.label: b for b in bins}
-    assert by_width["width / px 28-40"].own["aruco"].rate == 0.0
-    assert by_width["width / px 28-40"].ahead
-    assert by_width["width / px 130-200"].markers == 10
-    behind = binned(
-        table_of(_scored(widths, {OURS: 0.4, "aruco": 0.3}, {OURS: large, "aruco": every}))
-    )
-    assert not behind[0].ahead
-    figures = print_bins(behind)
+    figures = print_bins(table, bins_of(table))
+    assert "BEHIND a peer in error or rate: nowhere" in capsys.readouterr().out
+    assert figures["all"][OURS]["found"] == 1.0
+    assert figures["all"]["aruco"]["found"] == 0.5
+    assert figures["all"][OURS]["median"] == pytest.approx(0.1)
+    both = figures["all"]["aruco"]["both: ours"], figures["all"]["aruco"]["peer"]
+    assert both == pytest.approx((0.1, 0.3))
+    assert figures["width / px 28-40"]["aruco"]["found"] == 0.0
+    assert figures["width / px 130-200"]["aruco"]["markers"] == 10
+    behind = table_of(_scored(widths, {OURS: 0.4, "aruco": 0.3}, {OURS: large, "aruco": every}))
+    figures = print_bins(behind, bins_of(behind))
     assert figures["all"]["aruco"]["found"] == 1.0
     assert "BEHIND a peer in error or rate: all" in capsys.readouterr().out
 
@@ -123,12 +118,12 @@ def test_bins_compare_like_with_like(capsys: pytest.CaptureFixture[str]) -> None
 def test_every_marker_is_in_one_bin_of_each_quantity() -> None:
     frames = score_frames(SampleSettings(samples=4), (OURS,), frames=2, seed=2)
     table = table_of(frames)
-    bins = binned(table)
+    bins = bins_of(table)
     clear = table.columns["clear"] > 0.0
     for quantity, (title, limits) in BINS.items():
         values = table.columns[quantity][clear]
         inside = np.count_nonzero((values >= limits[0]) & (values <= limits[-1]))
-        assert sum(b.markers for b in bins if b.label.startswith(title)) == inside
+        assert sum(b.sum() for name, b in bins.items() if name.startswith(title)) == inside
     assert counts_lines(table)[0].startswith("2 frames")
 
 
@@ -150,7 +145,7 @@ def test_opencv_is_measured_as_it_is() -> None:
     assert known_to_opencv("4x4_50")
     assert not known_to_opencv("rawseeds")
     with pytest.raises(ValueError, match="no such detector"):
-        detector_of("another")
+        search("another", np.zeros((8, 8), np.uint8), None, "4x4_50")
 
 
 def test_offences_name_the_frame() -> None:
@@ -158,7 +153,7 @@ def test_offences_name_the_frame() -> None:
         np.array([MISIDENTIFIED]), np.full((1, 4, 2), np.nan), np.full((1, 4), np.nan), (5,), 0
     )
     frame = ScoredFrame(3, 17, "rawseeds", np.ones((1, 7)), {OURS: outcome})
-    places = [offence.place for offence in offences([frame])]
+    places = offences([frame])
     assert len(places) == 2
     assert all("seed 3 frame 17 rawseeds" in place for place in places)
 
@@ -175,7 +170,7 @@ def test_photographs_are_searched(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "without.png"), np.full((120, 160), 90, np.uint8))
     count, found = search_photographs([tmp_path], "aruco", ("4x4_50",))
     assert count == 2
-    assert [o.place for o in found] == [f"with.png 4x4_50 id {frame.markers[0].id}"]
+    assert found == [f"aruco: false: with.png 4x4_50 id {frame.markers[0].id}"]
     with pytest.raises(ValueError, match="holds no photographs"):
         search_photographs([tmp_path / "none"], "aruco", ("4x4_50",))
 

@@ -22,7 +22,7 @@ from tools.simulator.laser.measuring import (
     true_ranges,
 )
 from tools.simulator.laser.motion import Curve, RobotClock, Route, Stop, measured_path, ptpd_lines
-from tools.simulator.laser.session import plan_session, sides_of
+from tools.simulator.laser.session import plan_session
 from tools.simulator.laser.settings import (
     DrivingLimits,
     Faults,
@@ -30,7 +30,7 @@ from tools.simulator.laser.settings import (
     ReadingErrors,
     WheelErrors,
 )
-from tools.simulator.laser.site import LEG_RADIUS_M, Passer, clearance, rectangle
+from tools.simulator.laser.site import LEG_RADIUS_M, Passer, chain, clearance, rectangle
 
 FloatArray = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def test_a_disc_is_hit_where_its_circle_is(far: float, a: float, r: float, off: 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), angle)
 def test_a_robot_is_hit_like_walls_at_its_place(x: float, y: float, turn: float) -> None:
-    sides = sides_of(np.array([[-0.4, 0.3], [-0.4, -0.3], [0.2, -0.3], [0.4, 0.0], [0.2, 0.3]]))
+    sides = chain([(-0.4, 0.3), (-0.4, -0.3), (0.2, -0.3), (0.4, 0.0), (0.2, 0.3)], closed=True)
     pose = np.array([[x + 3.0, y, turn]])
     there = apply(pose[0], sides.reshape(-1, 2)).reshape(-1, 4)
     none = np.zeros((0, 4))
@@ -106,7 +106,7 @@ def test_a_robot_is_hit_like_walls_at_its_place(x: float, y: float, turn: float)
 
 def test_a_scanner_sees_the_robot_before_the_wall_and_legs_before_both() -> None:
     walls = rectangle(-1.0, -4.0, 6.0, 4.0)
-    square = sides_of(np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]]))
+    square = chain([(0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5), (0.5, -0.5)], closed=True)
     times = np.array([0.0, 1.0])
 
     def robot(t: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from redetect.groundtruth.validation.reference_poses import (
 from redetect.landmarks import wrap_angle
 from redetect.plane import compose
 from tools.simulator.__main__ import main
-from tools.simulator.laser.session import EPOCH_S, SessionPlan, plan_session, sides_of
+from tools.simulator.laser.session import EPOCH_S, SessionPlan, plan_session
 from tools.simulator.laser.session_files import (
     camera_covariances,
     camera_stream,
@@ -40,7 +40,7 @@ from tools.simulator.laser.session_files import (
     write_session,
 )
 from tools.simulator.laser.settings import Faults, LaserSettings
-from tools.simulator.laser.site import Passer, is_covered, legs_of
+from tools.simulator.laser.site import Passer, chain, is_covered, legs_of
 
 FloatArray = NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def test_what_fixed_scanners_saw_is_walls_robot_and_legs(session: tuple[Path, Se
                 np.column_stack([robot.outline, np.zeros(len(robot.outline))]),
             )[:, :2]
             legs = legs_of(list(plan.passers), np.array([time]))[0]
-            body = gap_to(cloud, sides_of(corners))
+            body = gap_to(cloud, chain(corners, closed=True))
             near = np.minimum(gap_to(cloud, plan.site.solid), body)
             for x, y, radius in legs:
                 if radius > 0.0:
@@ -226,7 +226,9 @@ def test_distances_are_measured_while_the_robot_stands(session: tuple[Path, Sess
 def test_points_on_the_robot_are_on_its_outline(session: tuple[Path, SessionPlan]) -> None:
     _, plan = session
     points = np.stack(list(survey_of(plan).robot_points.values()))
-    np.testing.assert_allclose(gap_to(points, sides_of(plan.robot.outline)), 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        gap_to(points, chain(plan.robot.outline, closed=True)), 0.0, atol=1e-12
+    )
 
 
 def test_the_drawing_is_the_map(session: tuple[Path, SessionPlan]) -> None:

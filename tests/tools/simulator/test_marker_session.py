@@ -128,7 +128,7 @@ def test_folder_is_laid_out_as_agreed(folder: Path) -> None:
 def test_images_are_the_plans_views(folder: Path) -> None:
     plan = plan_session(SMALL)
     for name, camera, frame in (("b", 1, 3), ("a", 0, 0)):
-        view = view_frame(plan, camera, frame)
+        view = view_frame(plan, (camera, frame))
         path = folder / name / "images" / f"small.{frame:04d}.png"
         np.testing.assert_array_equal(view.image, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
 
@@ -320,7 +320,7 @@ def test_demo_session_comes_out_again(project_root: Path) -> None:
     for name, camera, frame in (("a", 0, 2), ("b", 1, 11)):
         path = folder / name / "images" / f"m.{frame:04d}.jpg"
         committed = read_grey(path)
-        image = view_frame(plan, camera, frame).image
+        image = view_frame(plan, (camera, frame)).image
         # JPEG, and other machines may round differently in the last digit.
         assert np.abs(image.astype(int) - committed.astype(int)).mean() < 2.0
     truth = json.loads((folder / "truth.json").read_text())

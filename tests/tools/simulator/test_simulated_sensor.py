@@ -90,8 +90,7 @@ def _image(
     place = camera.floor_from_pixel(np.array(pixel, dtype=np.float64))
     crop = render_disc(camera, place, 0.1, 180.0, 60.0)
     grey = np.full((camera.height, camera.width), 60.0)
-    rows, columns = crop.grey.shape
-    grey[crop.v0 : crop.v0 + rows, crop.u0 : crop.u0 + columns] = crop.grey
+    grey[crop.window] = np.rint(crop.grey)
     grey += noise * np.random.default_rng(seed).standard_normal(grey.shape)
     return np.clip(np.rint(grey), 0, 255).astype(np.uint8), pixel
 

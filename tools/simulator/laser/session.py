@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,10 +73,7 @@ def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
     route, visits, references = _drive(settings, seed, site)
     scanners = _fixed_scanners(settings, seed)
     faults = settings.faults
-    moved = tuple(
-        replace(s, pose=s.pose + faults.by) if s.name == faults.moved_scanner else s
-        for s in scanners
-    )
+    moved = tuple(displaced(scanners, faults.moved_scanner, faults.by))
     clock = RobotClock(
         route.start_s, settings.clock_offset_s, settings.clock_drift,
         visits[0][0] + faults.clock_jump_at_s if faults.clock_jump_s else float("inf"),
@@ -88,9 +86,11 @@ def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
     )  # fmt: skip
 
 
-def sides_of(outline: FloatArray) -> FloatArray:
-    """(K, 4) sides of a closed polygon of (K, 2) corners."""
-    return np.hstack([outline, np.roll(outline, -1, axis=0)])
+def displaced(
+    scanners: Sequence[Scanner], name: str, by: tuple[float, float, float]
+) -> list[Scanner]:
+    """Scanners of which the one with a name is elsewhere: by x, y (m), theta (rad)."""
+    return [replace(s, pose=s.pose + by) if s.name == name else s for s in scanners]
 
 
 def sick(name: str, pose: FloatArray, settings: LaserSettings) -> Scanner:
@@ -106,14 +106,12 @@ def _robot(settings: LaserSettings) -> Robot:
     front, back, half, cut = 0.35, -0.45, 0.3, settings.front_cut_m
     corners = [(back, half), (back, -half), (front - cut, -half), (front, cut - half),
                (front, half - cut), (front - cut, half)]  # fmt: skip
-    if cut == 0.0:
-        corners = [(back, half), (back, -half), (front, -half), (front, half)]
     mounts = (("front", (0.36, 0.0, 0.0)), ("rear", (-0.46, 0.0, np.pi)))
     onboard = tuple(sick(name, np.array(pose), settings) for name, pose in mounts)
     limits = settings.driving
-    return Robot(
-        np.array(corners), 1.25 * limits.speed_m_s, 1.25 * limits.turn_rad_s, onboard
-    )  # fmt: skip
+    # Without a cut there are two corners less.
+    outline = np.array(list(dict.fromkeys(corners)))
+    return Robot(outline, 1.25 * limits.speed_m_s, 1.25 * limits.turn_rad_s, onboard)
 
 
 def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
@@ -13,30 +14,31 @@ import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.files import write_json
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
+from redetect.groundtruth.lasers.building import HEAD
+from redetect.groundtruth.lasers.scanners import (
+    Robot,
+    Scanner,
+    Scans,
+    scanner_entry,
+    write_scanners,
+)
 from redetect.groundtruth.trajectories.streams import PlanarPoses, write_planar_poses
 from redetect.groundtruth.validation.reference_poses import (
     DIMENSIONS_HEAD,
+    DISTANCES_HEAD,
     FIDUCIAL_DISTANCES_HEAD,
     Distance,
     Survey,
 )
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
+from redetect.storage import write_whole
 from tools.simulator.files import write_lines
 from tools.simulator.laser.measuring import Scene, measured, true_ranges
 from tools.simulator.laser.motion import measured_path, ptpd_lines
-from tools.simulator.laser.session import SessionPlan, plan_session, sides_of
+from tools.simulator.laser.session import SessionPlan, displaced, plan_session
 from tools.simulator.laser.settings import LaserSettings
-from tools.simulator.laser.site import FIDUCIALS, ROOM_M, Passer, legs_of
-from tools.simulator.laser.writers import (
-    write_building,
-    write_distances,
-    write_drawing,
-    write_robot,
-    write_scans,
-    write_survey,
-)
+from tools.simulator.laser.site import FIDUCIALS, ROOM_M, Passer, chain, legs_of
 
 #: How long before and after each visit scans are logged, and the odometry if its log pauses.
 SCAN_MARGIN_S = 2.0
@@ -207,40 +209,32 @@ def _drawn(plan: SessionPlan) -> FloatArray:
 
 
 def _by_hand(
-    scanner: Scanner, sigma_m: float, sigma_deg: float, rng: np.random.Generator
-) -> Scanner:
-    """A scanner with its pose as it was measured."""
+    scanners: Sequence[Scanner], sigma_m: float, sigma_deg: float, rng: np.random.Generator
+) -> list[Scanner]:
+    """Scanners with their poses as they were measured."""
     sigma = np.array([sigma_m, sigma_m, np.deg2rad(sigma_deg)])
-    pose = scanner.pose + sigma * rng.standard_normal(3)
-    return replace(scanner, pose=pose, covariance=np.diag(sigma**2))
-
-
-def _mounted_by_hand(plan: SessionPlan) -> Robot:
-    settings, rng = plan.settings, plan.random("mounts")
-    sigmas = settings.mount_sigma_m, settings.mount_sigma_deg
-    scanners = tuple(_by_hand(scanner, *sigmas, rng) for scanner in plan.robot.scanners)
-    return replace(plan.robot, scanners=scanners)
+    return [
+        replace(s, pose=s.pose + sigma * rng.standard_normal(3), covariance=np.diag(sigma**2))
+        for s in scanners
+    ]
 
 
 def _write_site(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
-    building = _drawn(plan)
+    settings, building, note = plan.settings, _drawn(plan), {"note": NOTE}
     write_building(folder / "building.csv", building, overwrite=overwrite)
     write_drawing(folder / "building.dxf", building, overwrite=overwrite)
-    write_robot(folder / "robot.json", _mounted_by_hand(plan), {"note": NOTE}, overwrite=overwrite)
-    x, y = ROOM_M
-    extra = {"note": NOTE, "covered_area": [[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]]}
-    write_scanners(folder / "scanners.json", _measured_by_hand(plan), extra, overwrite=overwrite)
-    exact = folder / "scanners.truth.json"
-    note = {"note": f"{NOTE}. The exact poses, as the empty room was scanned."}
-    write_scanners(exact, plan.scanners, note, overwrite=overwrite)
-
-
-def _measured_by_hand(plan: SessionPlan) -> list[Scanner]:
-    settings, rng = plan.settings, plan.random("hand")
+    sigmas = settings.mount_sigma_m, settings.mount_sigma_deg
+    mounted = _by_hand(plan.robot.scanners, *sigmas, plan.random("mounts"))
+    robot = replace(plan.robot, scanners=tuple(mounted))
+    write_robot(folder / "robot.json", robot, note, overwrite=overwrite)
     sigmas = settings.hand_sigma_m, settings.hand_sigma_deg
-    scanners = [_by_hand(scanner, *sigmas, rng) for scanner in plan.scanners]
-    name, off = settings.faults.wrong_scanner, np.array(settings.faults.by)
-    return [replace(s, pose=s.pose + off) if s.name == name else s for s in scanners]
+    fixed = _by_hand(plan.scanners, *sigmas, plan.random("hand"))
+    fixed = displaced(fixed, settings.faults.wrong_scanner, settings.faults.by)
+    x, y = ROOM_M
+    extra = {**note, "covered_area": [[0.0, 0.0], [x, 0.0], [x, y], [0.0, y]]}
+    write_scanners(folder / "scanners.json", fixed, extra, overwrite=overwrite)
+    note = {"note": f"{NOTE}. The exact poses, as the empty room was scanned."}
+    write_scanners(folder / "scanners.truth.json", plan.scanners, note, overwrite=overwrite)
 
 
 def _empty_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
@@ -262,7 +256,7 @@ def _fixed_scans(plan: SessionPlan, scanner: Scanner) -> Scans:
     times = times[in_visits(plan, times, SCAN_MARGIN_S)]
     lost_s = times - plan.visits[0][0] - settings.faults.lost_laser_at_s
     times = times[~((lost_s >= 0.0) & (lost_s < settings.faults.lost_laser_s))]
-    sides = sides_of(plan.robot.outline)
+    sides = chain(plan.robot.outline, closed=True)
     scene = Scene(plan.site.solid, plan.route.poses, sides, partial(legs_of, plan.passers))
     ranges = true_ranges(scanner, None, times, scene, settings.reading.sweep_s)
     return measured(times, ranges, scanner, settings.reading, rng)
@@ -314,14 +308,10 @@ def _clock_entry(plan: SessionPlan) -> dict[str, Any]:
         "from_s": None, "reference_s": clock.reference_s, "offset_s": clock.offset_s,
         "drift": clock.drift,
     }  # fmt: skip
-    pieces = [piece]
-    if np.isfinite(clock.jump_at_s):
-        pieces.append(
-            {**piece, "from_s": clock.jump_at_s, "offset_s": clock.offset_s + clock.jump_s}
-        )
+    after = {**piece, "from_s": clock.jump_at_s, "offset_s": clock.offset_s + clock.jump_s}
     return {
         "meaning": "robot_time = t + offset_s + drift (t - reference_s), from from_s on",
-        "pieces": pieces,
+        "pieces": [piece, after] if np.isfinite(clock.jump_at_s) else [piece],
     }
 
 
@@ -330,3 +320,62 @@ def _nearest_m(plan: SessionPlan, passer: Passer) -> float:
     times = np.arange(passer.from_s, passer.to_s, 0.02)
     gaps = passer.places(times)[0] - plan.route.poses(times)[:, :2]
     return round(float(np.nanmin(np.linalg.norm(gaps, axis=1))), 3)
+
+
+def write_scans(path: Path, scans: Scans, *, overwrite: bool = False) -> None:
+    """Write scans as a ``.npz``; the same scans give the same bytes."""
+    with write_whole(path, overwrite=overwrite) as stream:
+        np.savez_compressed(stream, times_s=scans.times_s, ranges_mm=scans.ranges_mm)
+
+
+def write_robot(
+    path: Path, robot: Robot, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
+) -> None:
+    """Write a ``robot.json``, and other entries."""
+    content = {
+        "version": 1,
+        "outline": robot.outline.tolist(),
+        "largest_speed_m_s": robot.largest_speed_m_s,
+        "largest_turn_rad_s": robot.largest_turn_rad_s,
+        "scanners": [scanner_entry(scanner) for scanner in robot.scanners],
+        **(extra or {}),
+    }
+    write_json(path, content, overwrite=overwrite)
+
+
+def write_building(path: Path, walls: FloatArray, *, overwrite: bool = False) -> None:
+    """Write walls (S, 4) as a ``building.csv``, in micrometres."""
+    rows = (",".join(f"{x:.6f}" for x in wall) for wall in walls)
+    write_lines(path, [HEAD, *rows], overwrite=overwrite)
+
+
+def write_drawing(path: Path, walls: FloatArray, *, overwrite: bool = False) -> None:
+    """Write walls (S, 4) as lines on the layer WALLS of a drawing in metres (DXF R12)."""
+    head = "0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n9\n$INSUNITS\n70\n6\n0\nENDSEC"
+    rows = (
+        f"0\nLINE\n8\nWALLS\n10\n{x1:.6f}\n20\n{y1:.6f}\n30\n0.0\n"
+        f"11\n{x2:.6f}\n21\n{y2:.6f}\n31\n0.0"
+        for x1, y1, x2, y2 in walls
+    )
+    entities = ["0\nSECTION\n2\nENTITIES", *rows, "0\nENDSEC\n0\nEOF"]
+    write_lines(path, [head, *entities], overwrite=overwrite)
+
+
+def write_survey(
+    path: Path, survey: Survey, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
+) -> None:
+    """Write a ``fiducials.json``, and other entries."""
+    content = {
+        "version": 1,
+        "fiducials": {name: point.tolist() for name, point in survey.fiducials.items()},
+        "robot_points": {name: point.tolist() for name, point in survey.robot_points.items()},
+        "sigma_m": survey.sigma_m,
+        **(extra or {}),
+    }
+    write_json(path, content, overwrite=overwrite)
+
+
+def write_distances(path: Path, distances: list[Distance], *, overwrite: bool = False) -> None:
+    """Write a ``distances.csv``, in tenths of a millimetre."""
+    rows = [f"{d.pose},{d.time_s:.6f},{d.point},{d.fiducial},{d.distance_m:.4f}" for d in distances]
+    write_lines(path, [DISTANCES_HEAD, *rows], overwrite=overwrite)

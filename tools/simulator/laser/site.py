@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from redetect.array_types import BoolArray, FloatArray
 
@@ -63,9 +64,11 @@ def rectangle(x1: float, y1: float, x2: float, y2: float) -> FloatArray:
     return chain([(x1, y1), (x2, y1), (x2, y2), (x1, y2)], closed=True)
 
 
-def chain(corners: list[tuple[float, float]], *, closed: bool = False) -> FloatArray:
-    """(N, 4) sides between corners."""
-    points = np.array([*corners, corners[0]] if closed else corners)
+def chain(corners: ArrayLike, *, closed: bool = False) -> FloatArray:
+    """(N, 4) sides between corners (N, 2)."""
+    points = np.asarray(corners, dtype=np.float64)
+    if closed:
+        points = np.vstack([points, points[:1]])
     return np.hstack([points[:-1], points[1:]])
 
 

@@ -53,6 +53,7 @@ def board_surface(board: Board, pose: FloatArray) -> Surface:
 #: turned by half a turn looks different.
 DOUBLE = Board("checkerboard", 7, 6, 0.11)
 WORLD = Board("checkerboard", 9, 6, 0.15)
+_BOARDS = {"first": DOUBLE, "second": DOUBLE, "world": WORLD}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ def _world_view(plan: SessionPlan) -> BoardView:
         at = middle + share * (plan.network.world_from_camera[0, :2, 3] - middle)
         pose = planar_transform(float(at[0]), float(at[1]), 0.3)
         pose[2, 3] = 0.004
-        view = _seen(plan, 0, "world", -1, WORLD, pose)
+        view = _seen(plan, 0, "world", -1, pose)
         if view is not None:
             return view
     raise ValueError("no place on the floor where the first camera sees a board")
@@ -135,8 +136,8 @@ def _placed(
     # Whichever of the cameras is on the right sees the first board.
     for right, left in ((one, other), (other, one)):
         views = (
-            _seen(plan, right, "first", placement, DOUBLE, first),
-            _seen(plan, left, "second", placement, DOUBLE, first @ offset),
+            _seen(plan, right, "first", placement, first),
+            _seen(plan, left, "second", placement, first @ offset),
         )
         if views[0] is not None and views[1] is not None:
             return [views[0], views[1]]
@@ -144,10 +145,10 @@ def _placed(
 
 
 def _seen(
-    plan: SessionPlan, camera: int, board: str, placement: int, kind: Board, pose: FloatArray
+    plan: SessionPlan, camera: int, board: str, placement: int, pose: FloatArray
 ) -> BoardView | None:
     """The board in the image, if all of it is in view and not too slanted."""
-    model = plan.network.cameras[camera]
+    model, kind = plan.network.cameras[camera], _BOARDS[board]
     to_camera = plan.camera_from_world[camera] @ pose
     middle = to_camera[:3, 3]
     if -(to_camera[:3, 2] @ middle) < 0.5 * np.linalg.norm(middle):
@@ -159,11 +160,8 @@ def _seen(
     return BoardView(camera, board, placement, pose, model.project(apply(to_camera, kind.points)))
 
 
-def write_calibration_set(
-    plan: SessionPlan, folder: Path, writer: SessionWriter | None = None
-) -> int:
+def write_calibration_set(plan: SessionPlan, folder: Path, writer: SessionWriter) -> int:
     """Write ``rig/`` and ``network/`` below a folder; returns the number of images."""
-    writer = writer or SessionWriter()
     count = _write_rig_images(plan, folder / "rig", writer)
     return count + _write_network_images(plan, folder / "network", writer)
 
@@ -179,14 +177,12 @@ def turning_poses(plan: SessionPlan, camera: int) -> FloatArray:
     rim = np.concatenate(
         [np.column_stack([0.6 * np.cos(a), 0.6 * np.sin(a), np.full(12, z)]) for z in (0.0, 0.8)]
     )
-    nearest = area / 2.0
-    for place in places:
-        seen = apply(plan.camera_from_world[camera], rim + np.append(place, 0.0))
-        pixels = model.project(seen)
-        size = np.array([model.width, model.height])
-        if np.all((pixels > 0.0) & (pixels < size - 1.0)):
-            nearest = place
-            break
+    # (41, 24, 2) pixels; if it is seen whole nowhere, it turns in the middle of the area.
+    rims = rim + np.insert(places, 2, 0.0, axis=1)[:, None]
+    pixels = model.project(apply(plan.camera_from_world[camera], rims))
+    size = np.array([model.width, model.height])
+    whole = np.all((pixels > 0.0) & (pixels < size - 1.0), axis=(1, 2))
+    nearest = places[np.argmax(whole)] if whole.any() else area / 2.0
     turn = np.linspace(-np.pi, np.pi, _TURN_STEPS, endpoint=False) + 0.07 * camera
     return np.column_stack([np.tile(nearest, (_TURN_STEPS, 1)), turn])
 
@@ -241,7 +237,7 @@ def _write_network_images(plan: SessionPlan, folder: Path, writer: SessionWriter
         "note": NOTE,
         "boards": {
             name: {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
-            for name, board in (("first", DOUBLE), ("second", DOUBLE), ("world", WORLD))
+            for name, board in _BOARDS.items()
         },
         "first_from_second": pose_entries(offset),
         "world_from_board": pose_entries(_world_view(plan).pose),

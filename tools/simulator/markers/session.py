@@ -52,11 +52,6 @@ class CalibrationErrors:
     focal: float = 0.0  # Of the focal lengths, as a share of them.
     centre_px: float = 0.0  # Of the principal point along each axis (pixels).
 
-    @property
-    def any(self) -> bool:
-        """Whether there are errors at all."""
-        return any(vars(self).values())
-
 
 def disturbed_network(
     network: Network, errors: CalibrationErrors, rng: np.random.Generator
@@ -250,8 +245,9 @@ def _drive(
     return times, np.concatenate([standing, poses]), speeds
 
 
-def view_frame(plan: SessionPlan, camera: int, frame: int) -> View:
-    """What a camera sees at one of the session's times; depends on no other frame."""
+def view_frame(plan: SessionPlan, which: tuple[int, int]) -> View:
+    """What a camera sees in a frame (both by number); depends on no other frame."""
+    camera, frame = which
     return view_robot(plan, camera, plan.poses[frame], plan.speeds[frame], frame)
 
 
@@ -277,25 +273,25 @@ def _surfaces(plan: SessionPlan, camera_from_world: FloatArray, pose: FloatArray
 
 def _instants(plan: SessionPlan, camera: int, pose: FloatArray, speed: FloatArray) -> FloatArray:
     """Instants of an exposure, as shares from its middle: one for each pixel of motion."""
-    points = plan.rig.robot_from_marker[:, :3, 3]
-    ends = []
-    for offset in (-0.5, 0.5):
-        moved = pose + offset * plan.settings.exposure_s * speed
-        world = se3.apply(planar_transform(*moved.tolist()), points)
-        seen = se3.apply(plan.camera_from_world[camera], world)
-        ends.append(plan.network.cameras[camera].project(seen))
+    points, half = plan.rig.robot_from_marker[:, :3, 3], 0.5 * plan.settings.exposure_s * speed
+    ends = [_pixels(plan, camera, moved, points) for moved in (pose - half, pose + half)]
     way = np.nan_to_num(np.linalg.norm(ends[1] - ends[0], axis=1)).max()
     count = int(np.clip(np.ceil(way), 1, _MOST_EXPOSURES))
     return (np.arange(count) + 0.5) / count - 0.5
 
 
+def _pixels(plan: SessionPlan, camera: int, pose: FloatArray, points: FloatArray) -> FloatArray:
+    """(N, 2) where a camera sees points of the robot at a pose. `points` (N, 3)."""
+    world = se3.apply(planar_transform(*pose.tolist()), points)
+    return plan.network.cameras[camera].project(se3.apply(plan.camera_from_world[camera], world))
+
+
 def _shadowed(plan: SessionPlan, camera: int, pose: FloatArray) -> Float32Array:
     """The background with the robot's soft shadow on the floor."""
-    background, model = plan.background(camera), plan.network.cameras[camera]
+    background = plan.background(camera)
     x, y = 1.15 * np.array(FOOTPRINT_M)
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    world = se3.apply(planar_transform(*pose.tolist()), corners)
-    pixels = model.project(se3.apply(plan.camera_from_world[camera], world))
+    pixels = _pixels(plan, camera, pose, corners)
     if np.isnan(pixels).any():
         return background
     mask = np.zeros(background.shape, np.uint8)
@@ -445,7 +441,7 @@ def write_session(
     writer.calibrations(plan, folder)
     work = [(c, f) for c in range(len(names)) for f in range(len(plan.times_s))]
     seen: list[SeenFrame] = []
-    for (camera, frame), view in zip(work, in_order(partial(_view, plan), work, jobs)):
+    for (camera, frame), view in zip(work, in_order(partial(view_frame, plan), work, jobs)):
         prefix = plan.prefix(frame)
         writer.image(folder, names[camera], prefix, view.image)
         seen.append(SeenFrame(names[camera], prefix, float(plan.times_s[frame]), view.markers))
@@ -455,10 +451,6 @@ def write_session(
     writer.poses(folder / "reference.csv", plan.times_s[still], plan.poses[still])
     writer.truth(folder / "truth.json", plan, seen)
     return len(work)
-
-
-def _view(plan: SessionPlan, work: tuple[int, int]) -> View:
-    return view_frame(plan, *work)
 
 
 def _rows_of(pose: FloatArray) -> list[list[float]]:

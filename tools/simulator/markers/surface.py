@@ -169,9 +169,7 @@ def pattern_distance(dictionary: MarkerDictionary, pattern: BoolArray) -> int:
     """In how many cells a pattern differs, in any of its four rotations, from the nearest marker.
     `pattern` (G, G).
     """
-    known = dictionary.patterns.reshape(len(dictionary), -1)
-    turned = np.stack([np.rot90(pattern, k).ravel() for k in range(4)])
-    return int(min(np.count_nonzero(known != t, axis=1).min() for t in turned))
+    return round(_cells_apart(dictionary, pattern.astype(np.float32)))
 
 
 def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
@@ -187,7 +185,13 @@ def texture_distance(dictionary: MarkerDictionary, texture: Texture) -> float:
     )
     half = 0.5 * dictionary.cell
     limits = np.rint((dictionary.centres[:, None] + [-half, half]) * len(fine)).astype(int)
-    cells = np.array([[fine[a:b, c:d].mean() for c, d in limits] for a, b in limits])
+    return _cells_apart(
+        dictionary, np.array([[fine[a:b, c:d].mean() for c, d in limits] for a, b in limits])
+    )
+
+
+def _cells_apart(dictionary: MarkerDictionary, cells: Float32Array) -> float:
+    """Sum of differences from the nearest marker; cells are 0 to 1, in any rotation."""
     known = dictionary.patterns.reshape(len(dictionary), -1)
     turned = (np.rot90(cells, k).ravel() for k in range(4))
     return float(min(np.abs(known - t).sum(axis=1).min() for t in turned))
