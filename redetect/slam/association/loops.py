@@ -132,16 +132,6 @@ def _agreement(
 
 
 @kernel()
-def _near(turn: float, x: float, y: float, others: FloatArray) -> bool:
-    """Whether a rotation and a shift are near one of others (k, 3)."""
-    for k in range(len(others)):
-        off = math.hypot(x - others[k, 1], y - others[k, 2])
-        if off < _OTHER_SHIFT_M and math.cos(turn - others[k, 0]) > math.cos(_OTHER_TURN_RAD):
-            return True
-    return False
-
-
-@kernel()
 def _best_motion(
     moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray
 ) -> tuple[float, float, float, int, int]:
@@ -149,7 +139,8 @@ def _best_motion(
 
     Every pair of landmarks of the first with every pair of the second of the same length gives a
     motion. Returns the rotation about the first constellation's centre and the shift, the number of
-    agreeing landmarks, and that of motions tried, without those near `besides` (k, 3).
+    agreeing landmarks, and that of motions tried, without those near `besides`: a rotation and a
+    shift (3,), NaN for none.
     """
     n, m = len(moved), len(fixed)
     centre_x, centre_y = 0.0, 0.0
@@ -186,7 +177,9 @@ def _best_motion(
                     shift_x, shift_y = new_x - centre_x, new_y - centre_y
                     if math.hypot(shift_x, shift_y) > search.most_shift_m:
                         continue
-                    if _near(turn, shift_x, shift_y, besides):
+                    off = math.hypot(shift_x - besides[1], shift_y - besides[2])
+                    alike = math.cos(turn - besides[0]) > math.cos(_OTHER_TURN_RAD)
+                    if alike and off < _OTHER_SHIFT_M:
                         continue
                     tried += 1
                     motion = (cos, sin, new_x, new_y)
@@ -315,10 +308,10 @@ def motion_onto(
     `besides` (3,), the best one that is not near this pose.
     """
     centre = moved.sum(axis=0) / max(len(moved), 1)
-    others = np.zeros((0, 3))
+    known = np.full(3, np.nan)
     if besides is not None:
-        others = np.array([[besides[2], *(apply(besides, centre) - centre)]])
-    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search, others)
+        known = np.array([besides[2], *(apply(besides, centre) - centre)])
+    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search, known)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 

@@ -92,15 +92,8 @@ def associate_run(
 ) -> RunAssociation:
     """Find which rows show the same landmark, ignoring IDs in the file.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    settings : AssociateSettings, optional
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m); only bearings of lines need it.
-    progress : callable, optional
-        Called with a description of the current stage.
+    Bearings of lines need the camera's centre in the robot frame, `camera_xy` (2,) (m). `progress`
+    is called with a description of the current stage.
     """
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
@@ -368,10 +361,9 @@ def without_clutter(
 def _nearest_of_frame(frames: IntArray, labels: IntArray, squared: FloatArray) -> BoolArray:
     """(n,) mask of the rows with the least squared error of those with one label in a frame."""
     order = np.lexsort((squared, labels, frames))
-    first = np.ones(len(order), dtype=np.bool_)
-    first[1:] = (np.diff(frames[order]) != 0) | (np.diff(labels[order]) != 0)
+    _, first = np.unique(np.stack([frames, labels])[:, order], axis=1, return_index=True)
     nearest = np.zeros(len(order), dtype=np.bool_)
-    nearest[order] = first
+    nearest[order[first]] = True
     return nearest
 
 
