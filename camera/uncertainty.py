@@ -44,10 +44,8 @@ def intrinsics_of(camera: Camera) -> FloatArray:
 def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> Camera:
     """The camera with other intrinsics, an array as of `intrinsics_of`, and other changes."""
     sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in intrinsics)
-    return replace(
-        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-        tangential=(p1, p2), polynomial=(k1, k2, k3), **changes,
-    )  # fmt: skip
+    lens = {"coef": (a2, a3, b1, b2, b3), "tangential": (p1, p2), "polynomial": (k1, k2, k3)}
+    return replace(camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, **lens, **changes)
 
 
 def with_pose(camera: Camera, pose: FloatArray) -> Camera:
@@ -90,18 +88,8 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """Derivatives of pixels' positions on the floor by the camera's parameters.
-
-    Parameters
-    ----------
-    camera : Camera
-    floor_xy : (N, 2) float64
-        Positions on the floor (m).
-
-    Returns
-    -------
-    (N, 2, 20) float64
-        Of the position assigned to the same pixel.
+    """(N, 2, 20) derivatives, by the camera's parameters, of the positions on the floor that are
+    assigned to the pixels of (N, 2) positions (m).
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     in_camera = offset @ camera.camera_from_robot.T

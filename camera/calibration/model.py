@@ -72,34 +72,24 @@ def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
     return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
 
 
-class _Seen(NamedTuple):
-    """Points in the camera frame through a lens; NaN where it does not see them."""
-
-    z: FloatArray  # (N,)
-    xy: FloatArray  # (N, 2): undistorted normalised coordinates
-    r: FloatArray  # (N,): their radius
-    denominator: FloatArray  # (N,): of the distortion
-    ratio: FloatArray  # (N,): the rational function
-    distorted: FloatArray  # (N, 2): distorted normalised coordinates
+def _normalised(coef: Coef, brown: Brown, points_camera: FloatArray) -> FloatArray:
+    """(N, 2) undistorted normalised coordinates of points; NaN where the lens does not see them."""
+    z = points_camera[:, 2:]
+    xy = points_camera[:, :2] / np.where(z > 0.0, z, np.nan)
+    within = np.hypot(xy[:, :1], xy[:, 1:]) <= one_to_one_radius(coef, brown)
+    return np.where(within, xy, np.nan)
 
 
-def _seen(coef: Coef, brown: Brown, points_camera: FloatArray) -> _Seen:
-    a2, a3, b1, b2, b3 = coef
-    z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
-    xy = points_camera[:, :2] / z[:, None]
-    r = np.hypot(xy[:, 0], xy[:, 1])
-    r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
-    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
-    ratio = r * (a2 + r * a3) / denominator
-    factor = radial_factor(r, coef, polynomial_of(brown))
-    distorted = xy * factor[:, None] + tangential_shift(xy, brown[2:4])
-    return _Seen(z, xy, r, denominator, ratio, distorted)
+def _distorted(coef: Coef, brown: Brown, xy: FloatArray) -> FloatArray:
+    factor = radial_factor(np.hypot(xy[:, 0], xy[:, 1]), coef, polynomial_of(brown))
+    return np.asarray(xy * factor[:, None] + tangential_shift(xy, brown[2:4]))
 
 
 def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
     """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
-    distorted = _seen(*lens_of(intrinsics), points_camera).distorted
-    return np.asarray(intrinsics[:2] * distorted + intrinsics[2:4])
+    lens = lens_of(intrinsics)
+    seen = _distorted(*lens, _normalised(*lens, points_camera))
+    return np.asarray(intrinsics[:2] * seen + intrinsics[2:4])
 
 
 def project_points(
@@ -112,7 +102,12 @@ def project_points(
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
     coef, brown = lens_of(intrinsics)
-    z, xy, r, denominator, ratio, seen = _seen(coef, brown, points_camera)
+    xy = _normalised(coef, brown, points_camera)
+    seen = _distorted(coef, brown, xy)
+    r = np.hypot(xy[:, 0], xy[:, 1])
+    a2, a3, b1, b2, b3 = coef
+    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+    ratio = r * (a2 + r * a3) / denominator
 
     by_intrinsics = np.zeros((len(r), 2, COUNT))
     by_intrinsics[:, [0, 1], [0, 1]] = seen
@@ -125,11 +120,9 @@ def project_points(
     by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
     by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
-    seen_xy = np.where(np.isnan(r)[:, None], np.nan, xy)
-    by_xy = scale[:, None] * distorted_jacobian(seen_xy, coef, brown)
-    by_point = np.empty((len(r), 2, 3))
-    by_point[:, :, :2] = by_xy / z[:, None, None]
-    by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
+    by_xy = scale[:, None] * distorted_jacobian(xy, coef, brown)
+    by_depth = -by_xy @ xy[:, :, None]
+    by_point = np.concatenate([by_xy, by_depth], axis=-1) / points_camera[:, 2, None, None]
     return scale * seen + offset, by_intrinsics, by_point
 
 
