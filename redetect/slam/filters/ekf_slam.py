@@ -50,14 +50,8 @@ _MOST_DISCS = 300
 
 
 class EkfSlam(base.Filter):
-    """The filter.
-
-    Parameters
-    ----------
-    start, start_covariance, camera_xy, common_tilt_variance : array_like
-        As in `Filter`.
-    tilt_sigma_rad : float
-        Standard deviation of the robot's sway about the floor's axes, added to rows' covariances.
+    """The filter; `tilt_sigma_rad` is the standard deviation of the robot's sway about the floor's
+    axes, added to rows' covariances. Other parameters are those of `Filter`.
     """
 
     line_size = 4
