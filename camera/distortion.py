@@ -59,9 +59,6 @@ _SMALLEST_INVERSE = 1e-4
 _LAST_STEP = 1e-9
 
 _NODES = 4096
-# Rounds of refining the place of the first fold; the last is between neighbouring doubles.
-_REFINEMENTS = 6
-_NODES_BETWEEN = 513
 
 
 def radial_factor(
@@ -225,16 +222,18 @@ def one_to_one_radius(coef: Coef, brown: Brown) -> float:
         return limit
     radius = np.tan(np.linspace(0.0, math.atan(limit), _NODES))
     radius[-1] = limit
-    for _ in range(_REFINEMENTS):
-        folded = ~(_least_determinant(radius, coef, polynomial, amount) > 0.0)
-        first = int(np.argmax(folded))
-        if not folded[first]:
-            break
-        # At 0 the determinant is 1.
-        radius = np.linspace(radius[max(first - 1, 0)], radius[first], _NODES_BETWEEN)
-    else:
-        return float(radius[0])
-    return limit
+    folded = ~(_least_determinant(radius, coef, polynomial, amount) > 0.0)
+    if not folded.any():
+        return limit
+    first = int(np.argmax(folded))  # at 0 the determinant is 1
+    before, after = float(radius[first - 1]), float(radius[first])
+    # Bisection, down to neighbouring doubles.
+    while before < (middle := 0.5 * (before + after)) < after:
+        if _least_determinant(np.array(middle), coef, polynomial, amount) > 0.0:
+            before = middle
+        else:
+            after = middle
+    return before
 
 
 def _least_determinant(

@@ -191,19 +191,20 @@ class FreeLens(NamedTuple):
 
         `aspect` is scaleY / scaleX; None: the scales are independent.
         """
-        names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[self.coefficients]]
-        names += [*(TANGENTIAL if self.tangential else ()), *POLYNOMIAL[: self.polynomial]]
         scales = np.zeros((COUNT, 1 if aspect is not None else 2))
         scales[0, 0] = 1.0
         scales[1, -1] = 1.0 if aspect is None else aspect
-        return np.hstack([scales, np.eye(COUNT)[:, [INTRINSICS.index(name) for name in names]]])
+        others = [INTRINSICS.index(name) for name in ("offsetX", "offsetY", *self.names)]
+        return np.hstack([scales, np.eye(COUNT)[:, others]])
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the free coefficients."""
+        radial = [*FREE_COEFFICIENTS[self.coefficients], *POLYNOMIAL[: self.polynomial]]
+        return [*radial, *(TANGENTIAL if self.tangential else ())]
 
     def __str__(self) -> str:
-        names = (
-            *FREE_COEFFICIENTS[self.coefficients], *POLYNOMIAL[: self.polynomial],
-            *(TANGENTIAL if self.tangential else ()),
-        )  # fmt: skip
-        return " ".join(names) or "none"
+        return " ".join(self.names) or "none"
 
 
 @dataclass(frozen=True)

@@ -140,8 +140,7 @@ def in_order(labels: IntArray) -> IntArray:
     """Renumber labels (n,) from 0 without gaps, in the order of their first rows; -1 stays."""
     names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     first[names < 0] = -1
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first)) - np.count_nonzero(names < 0)
+    rank = np.argsort(np.argsort(first)) - np.count_nonzero(names < 0)
     return rank[inverse]
 
 

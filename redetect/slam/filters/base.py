@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -129,26 +130,11 @@ class Filter(ABC):
     consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010): at the
     latest estimates, corrections would add spurious information on the map's orientation.
 
-    Parameters
-    ----------
-    start : (3,) array_like
-        Pose at the start (m, m, rad).
-    start_covariance : (3, 3) array_like or None
-        Its covariance; None if the start defines the map.
-    camera_xy : (2,) array_like
-        The camera's centre in the robot frame (m); only lines need it.
-    common_tilt_variance : float
-        Variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part
-        of the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry
-        looks the same.
-
-    Attributes
-    ----------
-    disc_slots, line_slots : dict of int to int
-        Index of each landmark's first number in the state, by identifier.
-    count : RowCount
-    size : int
-        Number of numbers in the state.
+    Takes the pose at the start (3,) (m, m, rad) and its covariance (3, 3), None if the start
+    defines the map; the camera's centre in the robot frame (2,) (m), which only lines need; and the
+    variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part of
+    the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry looks
+    the same.
     """
 
     #: Number of the state's numbers for a line.
@@ -164,13 +150,14 @@ class Filter(ABC):
         common_tilt_variance: float,
     ) -> None:
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        #: Index of each landmark's first number in the state, by identifier.
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
         self.count = RowCount()
         # Numbers of the pose, and of the common tilt, if there is one.
         self._moving = np.arange(POSE_SIZE + 2 if common_tilt_variance else POSE_SIZE)
         self._tilt = slice(POSE_SIZE, len(self._moving))
-        self.size = len(self._moving)
+        self.size = len(self._moving)  #: Number of numbers in the state.
         self._state = np.zeros(self.size)
         self._state[_POSE] = start
         self._linearised = self._state.copy()
@@ -226,9 +213,7 @@ class Filter(ABC):
         seen = disc_in_robot(pose, self._state[of_discs])
         if self._tilt.stop > self._tilt.start:
             jacobian[: 2 * d, self._tilt] = common_tilt_jacobian(seen).reshape(-1, 2)
-        by_disc = np.zeros((d, 2, d, 2))
-        by_disc[np.arange(d), :, np.arange(d)] = turn.T
-        jacobian[: 2 * d, first : first + 2 * d] = by_disc.reshape(2 * d, 2 * d)
+        jacobian[: 2 * d, first : first + 2 * d] = np.kron(np.eye(d), turn.T)
         jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
         sway = np.zeros((len(jacobian), 2))
         if self.tilt_sigma_rad:
@@ -267,9 +252,7 @@ class Filter(ABC):
         off = wrap_angle(np.repeat(rows.lines.bearing_rad, members) - seen[d:])
         error = np.append(rows.circles.xy.ravel() - seen[:d], mean @ off)
         jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
-        noise = np.diag(np.append(np.zeros(d), rows.lines.sigma_rad**2))
-        at = np.arange(d).reshape(-1, 2)
-        noise[at[:, :, None], at[:, None, :]] = rows.circles.covariance
+        noise = block_diag(*rows.circles.covariance, np.diag(rows.lines.sigma_rad**2))
         noise[:d, :d] += sway[:d] @ sway[:d].T
         return Innovation(error, jacobian, index, noise)
 
@@ -373,14 +356,11 @@ class Associator:
 
     def _discs(self, rows: CircleRows, estimate: Filter) -> IntArray:
         names = _near_discs(rows.xy, estimate)
-        found = np.full(len(rows), UNKNOWN_ID, dtype=np.int64)
-        closest = np.full(len(found), np.inf)
-        if len(names):
-            compared = estimate.compared(rows, names)
-            landmark = compatible(self.method, *compared, self.gate_probability)
-            found = np.append(names, UNKNOWN_ID)[landmark]
-            closest = np.min(individual_distances(*compared), axis=1)
+        compared = estimate.compared(rows, names)
+        landmark = compatible(self.method, *compared, self.gate_probability)
+        found = np.append(names, UNKNOWN_ID)[landmark]
         if self.new_id is not None:
+            closest = np.min(individual_distances(*compared), axis=1, initial=np.inf)
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
                 found[k] = self.new_id()
@@ -390,8 +370,6 @@ class Associator:
         names, slots = np.array([*estimate.line_slots.items()], dtype=np.int64).reshape(-1, 2).T
         away = np.linalg.norm(estimate.state[slots[:, None] + _XY] - estimate.state[:2], axis=1)
         names = names[away < FARTHEST_LINE_M]
-        if not len(names) or not len(rows):
-            return ((),) * len(rows)
         landmark = compatible(self.method, *estimate.compared(rows, names), self.gate_probability)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 

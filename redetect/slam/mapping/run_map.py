@@ -201,45 +201,28 @@ def map_run(
     First odometry and discs are fitted, starting from first sight; then lines are triangulated from
     those poses and everything is fitted together; a robust loss and the mounting start from there.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run. Rows without an identifier are ignored.
-    camera : Camera, optional
-        As calibrated: needed for lines (the origin of bearings), and if the mounting is unknown.
-    weighting : Weighting, optional
-        Loss and unknowns; plain least squares by default.
-    start : (3,)
-        The first pose (m, m, rad).
-    solver : "separable" or "gtsam"
-        The solver for the final optimisation.
-    name : str
-        Name of the run in messages.
-
-    Raises
-    ------
-    SlamError
-        If no row has an identifier, the run is disconnected, or there is no calibration or minimum.
+    Takes the run, whose rows without an identifier are ignored; the camera as calibrated, needed
+    for lines (the origin of bearings), and if the mounting is unknown; loss and unknowns, plain
+    least squares by default; the first pose `start` (3,) (m, m, rad); the solver of the final
+    optimisation; and the run's name in messages. Raises `SlamError` if no row has an identifier,
+    the run is disconnected, or there is no calibration or minimum.
     """
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
     begin = _parts_registered(recording, graph, first_sight(graph, start), name)
-    has_lines = len(recording.lines) > 0
-    plain_only = not has_lines and wanted == Weighting() and solver == "separable"
+    plain_only = not len(recording.lines) and wanted == Weighting() and solver == "separable"
     # First odometry and discs, then with lines.
     minima = [_fitted_to_discs(recording, graph, begin, 1e-10 if plain_only else _COARSE, name)]
     estimate = minima[-1].at
-    placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
-    if has_lines:
-        placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
-        if not len(placed.ids) and not len(graph.disc_ids):
-            raise SlamError(
-                f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its "
-                "own: there is nothing to map"
-            )
-        graph, estimate, with_them = _with_lines(graph, recording, estimate, placed)
-        minima += with_them
+    placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
+    if not len(placed.ids) and not len(graph.disc_ids):
+        raise SlamError(
+            f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its own: "
+            "there is nothing to map"
+        )
+    graph, estimate, with_them = _with_lines(graph, recording, estimate, placed)
+    minima += with_them
     # From there the wanted loss, and last the mounting.
     final: Descent = solve_gtsam
     if solver != "gtsam":
