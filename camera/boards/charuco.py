@@ -89,7 +89,8 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     `marker_share` is the side of the markers in squares. Corners that cannot be seen stay NaN.
     """
     grey = image.astype(np.float64)
-    gradient = np.stack([cv2.Scharr(grey, cv2.CV_64F, 1, 0), cv2.Scharr(grey, cv2.CV_64F, 0, 1)])
+    slopes = [cv2.Scharr(grey, cv2.CV_64F, 1, 0), cv2.Scharr(grey, cv2.CV_64F, 0, 1)]
+    gradient = np.array(slopes, dtype=np.float64)
     white = 0.5 * (1.0 - marker_share)
     known, result = grid, np.full(grid.shape, np.nan)
     wanted, tried = np.isfinite(grid[..., 0]), np.zeros(grid.shape[:2], dtype=bool)

@@ -14,11 +14,9 @@ import numpy as np
 
 from camera.distortion import (
     RADIUS_LIMIT,
-    Brown,
-    Coef,
+    Lens,
     distorted_jacobian,
     one_to_one_radius,
-    polynomial_of,
     radial_factor,
     tangential_shift,
 )
@@ -66,29 +64,29 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _BORDER_PLACES = 9
 
 
-def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
-    """The distortion's (a2, a3, b1, b2, b3) and (k1, k2, p1, p2, k3) of an intrinsics vector."""
+def lens_of(intrinsics: FloatArray) -> Lens:
+    """The distortion of an intrinsics vector."""
     a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = intrinsics[4:].tolist()
-    return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
+    return Lens((a2, a3, b1, b2, b3), (k1, k2, k3), (p1, p2))
 
 
-def _normalised(coef: Coef, brown: Brown, points_camera: FloatArray) -> FloatArray:
+def _normalised(lens: Lens, points_camera: FloatArray) -> FloatArray:
     """(N, 2) undistorted normalised coordinates of points; NaN where the lens does not see them."""
     z = points_camera[:, 2:]
     xy = points_camera[:, :2] / np.where(z > 0.0, z, np.nan)
-    within = np.hypot(xy[:, :1], xy[:, 1:]) <= one_to_one_radius(coef, brown)
+    within = np.hypot(xy[:, :1], xy[:, 1:]) <= one_to_one_radius(lens)
     return np.where(within, xy, np.nan)
 
 
-def _distorted(coef: Coef, brown: Brown, xy: FloatArray) -> FloatArray:
-    factor = radial_factor(np.hypot(xy[:, 0], xy[:, 1]), coef, polynomial_of(brown))
-    return np.asarray(xy * factor[:, None] + tangential_shift(xy, brown[2:4]))
+def _distorted(lens: Lens, xy: FloatArray) -> FloatArray:
+    factor = radial_factor(np.hypot(xy[:, 0], xy[:, 1]), lens)
+    return np.asarray(xy * factor[:, None] + tangential_shift(xy, lens.tangential))
 
 
 def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
     """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
     lens = lens_of(intrinsics)
-    seen = _distorted(*lens, _normalised(*lens, points_camera))
+    seen = _distorted(lens, _normalised(lens, points_camera))
     return np.asarray(intrinsics[:2] * seen + intrinsics[2:4])
 
 
@@ -101,11 +99,11 @@ def project_points(
     2, 14), `by_point` (N, 2, 3).
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
-    coef, brown = lens_of(intrinsics)
-    xy = _normalised(coef, brown, points_camera)
-    seen = _distorted(coef, brown, xy)
+    lens = lens_of(intrinsics)
+    xy = _normalised(lens, points_camera)
+    seen = _distorted(lens, xy)
     r = np.hypot(xy[:, 0], xy[:, 1])
-    a2, a3, b1, b2, b3 = coef
+    a2, a3, b1, b2, b3 = lens.coef
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
     ratio = r * (a2 + r * a3) / denominator
 
@@ -120,7 +118,7 @@ def project_points(
     by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
     by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
-    by_xy = scale[:, None] * distorted_jacobian(xy, coef, brown)
+    by_xy = scale[:, None] * distorted_jacobian(xy, lens)
     by_depth = -by_xy @ xy[:, :, None]
     by_point = np.concatenate([by_xy, by_depth], axis=-1) / points_camera[:, 2, None, None]
     return scale * seen + offset, by_intrinsics, by_point
@@ -149,20 +147,18 @@ def _is_within(
     intrinsics: FloatArray, width: int, height: int, *, share: float, margin: float
 ) -> bool:
     """Whether the image, enlarged by a margin, is within a share of the largest radius."""
-    coef, brown = lens_of(intrinsics)
-    r = share * min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
+    lens = lens_of(intrinsics)
+    r = share * min(one_to_one_radius(lens), RADIUS_LIMIT)
     border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
-    reach = _reach(r, coef, brown, border)
+    reach = _reach(r, lens, border)
     return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + margin) < reach))
 
 
-def _reach(r: float, coef: Coef, brown: Brown, towards: FloatArray) -> FloatArray:
+def _reach(r: float, lens: Lens, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
-    factor = radial_factor(np.array(r), coef, polynomial_of(brown))
-    if not any(brown[2:4]):  # the same in all directions
-        return np.asarray(r * factor)
-    edge = r * _DIRECTIONS
-    edge = edge * factor + tangential_shift(edge, brown[2:4])
+    if not any(lens.tangential):  # the same in all directions
+        return np.asarray(r * radial_factor(np.array(r), lens))
+    edge = _distorted(lens, r * _DIRECTIONS)
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),
         np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
