@@ -100,7 +100,9 @@ def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
     """
     robot = np.asarray(pose, dtype=np.float64)
     offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
-    return np.asarray(np.einsum("...ji,...j->...i", rotation(robot[..., 2]), offset))
+    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
+    x, y = offset[..., 0], offset[..., 1]
+    return np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
 
 
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:

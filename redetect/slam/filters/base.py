@@ -14,7 +14,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
@@ -213,7 +212,9 @@ class Filter(ABC):
         seen = disc_in_robot(pose, self._state[of_discs])
         if self._tilt.stop > self._tilt.start:
             jacobian[: 2 * d, self._tilt] = common_tilt_jacobian(seen).reshape(-1, 2)
-        jacobian[: 2 * d, first : first + 2 * d] = np.kron(np.eye(d), turn.T)
+        by_disc = np.zeros((d, 2, d, 2))
+        by_disc[np.arange(d), :, np.arange(d)] = turn.T
+        jacobian[: 2 * d, first : first + 2 * d] = by_disc.reshape(2 * d, 2 * d)
         jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
         sway = np.zeros((len(jacobian), 2))
         if self.tilt_sigma_rad:
@@ -252,7 +253,9 @@ class Filter(ABC):
         off = wrap_angle(np.repeat(rows.lines.bearing_rad, members) - seen[d:])
         error = np.append(rows.circles.xy.ravel() - seen[:d], mean @ off)
         jacobian = np.concatenate([jacobian[:d], mean @ jacobian[d:]])
-        noise = block_diag(*rows.circles.covariance, np.diag(rows.lines.sigma_rad**2))
+        noise = np.diag(np.append(np.zeros(d), rows.lines.sigma_rad**2))
+        at = np.arange(d).reshape(-1, 2)
+        noise[at[:, :, None], at[:, None, :]] = rows.circles.covariance
         noise[:d, :d] += sway[:d] @ sway[:d].T
         return Innovation(error, jacobian, index, noise)
 
