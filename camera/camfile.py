@@ -40,8 +40,21 @@ _Entries = dict[str, list[tuple[str, int]]]
 def read_camera(path: str | os.PathLike[str]) -> Camera:
     """Read a ``.cam`` file.
 
-    Raises CameraError if it cannot be read or does not describe a possible camera; the message
-    names the file and, if a single line is wrong, the line.
+    Parameters
+    ----------
+    path : path
+        The file.
+
+    Returns
+    -------
+    Camera
+        The calibrated camera.
+
+    Raises
+    ------
+    CameraError
+        If the file cannot be read or does not describe a possible camera; the message names the
+        file and, if a single line is wrong, the line.
     """
     text = read_text(path, LARGEST_FILE_BYTES, "calibration file", CameraError)
     return parse_camera(text, name=os.fspath(path))

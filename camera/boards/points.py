@@ -29,11 +29,25 @@ def find_board(
 ) -> tuple[IntArray, FloatArray]:
     """Find a board's points in an image.
 
-    `window` is half the side of the window in which a checkerboard's corner is refined, as a share
-    of its squares in the image: a larger one averages more, but is more affected by distortion.
+    Parameters
+    ----------
+    image : (H, W) uint8 array
+    board : Board
+    window : float
+        Half the side of the window in which a checkerboard's corner is refined, as a share of its
+        squares in the image: a larger one averages more, but is more affected by distortion.
 
-    Returns indices of `Board.points` (K,), ascending, and their pixels (K, 2). Raises
-    CalibrationError if the board is not there, or too little of a ChArUco board is.
+    Returns
+    -------
+    indices : (K,) int64 array
+        Indices of `Board.points`, ascending.
+    pixels : (K, 2) array
+        Their positions (the top left pixel's centre is 0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        If the board is not there, or too little of a ChArUco board is.
     """
     if board.kind == "charuco":
         indices, pixels = find_charuco(image, board)

@@ -155,8 +155,22 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a camera by views of a board, by the reprojection error.
 
-    `size` is the width and height of the pictures (px). Raises CalibrationError if the views are
-    too few or too much alike, or nothing explains them.
+    Parameters
+    ----------
+    views : sequence of BoardView
+    board : Board
+    size : (int, int)
+        Width and height of the pictures, pixels.
+    settings : CalibrationSettings, optional
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    CalibrationError
+        If the views are too few or too much alike, or nothing explains them.
     """
     settings = settings if settings is not None else CalibrationSettings()
     demand_enough(len(views))

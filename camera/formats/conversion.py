@@ -153,10 +153,26 @@ def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
 def convert_to_foreign(
     source: AnyCamera, model: Model, rows: Rows = "same", *, free: int | None = None
 ) -> Converted:
-    """Convert to one of the other programs' models, exactly or by a fit.
+    """Fit one of the other programs' models.
 
-    `free` is the number of the model's first coefficients that may differ from 0, by default all.
-    Raises ConversionError if the source sees less than half of its image, or the fit fails.
+    Parameters
+    ----------
+    source : Camera or ForeignCamera
+    model : str
+        `radtan`, `rational` or `fisheye`.
+    rows : str
+        `same`, `halve` or `double`.
+    free : int, optional
+        Number of the model's first coefficients that may differ from 0; by default all.
+
+    Returns
+    -------
+    Converted
+
+    Raises
+    ------
+    ConversionError
+        If the source sees less than half of its image, or the fit fails.
     """
     number = COEFFICIENTS[model] if free is None else free
     factor = _FACTORS[rows]

@@ -50,8 +50,14 @@ _MOST_DISCS = 300
 
 
 class EkfSlam(base.Filter):
-    """The filter; `tilt_sigma_rad` is the standard deviation of the robot's sway about the floor's
-    axes, added to rows' covariances. Other parameters are those of `Filter`.
+    """The filter.
+
+    Parameters
+    ----------
+    start, start_covariance, camera_xy, common_tilt_variance : array_like
+        As in `Filter`.
+    tilt_sigma_rad : float
+        Standard deviation of the robot's sway about the floor's axes, added to rows' covariances.
     """
 
     line_size = 4

@@ -21,15 +21,29 @@ from scipy.linalg import block_diag
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.errors import SlamError
-from redetect.slam.filters import base
-from redetect.slam.filters.base import POSE_SIZE
+from redetect.slam.filters.base import (
+    POSE_SIZE,
+    Associator,
+    Filter,
+    FilterRun,
+    FrameRows,
+    run_filter,
+)
 from redetect.slam.options import Localize
 from redetect.slam.recording import NO_CAMERA, Recording, camera_xy_of
 
 
-class Localizer(base.Filter):
-    """The filter; `exact` assumes that the map is exact, whatever its covariances. Other parameters
-    are those of `Filter`, with the pose in the map.
+class Localizer(Filter):
+    """The filter.
+
+    Parameters
+    ----------
+    landmark_map : LandmarkMap
+        The landmarks.
+    start, start_covariance, camera_xy, common_tilt_variance : array_like
+        As in `Filter`; the pose is in the map.
+    exact : bool
+        Assume that the map is exact, whatever its covariances.
     """
 
     def __init__(
@@ -60,7 +74,7 @@ class Localizer(base.Filter):
                 joint = block_diag(*discs.covariance, *lines.covariance)
             self._covariance[first:, first:] = joint
 
-    def measure(self, rows: base.FrameRows) -> None:
+    def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame whose landmarks are in the map; others are ignored."""
         known, others = self._known(rows)
         self.count.leave_out("disc not in the map", len(others.circles))
@@ -78,13 +92,13 @@ class Localizer(base.Filter):
 def localize_run(
     recording: Recording,
     landmark_map: LandmarkMap,
-    associator: base.Associator | None = None,
+    associator: Associator | None = None,
     *,
     start: ArrayLike | None = (0.0, 0.0, 0.0),
     start_sigma: ArrayLike = (0.0, 0.0, 0.0),
     camera_xy: ArrayLike = NO_CAMERA,
     names: tuple[str, str] = ("run", "map"),
-) -> base.FilterRun:
+) -> FilterRun:
     """Localise a run in a map, with rows paired by their identifiers unless said otherwise.
 
     Takes the pose at the `start` in the map (m, m, rad) with its standard deviations, both (3,),
@@ -92,8 +106,7 @@ def localize_run(
     unknown start, None, is estimated from the discs of the first frames, whatever their
     identifiers. Raises `SlamError` if that has no certain place, or no row shows a landmark.
     """
-    pairing, found = associator or base.Associator(), None
-    covariance = np.diag(np.square(start_sigma))
+    pairing, covariance, found = associator or Associator(), np.diag(np.square(start_sigma)), None
     if start is None:
         found = localise_globally(recording, landmark_map.discs.xy)
         if found is None:
@@ -112,7 +125,7 @@ def localize_run(
         # harm with known pairs, but loses track if pairs have to be found.
         exact=pairing.method != "known",
     )
-    run = base.run_filter(recording, localizer, pairing)
+    run = run_filter(recording, localizer, pairing)
     if not run.count.discs and not run.count.lines:
         expected = "identifiers of the same run, or --association joint"
         if pairing.method != "known":
@@ -123,12 +136,12 @@ def localize_run(
 
 def localize_by_flags(
     flags: Localize, recording: Recording, landmark_map: LandmarkMap
-) -> base.FilterRun:
+) -> FilterRun:
     """`localize_run` as the flags of `slam localize` state."""
     return localize_run(
         recording,
         landmark_map,
-        base.Associator(flags.association, flags.gate_probability),
+        Associator(flags.association, flags.gate_probability),
         start=flags.known_start,
         start_sigma=flags.start_sigma,
         camera_xy=camera_xy_of(recording, flags.run, flags.camera),

@@ -206,11 +206,26 @@ def read_robot(
 ) -> tuple[Recording, Response | None]:
     """A robot's log, with landmarks as discs; most steps have no covariance.
 
-    `sigma_m, sigma_rad` are standard deviations of independent ranges and bearings; by default,
-    those of calibrated ranges are as found in logs with true poses, where their errors last
-    (`_alike`). If `calibrated`, steps are as the robot follows its commands (`response_of`, also
-    returned), not as commanded, and ranges are computed from the depths that the log has. Raises
-    `SlamError` if a file cannot be used.
+    Parameters
+    ----------
+    odometry : Path
+    sigma_m, sigma_rad : float, optional
+        Standard deviations of independent ranges and bearings; by default, those of calibrated
+        ranges are as found in logs with true poses, where their errors last (`_alike`).
+    calibrated : bool
+        Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
+        ranges are computed from the depths that the log has.
+
+    Returns
+    -------
+    Recording
+    Response or None
+        None without calibration.
+
+    Raises
+    ------
+    SlamError
+        If a file cannot be used.
     """
     velocity = _log(odometry, "time v omega")
     seen = _seen_by_robot(odometry, calibrated=calibrated)
@@ -239,8 +254,14 @@ def response_of(
     From one sighting of a landmark to the next, range and bearing change as the robot moves. The
     most likely response predicts these changes best; where they show little, it is the usual one.
 
-    Takes time (s), speed (m/s) and turn rate (rad/s) of each command, `velocity` (k, 3), n
-    sightings, and standard deviations of their ranges (n,) and bearings.
+    Parameters
+    ----------
+    velocity : (k, 3) float64
+        Time (s), speed (m/s) and turn rate (rad/s) of each command.
+    seen : _Sightings
+        The landmarks, n times.
+    sigma_m, sigma_rad : (n,) float64, float
+        Standard deviations of ranges and bearings.
     """
     by_landmark = np.lexsort((seen.frame, seen.ids))
     before, after = by_landmark[:-1], by_landmark[1:]
