@@ -37,34 +37,57 @@ PARAMETERS = 20
 class Camera:
     """A calibrated camera on a robot, with its distortion. A value.
 
-    Two cameras are equal, and have the same hash, if all their parameters are equal. The model is
-    that of the DLR Spatial Cognition data set report, camera calibration.
+    Two cameras are equal, and have the same hash, if all their parameters are equal.
 
-    A CameraError is raised if a number is not finite, a size or scale not positive, the rotation
-    not a rotation, or the distortion folds so that less than half of the image sees anything; names
-    are the file's.
+    Parameters
+    ----------
+    width, height : int
+        Image size in pixels.
+    scale_x, scale_y : float
+        Focal lengths in pixels along u and v (different for single fields of interlaced frames).
+    offset_x, offset_y : float
+        Principal point in pixels.
+    coef : 5 floats
+        a2, a3, b1, b2, b3 of the distortion (see `camera.distortion`).
+    robot_from_camera : 3 rows of 4 floats
+        Rotation and translation camera -> robot (``sensor2World``), metres.
+    sensor_to_tcp : 3 rows of 4 floats, optional
+        The file's second transform, kept as it is.
+    mount_index : int
+        The file's ``mountIndex``.
+    unknown : tuple of (key, text)
+        Entries of a ``.cam`` file that mean nothing here; they survive reading and writing.
+    tangential : 2 floats
+        p1, p2 of the distortion (see `camera.distortion`); the data set's cameras have none.
+    polynomial : 3 floats
+        k1, k2, k3 of the distortion (see `camera.distortion`); the data set's cameras have none.
+    covariance : tuple of float, optional
+        Of the calibration's parameters (`camera.uncertainty`): the lower triangle, row by row.
+
+    Raises
+    ------
+    CameraError
+        If a number is not finite, a size or scale not positive, the rotation not a rotation, or the
+        distortion folds so that less than half of the image sees anything; names are the file's.
+
+    References
+    ----------
+    DLR Spatial Cognition data set report, camera calibration.
     """
 
-    #: Size of the image, pixels
     width: int
     height: int
-    #: Focal lengths along u and v, pixels (different for single fields of interlaced frames)
     scale_x: float
     scale_y: float
-    #: Principal point, pixels
     offset_x: float
     offset_y: float
-    coef: Coef  #: a2, a3, b1, b2, b3 of the distortion (see `camera.distortion`)
-    #: Rotation and translation camera -> robot (``sensor2World``), 3 rows of 4 numbers, metres
+    coef: Coef
     robot_from_camera: Pose
-    sensor_to_tcp: Pose | None = None  #: The file's second transform, kept as it is
-    mount_index: int = 0  #: The file's ``mountIndex``
-    #: Entries of a ``.cam`` file that mean nothing here; they survive reading and writing
+    sensor_to_tcp: Pose | None = None
+    mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    #: p1, p2 and k1, k2, k3 of the distortion; the data set's cameras have none
     tangential: Tangential = (0.0, 0.0)
     polynomial: Polynomial = (0.0, 0.0, 0.0)
-    #: Of the calibration's parameters (`camera.uncertainty`): the lower triangle, row by row
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:

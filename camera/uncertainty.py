@@ -88,8 +88,18 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """(N, 2, 20) derivatives, by the camera's parameters, of the positions on the floor that are
-    assigned to the pixels of (N, 2) positions (m).
+    """Derivatives of pixels' positions on the floor by the camera's parameters.
+
+    Parameters
+    ----------
+    camera : Camera
+    floor_xy : (N, 2) float64
+        Positions on the floor (m).
+
+    Returns
+    -------
+    (N, 2, 20) float64
+        Of the position assigned to the same pixel.
     """
     offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
     in_camera = offset @ camera.camera_from_robot.T

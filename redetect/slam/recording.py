@@ -255,15 +255,26 @@ def read_recording(
     stem: str | None = None,
     noise: OdometryNoise = ASSUMED,
 ) -> Recording:
-    """Read the rows of a run folder, or of a single ``.circles`` or ``.lines`` file.
+    """Read a run's rows.
 
-    `circles` and `lines` are the landmarks to read from a folder; of a single file all rows are
-    read. `stem` is the name of the files in the folder without suffix (`landmark_files`), `noise`
-    that of steps without a covariance.
+    Parameters
+    ----------
+    run : path
+        A run folder, or a single ``.circles`` or ``.lines`` file.
+    circles, lines : bool
+        Which landmarks to read from a folder. All rows of a single file are read.
+    stem : str, optional
+        Name of the files in the folder without suffix; see `landmark_files`.
+    noise : OdometryNoise
+        Noise of steps without a covariance.
 
-    Raises `redetect.landmarks.LandmarkFileError` if a file is malformed; `SlamError` if there is no
-    file, no step, two files are not of the same run, or a covariance is not positive definite: the
-    message names file, step and row.
+    Raises
+    ------
+    redetect.landmarks.LandmarkFileError
+        If a file is malformed.
+    SlamError
+        If there is no file, no step, two files are not of the same run, or a covariance is not
+        positive definite; the message names file, step and row.
     """
     files = landmark_files(Path(run), circles=circles, lines=lines, stem=stem)
     frames = list(landmarks.read_frames(files[0]))

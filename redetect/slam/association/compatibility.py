@@ -36,15 +36,24 @@ def compatible(
 ) -> IntArray:
     """Associate rows with landmarks.
 
-    Method `nearest`: nearest neighbour with Mahalanobis gate, closest pairs first, each row and
-    landmark once. `joint`: the largest set of pairs that are compatible jointly, among equals the
-    most likely one. Every pair must pass the individual gate, and all k pairs together the gate of
-    d k degrees of freedom. Unlike the published search, a branch is pruned only if no set below it
-    can pass, so that the result does not depend on the order of the rows.
+    Parameters
+    ----------
+    method : str
+        `nearest`: nearest neighbour with Mahalanobis gate, closest pairs first, each row and
+        landmark once. `joint`: the largest set of pairs that are compatible jointly, among equals
+        the most likely one. Every pair must pass the individual gate, and all k pairs together the
+        gate of d k degrees of freedom. Unlike the published search, a branch is pruned only if no
+        set below it can pass, so that the result does not depend on the order of the rows.
+    innovations, predicted_covariance, noise : (n, m, d), (m d, m d), (n, d, d) float64
+    gate_probability : float
+        Share of correct pairs, or sets of pairs, that pass.
+    most_nodes : int
+        Bound of the joint search.
 
-    Takes `innovations` (n, m, d), `predicted_covariance` (m d, m d), `noise` (n, d, d), the share
-    of correct pairs, or sets of pairs, that pass, and a bound of the joint search. Returns (n,):
-    index of each row's landmark, -1 if it shows none of them; each occurs at most once.
+    Returns
+    -------
+    (n,) int64
+        Index of each row's landmark, -1 if it shows none of them; each occurs at most once.
     """
     arrays = map(np.ascontiguousarray, (innovations, predicted_covariance, noise))
     innovations, predicted_covariance, noise = arrays

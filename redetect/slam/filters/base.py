@@ -129,11 +129,26 @@ class Filter(ABC):
     consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010): at the
     latest estimates, corrections would add spurious information on the map's orientation.
 
-    Takes the pose at the start (3,) (m, m, rad) and its covariance (3, 3), None if the start
-    defines the map; the camera's centre in the robot frame (2,) (m), which only lines need; and the
-    variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part of
-    the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry looks
-    the same.
+    Parameters
+    ----------
+    start : (3,) array_like
+        Pose at the start (m, m, rad).
+    start_covariance : (3, 3) array_like or None
+        Its covariance; None if the start defines the map.
+    camera_xy : (2,) array_like
+        The camera's centre in the robot frame (m); only lines need it.
+    common_tilt_variance : float
+        Variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part
+        of the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry
+        looks the same.
+
+    Attributes
+    ----------
+    disc_slots, line_slots : dict of int to int
+        Index of each landmark's first number in the state, by identifier.
+    count : RowCount
+    size : int
+        Number of numbers in the state.
     """
 
     #: Number of the state's numbers for a line.

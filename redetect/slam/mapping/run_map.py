@@ -201,11 +201,25 @@ def map_run(
     First odometry and discs are fitted, starting from first sight; then lines are triangulated from
     those poses and everything is fitted together; a robust loss and the mounting start from there.
 
-    Takes the run, whose rows without an identifier are ignored; the camera as calibrated, needed
-    for lines (the origin of bearings), and if the mounting is unknown; loss and unknowns, plain
-    least squares by default; the first pose `start` (3,) (m, m, rad); the solver of the final
-    optimisation; and the run's name in messages. Raises `SlamError` if no row has an identifier,
-    the run is disconnected, or there is no calibration or minimum.
+    Parameters
+    ----------
+    recording : Recording
+        The run. Rows without an identifier are ignored.
+    camera : Camera, optional
+        As calibrated: needed for lines (the origin of bearings), and if the mounting is unknown.
+    weighting : Weighting, optional
+        Loss and unknowns; plain least squares by default.
+    start : (3,)
+        The first pose (m, m, rad).
+    solver : "separable" or "gtsam"
+        The solver for the final optimisation.
+    name : str
+        Name of the run in messages.
+
+    Raises
+    ------
+    SlamError
+        If no row has an identifier, the run is disconnected, or there is no calibration or minimum.
     """
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
