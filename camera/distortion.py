@@ -12,11 +12,11 @@ tangential terms that also move points across their radius: (x, y) is distorted 
     x (f(r) + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2),
     y (f(r) + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
 
-``polynomial`` is always ``(k1, k2, k3)``, ``brown`` always ``(k1, k2, p1, p2, k3)``, in OpenCV's
-order and meaning; where f is 1 that is OpenCV's model of five coefficients. With q = (p2, p1) and
-X = (x, y) the tangential terms are 2 (q X) X + r^2 q. Their Jacobian is symmetric, as that of the
-radial part is: the distortion is the gradient of a potential. So it is one-to-one over any convex
-region in which the Jacobian is positive definite, and its inverse minimises a convex function.
+In OpenCV's order, ``(k1, k2, p1, p2, k3)``, they are called ``brown``; where f is 1 that is
+OpenCV's model of five coefficients. With q = (p2, p1) and X = (x, y) the tangential terms are
+2 (q X) X + r^2 q. Their Jacobian is symmetric, as that of the radial part is: the distortion is the
+gradient of a potential. So it is one-to-one over any convex region in which the Jacobian is
+positive definite, and its inverse minimises a convex function.
 
 References
 ----------
@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd, polyder, polymul, polymulx, polyroots, polysub
@@ -39,9 +40,6 @@ Coef = tuple[float, float, float, float, float]
 Polynomial = tuple[float, float, float]
 Brown = tuple[float, float, float, float, float]
 Tangential = tuple[float, float]
-
-NO_POLYNOMIAL: Polynomial = (0.0, 0.0, 0.0)
-NOT_TANGENTIAL: Tangential = (0.0, 0.0)
 
 #: Largest plausible coefficient; it also keeps all computations finite.
 LARGEST_COEFFICIENT = 1e6
@@ -59,51 +57,58 @@ _SMALLEST_INVERSE = 1e-4
 _LAST_STEP = 1e-9
 
 _NODES = 4096
-# Rounds of refining the place of the first fold; the last is between neighbouring doubles.
-_REFINEMENTS = 6
-_NODES_BETWEEN = 513
 
 
-def radial_factor(
-    radius: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
-) -> FloatArray:
+class Lens(NamedTuple):
+    """The coefficients of a distortion."""
+
+    coef: Coef  #: a2, a3, b1, b2, b3
+    polynomial: Polynomial = (0.0, 0.0, 0.0)  #: k1, k2, k3
+    tangential: Tangential = (0.0, 0.0)  #: p1, p2
+
+    @property
+    def brown(self) -> Brown:
+        """k1, k2, p1, p2, k3, in OpenCV's order."""
+        k1, k2, k3 = self.polynomial
+        return k1, k2, *self.tangential, k3
+
+
+def radial_factor(radius: FloatArray, lens: Lens) -> FloatArray:
     """f(r), the factor of the distortion at undistorted normalised radii r >= 0."""
-    a2, a3, b1, b2, b3 = coef
+    a2, a3, b1, b2, b3 = lens.coef
     numerator = radius * (a2 + radius * a3)
     denominator = 1.0 + radius * (b1 + radius * (b2 + radius * b3))
     factor = 1.0 + numerator / denominator
-    if any(polynomial):
-        k1, k2, k3 = polynomial
+    if any(lens.polynomial):
+        k1, k2, k3 = lens.polynomial
         squared = radius * radius
         factor = factor + squared * (k1 + squared * (k2 + squared * k3))
     return np.asarray(factor)
 
 
-def radial_factor_derivative(
-    radius: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
-) -> FloatArray:
-    """df/dr at `radius`; parameters as in `radial_factor`."""
-    a2, a3, b1, b2, b3 = coef
+def radial_factor_derivative(radius: FloatArray, lens: Lens) -> FloatArray:
+    """df/dr at `radius`."""
+    a2, a3, b1, b2, b3 = lens.coef
     numerator = radius * (a2 + radius * a3)
     denominator = 1.0 + radius * (b1 + radius * (b2 + radius * b3))
     d_numerator = a2 + 2.0 * a3 * radius
     d_denominator = b1 + radius * (2.0 * b2 + 3.0 * b3 * radius)
     slope = (d_numerator * denominator - numerator * d_denominator) / (denominator * denominator)
-    if any(polynomial):
-        k1, k2, k3 = polynomial
+    if any(lens.polynomial):
+        k1, k2, k3 = lens.polynomial
         squared = radius * radius
         slope = slope + radius * (2.0 * k1 + squared * (4.0 * k2 + squared * (6.0 * k3)))
     return np.asarray(slope)
 
 
 @lru_cache(maxsize=256)
-def fold_radius(coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL) -> float:
-    """r_max, up to which g(r) grows: the first pole of f or zero of g'.
+def fold_radius(lens: Lens) -> float:
+    """r_max without tangential terms, up to which g(r) grows: the first pole of f or zero of g'.
 
     Past it the image folds back on itself and the projection is undefined.
     """
-    a2, a3, b1, b2, b3 = coef
-    k1, k2, k3 = polynomial
+    a2, a3, b1, b2, b3 = lens.coef
+    k1, k2, k3 = lens.polynomial
     # Coefficients of powers of r, the lowest first; NumPy's classes for them take much longer.
     numerator, denominator = [0.0, a2, a3], [1.0, b1, b2, b3]
     polynomial_growth = [1.0, 0.0, 3.0 * k1, 0.0, 5.0 * k2, 0.0, 7.0 * k3]
@@ -134,17 +139,15 @@ def _first_positive_root(polynomial: ArrayLike) -> float:
 
 
 @lru_cache(maxsize=64)
-def inverse_table(
-    coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
-) -> tuple[FloatArray, FloatArray]:
+def inverse_table(lens: Lens) -> tuple[FloatArray, FloatArray]:
     """Distorted radii, growing, and the undistorted radii that are seen there.
 
     16384 of each, from 0 to the fold or `RADIUS_LIMIT`; read only.
     """
-    limit = min(fold_radius(coef, polynomial), RADIUS_LIMIT)
+    limit = min(fold_radius(lens), RADIUS_LIMIT)
     radius = np.tan(np.linspace(0.0, np.arctan(limit), _TABLE_NODES))
     radius[-1] = limit
-    distorted = radius * radial_factor(radius, coef, polynomial)
+    distorted = radius * radial_factor(radius, lens)
     # At the fold itself rounding can spoil the order by a last digit.
     distorted = np.maximum.accumulate(distorted)
     radius.setflags(write=False)
@@ -152,26 +155,24 @@ def inverse_table(
     return distorted, radius
 
 
-def undistorted_radius(
-    distorted: FloatArray, coef: Coef, polynomial: Polynomial = NO_POLYNOMIAL
-) -> FloatArray:
+def undistorted_radius(distorted: FloatArray, lens: Lens) -> FloatArray:
     """Inverse of g on [0, r_max], to 1e-12 relative to the larger of 1 and r; NaN beyond.
 
     (At the fold itself g' vanishes, so there r is only as good as the last digit of g allows, 1e-8;
     g of the result is right to the last digits.) Newton's method, within the cell of a table of g.
     """
     target = np.asarray(distorted, dtype=np.float64)
-    table_g, table_r = inverse_table(coef, polynomial)
+    table_g, table_r = inverse_table(lens)
     goal = np.where((target >= 0.0) & (target <= table_g[-1]), target, np.nan)
     upper = np.clip(np.searchsorted(table_g, goal), 1, len(table_g) - 1)
     low, high = table_r[upper - 1], table_r[upper]
     r = np.clip(np.interp(goal, table_g, table_r), low, high)
     ended = np.isnan(goal)
     for _ in range(_NEWTON_STEPS):
-        f = radial_factor(r, coef, polynomial)
+        f = radial_factor(r, lens)
         error = goal - r * f
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            step = error / (f + r * radial_factor_derivative(r, coef, polynomial))
+            step = error / (f + r * radial_factor_derivative(r, lens))
         moved = np.clip(r + np.where(error == 0.0, 0.0, step), low, high)
         # Newton's error is squared by each step: after one this small it has converged.
         small = np.abs(moved - r) <= _LAST_STEP * np.maximum(1.0, r)
@@ -182,23 +183,18 @@ def undistorted_radius(
     return np.asarray(r)
 
 
-def polynomial_of(brown: Brown) -> Polynomial:
-    """(k1, k2, k3)."""
-    return brown[0], brown[1], brown[4]
-
-
 def tangential_shift(xy: FloatArray, tangential: Tangential) -> FloatArray:
     """Displacement of (..., 2) points by the tangential terms, in addition to the radial ones."""
     q = np.array(tangential[::-1])
     return np.asarray(2.0 * (xy @ q)[..., None] * xy + np.sum(xy * xy, axis=-1)[..., None] * q)
 
 
-def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
+def distorted_jacobian(xy: FloatArray, lens: Lens) -> FloatArray:
     """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
-    polynomial, q = polynomial_of(brown), np.array([brown[3], brown[2]])
+    q = np.array(lens.tangential[::-1])
     radius = np.hypot(xy[..., 0], xy[..., 1])
-    factor = radial_factor(radius, coef, polynomial)
-    slope = radial_factor_derivative(radius, coef, polynomial)
+    factor = radial_factor(radius, lens)
+    slope = radial_factor_derivative(radius, lens)
     # d(x f)/dx = f + f' x^2 / r; at r = 0 the second term vanishes.
     unit = xy / np.where(radius > 0.0, radius, 1.0)[..., None]
     outer = slope[..., None, None] * xy[..., :, None] * unit[..., None, :]
@@ -211,50 +207,49 @@ def distorted_jacobian(xy: FloatArray, coef: Coef, brown: Brown) -> FloatArray:
 
 
 @lru_cache(maxsize=256)
-def one_to_one_radius(coef: Coef, brown: Brown) -> float:
+def one_to_one_radius(lens: Lens) -> float:
     """r_max: the undistorted radius up to which no two rays have the same image.
 
     Without Brown's terms the rational distortion's `fold_radius`; with them the largest radius
     below which the Jacobian is positive definite in all directions, and at most `RADIUS_LIMIT`.
     """
-    if not any(brown):
-        return fold_radius(coef)
-    polynomial, amount = polynomial_of(brown), math.hypot(brown[2], brown[3])
-    limit = min(fold_radius(coef, polynomial), RADIUS_LIMIT)
-    if amount == 0.0:
+    if not any(lens.brown):
+        return fold_radius(lens)
+    limit = min(fold_radius(lens), RADIUS_LIMIT)
+    if not any(lens.tangential):
         return limit
     radius = np.tan(np.linspace(0.0, math.atan(limit), _NODES))
     radius[-1] = limit
-    for _ in range(_REFINEMENTS):
-        folded = ~(_least_determinant(radius, coef, polynomial, amount) > 0.0)
-        first = int(np.argmax(folded))
-        if not folded[first]:
-            break
-        # At 0 the determinant is 1.
-        radius = np.linspace(radius[max(first - 1, 0)], radius[first], _NODES_BETWEEN)
-    else:
-        return float(radius[0])
-    return limit
+    folded = ~(_least_determinant(radius, lens) > 0.0)
+    if not folded.any():
+        return limit
+    first = int(np.argmax(folded))  # at 0 the determinant is 1
+    before, after = float(radius[first - 1]), float(radius[first])
+    # Bisection, down to neighbouring doubles.
+    while before < (middle := 0.5 * (before + after)) < after:
+        if _least_determinant(np.array(middle), lens) > 0.0:
+            before = middle
+        else:
+            after = middle
+    return before
 
 
-def _least_determinant(
-    radius: FloatArray, coef: Coef, polynomial: Polynomial, amount: float
-) -> FloatArray:
-    """The Jacobian's smallest determinant on circles; `amount` is |(p1, p2)|.
+def _least_determinant(radius: FloatArray, lens: Lens) -> FloatArray:
+    """The Jacobian's smallest determinant on circles.
 
     In the direction of the radius and across it, at an angle of cosine c to q, the Jacobian is
     [[g' + 6 b c, 2 b s], [2 b s, f + 2 b c]] with b = r |q|: a parabola in c.
     """
-    factor = radial_factor(radius, coef, polynomial)
+    factor = radial_factor(radius, lens)
     with np.errstate(all="ignore"):
-        growth = factor + radius * radial_factor_derivative(radius, coef, polynomial)
-        b = radius * amount
+        growth = factor + radius * radial_factor_derivative(radius, lens)
+        b = radius * math.hypot(*lens.tangential)
         mean = growth + 3.0 * factor
         c = np.where(b > 0.0, np.clip(-mean / (16.0 * b), -1.0, 1.0), -1.0)
         return np.asarray(growth * factor - 4.0 * b * b + 2.0 * b * mean * c + 16.0 * (b * c) ** 2)
 
 
-def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) -> FloatArray:
+def straightened(distorted: FloatArray, lens: Lens) -> FloatArray:
     """Undistorted normalised coordinates of distorted ones, all terms undone.
 
     Newton's method from the radial inverse (`camera.kernels.straightened_point`).
@@ -264,8 +259,8 @@ def straightened(distorted: FloatArray, coef: Coef, brown: Brown, r_max: float) 
     seen = np.ascontiguousarray(distorted, dtype=np.float64).reshape(-1, 2)
     with np.errstate(over="ignore"):
         radius = np.hypot(seen[:, 0], seen[:, 1])
-    seen_there, there = inverse_table(coef, polynomial_of(brown))
+    seen_there, there = inverse_table(lens)
     straight = np.empty_like(seen)
-    lens = np.array([*coef, *brown, r_max])
-    straighten_points(lens, seen, np.interp(radius, seen_there, there), straight)
+    numbers = np.array([*lens.coef, *lens.brown, one_to_one_radius(lens)])
+    straighten_points(numbers, seen, np.interp(radius, seen_there, there), straight)
     return straight.reshape(np.shape(distorted))

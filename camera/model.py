@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from camera import distortion
 from camera import model_checks as checks
-from camera.distortion import Brown, Coef, Polynomial, Tangential
+from camera.distortion import Brown, Coef, Lens, Polynomial, Tangential
 from redetect.array_types import FloatArray
 
 Pose = tuple[tuple[float, float, float, float], ...]
@@ -86,8 +86,8 @@ class Camera:
     sensor_to_tcp: Pose | None = None
     mount_index: int = 0
     unknown: tuple[tuple[str, str], ...] = field(default=())
-    tangential: Tangential = distortion.NOT_TANGENTIAL
-    polynomial: Polynomial = distortion.NO_POLYNOMIAL
+    tangential: Tangential = (0.0, 0.0)
+    polynomial: Polynomial = (0.0, 0.0, 0.0)
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -144,7 +144,7 @@ class Camera:
     @cached_property
     def r_max(self) -> float:
         """Undistorted radius up to which the projection is defined."""
-        return distortion.one_to_one_radius(self.coef, self.brown)
+        return distortion.one_to_one_radius(self.lens)
 
     @cached_property
     def seen_share(self) -> float:
@@ -162,10 +162,14 @@ class Camera:
         return any(self.tangential)
 
     @cached_property
+    def lens(self) -> Lens:
+        """All coefficients of the distortion."""
+        return Lens(self.coef, self.polynomial, self.tangential)
+
+    @property
     def brown(self) -> Brown:
         """k1, k2, p1, p2, k3 of the distortion, in OpenCV's order."""
-        k1, k2, k3 = self.polynomial
-        return k1, k2, *self.tangential, k3
+        return self.lens.brown
 
     @cached_property
     def content_hash(self) -> str:
@@ -196,7 +200,7 @@ class Camera:
     def distort(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted coordinates px/pz, py/pz; NaN past the fold."""
         (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
-        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        factor = distortion.radial_factor(radius, self.lens)
         pixels = scale * xy * factor[..., None]
         if self.decentred:
             pixels = pixels + scale * distortion.tangential_shift(xy, self.tangential)
@@ -216,10 +220,10 @@ class Camera:
         """
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            return distortion.straightened(seen, self.coef, self.brown, self.r_max)
+            return distortion.straightened(seen, self.lens)
         distorted = np.hypot(seen[..., 0], seen[..., 1])
-        radius = distortion.undistorted_radius(distorted, self.coef, self.polynomial)
-        factor = distortion.radial_factor(radius, self.coef, self.polynomial)
+        radius = distortion.undistorted_radius(distorted, self.lens)
+        factor = distortion.radial_factor(radius, self.lens)
         return np.asarray(seen / factor[..., None])
 
     def project(self, points_camera: ArrayLike) -> FloatArray:
@@ -274,7 +278,7 @@ class Camera:
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
         xy, _ = self._before_fold(normalised)
-        jacobian = distortion.distorted_jacobian(xy, self.coef, self.brown)
+        jacobian = distortion.distorted_jacobian(xy, self.lens)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:

@@ -44,10 +44,8 @@ def intrinsics_of(camera: Camera) -> FloatArray:
 def with_intrinsics(camera: Camera, intrinsics: FloatArray, **changes: Any) -> Camera:
     """The camera with other intrinsics, an array as of `intrinsics_of`, and other changes."""
     sx, sy, ox, oy, a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = (float(x) for x in intrinsics)
-    return replace(
-        camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, coef=(a2, a3, b1, b2, b3),
-        tangential=(p1, p2), polynomial=(k1, k2, k3), **changes,
-    )  # fmt: skip
+    changes |= {"coef": (a2, a3, b1, b2, b3), "tangential": (p1, p2), "polynomial": (k1, k2, k3)}
+    return replace(camera, scale_x=sx, scale_y=sy, offset_x=ox, offset_y=oy, **changes)
 
 
 def with_pose(camera: Camera, pose: FloatArray) -> Camera:

@@ -89,9 +89,8 @@ def measured_corners(image: GreyImage, grid: FloatArray, marker_share: float) ->
     `marker_share` is the side of the markers in squares. Corners that cannot be seen stay NaN.
     """
     grey = image.astype(np.float64)
-    gradient: FloatArray = np.empty((2, *grey.shape))
-    cv2.Scharr(grey, cv2.CV_64F, 1, 0, dst=gradient[0])
-    cv2.Scharr(grey, cv2.CV_64F, 0, 1, dst=gradient[1])
+    slopes = [cv2.Scharr(grey, cv2.CV_64F, 1, 0), cv2.Scharr(grey, cv2.CV_64F, 0, 1)]
+    gradient = np.array(slopes, dtype=np.float64)
     white = 0.5 * (1.0 - marker_share)
     known, result = grid, np.full(grid.shape, np.nan)
     wanted, tried = np.isfinite(grid[..., 0]), np.zeros(grid.shape[:2], dtype=bool)
@@ -135,8 +134,7 @@ def _expected(
 
 
 def _mapped(homography: FloatArray, places: FloatArray) -> FloatArray:
-    mapped = np.column_stack([places, np.ones(len(places))]) @ homography.T
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+    return np.asarray(cv2.perspectiveTransform(places[None], homography)[0])
 
 
 def _measured(
@@ -168,18 +166,15 @@ def _measured(
         return nothing
     u, v = np.meshgrid(np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
-    gu, gv = gradient[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
+    slope = gradient[:, low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(2, -1)
     at = start
     for _ in range(_ITERATIONS):
         square = (pixels - at) @ to_squares.T
-        weight = _strips(square, across, half_px)
-        uu, uv, vv = np.sum(weight * gu * gu), np.sum(weight * gu * gv), np.sum(weight * gv * gv)
-        determinant = uu * vv - uv * uv
-        if determinant <= 1e-3 * uu * vv:
+        weighted = slope * _strips(square, across, half_px)
+        normal = weighted @ slope.T
+        if np.linalg.det(normal) <= 1e-3 * normal[0, 0] * normal[1, 1]:
             return nothing
-        along = weight * (gu * (pixels[:, 0] - at[0]) + gv * (pixels[:, 1] - at[1]))
-        right_u, right_v = np.sum(along * gu), np.sum(along * gv)
-        step = np.array([vv * right_u - uv * right_v, uu * right_v - uv * right_u]) / determinant
+        step = np.linalg.solve(normal, weighted @ np.sum(slope.T * (pixels - at), axis=1))
         at = at + step
         if np.any(np.abs(to_squares @ (at - start)) > _FARTHEST):
             return nothing

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import center_of_mass
 
 from camera.boards.board import Board
 from camera.boards.charuco import both_heights, find_charuco
@@ -224,6 +225,5 @@ def _centroid(image: GreyImage, at: FloatArray, reach: float) -> FloatArray | No
     blob = labels == labels[v - top, u - left]
     if blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any():
         return None  # it is cut off
-    weight[~blob] = 0.0
-    rows, columns = np.mgrid[top : top + window.shape[0], left : left + window.shape[1]]
-    return np.array([np.sum(weight * each) / weight.sum() for each in (columns, rows)])
+    row, column = center_of_mass(weight, blob)
+    return np.array([left + column, top + row])

@@ -14,7 +14,7 @@ import numpy as np
 
 from camera.calibration import model
 from camera.calibration.model import CalibrationSettings, FreeLens
-from camera.distortion import polynomial_of, undistorted_radius
+from camera.distortion import undistorted_radius
 from camera.rotations import cross_matrices, rotation_of
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.least_squares import solver
@@ -276,8 +276,7 @@ def with_unfitted_terms(
 def _corner(intrinsics: FloatArray, points: Points) -> tuple[float, float]:
     """Undistorted normalised radius of the farthest corner, and its relative distortion there."""
     seen = model.corner_radius(intrinsics, points.width, points.height)
-    coef, brown = model.lens_of(intrinsics)
-    there = float(undistorted_radius(np.array(seen), coef, polynomial_of(brown)))
+    there = float(undistorted_radius(np.array(seen), model.lens_of(intrinsics)))
     # Beyond the fold, if decentring alone moves the corner to before it.
     return (there, seen / there - 1.0) if np.isfinite(there) else (seen, 1.0)
 

@@ -14,11 +14,9 @@ import numpy as np
 
 from camera.distortion import (
     RADIUS_LIMIT,
-    Brown,
-    Coef,
+    Lens,
     distorted_jacobian,
     one_to_one_radius,
-    polynomial_of,
     radial_factor,
     tangential_shift,
 )
@@ -66,40 +64,30 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _BORDER_PLACES = 9
 
 
-def lens_of(intrinsics: FloatArray) -> tuple[Coef, Brown]:
-    """The distortion's (a2, a3, b1, b2, b3) and (k1, k2, p1, p2, k3) of an intrinsics vector."""
+def lens_of(intrinsics: FloatArray) -> Lens:
+    """The distortion of an intrinsics vector."""
     a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = intrinsics[4:].tolist()
-    return (a2, a3, b1, b2, b3), (k1, k2, p1, p2, k3)
+    return Lens((a2, a3, b1, b2, b3), (k1, k2, k3), (p1, p2))
 
 
-class _Seen(NamedTuple):
-    """Points in the camera frame through a lens; NaN where it does not see them."""
-
-    z: FloatArray  # (N,)
-    xy: FloatArray  # (N, 2): undistorted normalised coordinates
-    r: FloatArray  # (N,): their radius
-    denominator: FloatArray  # (N,): of the distortion
-    ratio: FloatArray  # (N,): the rational function
-    distorted: FloatArray  # (N, 2): distorted normalised coordinates
+def _normalised(lens: Lens, points_camera: FloatArray) -> FloatArray:
+    """(N, 2) undistorted normalised coordinates of points; NaN where the lens does not see them."""
+    z = points_camera[:, 2:]
+    xy = points_camera[:, :2] / np.where(z > 0.0, z, np.nan)
+    within = np.hypot(xy[:, :1], xy[:, 1:]) <= one_to_one_radius(lens)
+    return np.where(within, xy, np.nan)
 
 
-def _seen(coef: Coef, brown: Brown, points_camera: FloatArray) -> _Seen:
-    a2, a3, b1, b2, b3 = coef
-    z = np.where(points_camera[:, 2] > 0.0, points_camera[:, 2], np.nan)
-    xy = points_camera[:, :2] / z[:, None]
-    r = np.hypot(xy[:, 0], xy[:, 1])
-    r = np.where(r <= one_to_one_radius(coef, brown), r, np.nan)
-    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
-    ratio = r * (a2 + r * a3) / denominator
-    factor = radial_factor(r, coef, polynomial_of(brown))
-    distorted = xy * factor[:, None] + tangential_shift(xy, brown[2:4])
-    return _Seen(z, xy, r, denominator, ratio, distorted)
+def _distorted(lens: Lens, xy: FloatArray) -> FloatArray:
+    factor = radial_factor(np.hypot(xy[:, 0], xy[:, 1]), lens)
+    return np.asarray(xy * factor[:, None] + tangential_shift(xy, lens.tangential))
 
 
 def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
     """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
-    distorted = _seen(*lens_of(intrinsics), points_camera).distorted
-    return np.asarray(intrinsics[:2] * distorted + intrinsics[2:4])
+    lens = lens_of(intrinsics)
+    seen = _distorted(lens, _normalised(lens, points_camera))
+    return np.asarray(intrinsics[:2] * seen + intrinsics[2:4])
 
 
 def project_points(
@@ -111,8 +99,13 @@ def project_points(
     2, 14), `by_point` (N, 2, 3).
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
-    coef, brown = lens_of(intrinsics)
-    z, xy, r, denominator, ratio, seen = _seen(coef, brown, points_camera)
+    lens = lens_of(intrinsics)
+    xy = _normalised(lens, points_camera)
+    seen = _distorted(lens, xy)
+    r = np.hypot(xy[:, 0], xy[:, 1])
+    a2, a3, b1, b2, b3 = lens.coef
+    denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
+    ratio = r * (a2 + r * a3) / denominator
 
     by_intrinsics = np.zeros((len(r), 2, COUNT))
     by_intrinsics[:, [0, 1], [0, 1]] = seen
@@ -125,11 +118,9 @@ def project_points(
     by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
     by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
-    seen_xy = np.where(np.isnan(r)[:, None], np.nan, xy)
-    by_xy = scale[:, None] * distorted_jacobian(seen_xy, coef, brown)
-    by_point = np.empty((len(r), 2, 3))
-    by_point[:, :, :2] = by_xy / z[:, None, None]
-    by_point[:, :, 2] = -(by_xy @ xy[:, :, None])[:, :, 0] / z[:, None]
+    by_xy = scale[:, None] * distorted_jacobian(xy, lens)
+    by_depth = -by_xy @ xy[:, :, None]
+    by_point = np.concatenate([by_xy, by_depth], axis=-1) / points_camera[:, 2, None, None]
     return scale * seen + offset, by_intrinsics, by_point
 
 
@@ -156,20 +147,18 @@ def _is_within(
     intrinsics: FloatArray, width: int, height: int, *, share: float, margin: float
 ) -> bool:
     """Whether the image, enlarged by a margin, is within a share of the largest radius."""
-    coef, brown = lens_of(intrinsics)
-    r = share * min(one_to_one_radius(coef, brown), RADIUS_LIMIT)
+    lens = lens_of(intrinsics)
+    r = share * min(one_to_one_radius(lens), RADIUS_LIMIT)
     border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
-    reach = _reach(r, coef, brown, border)
+    reach = _reach(r, lens, border)
     return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + margin) < reach))
 
 
-def _reach(r: float, coef: Coef, brown: Brown, towards: FloatArray) -> FloatArray:
+def _reach(r: float, lens: Lens, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
-    factor = radial_factor(np.array(r), coef, polynomial_of(brown))
-    if not any(brown[2:4]):  # the same in all directions
-        return np.asarray(r * factor)
-    edge = r * _DIRECTIONS
-    edge = edge * factor + tangential_shift(edge, brown[2:4])
+    if not any(lens.tangential):  # the same in all directions
+        return np.asarray(r * radial_factor(np.array(r), lens))
+    edge = _distorted(lens, r * _DIRECTIONS)
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),
         np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
@@ -198,19 +187,20 @@ class FreeLens(NamedTuple):
 
         `aspect` is scaleY / scaleX; None: the scales are independent.
         """
-        names = ["offsetX", "offsetY", *FREE_COEFFICIENTS[self.coefficients]]
-        names += [*(TANGENTIAL if self.tangential else ()), *POLYNOMIAL[: self.polynomial]]
         scales = np.zeros((COUNT, 1 if aspect is not None else 2))
         scales[0, 0] = 1.0
         scales[1, -1] = 1.0 if aspect is None else aspect
-        return np.hstack([scales, np.eye(COUNT)[:, [INTRINSICS.index(name) for name in names]]])
+        others = [INTRINSICS.index(name) for name in ("offsetX", "offsetY", *self.names)]
+        return np.hstack([scales, np.eye(COUNT)[:, others]])
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the free coefficients."""
+        radial = [*FREE_COEFFICIENTS[self.coefficients], *POLYNOMIAL[: self.polynomial]]
+        return [*radial, *(TANGENTIAL if self.tangential else ())]
 
     def __str__(self) -> str:
-        names = (
-            *FREE_COEFFICIENTS[self.coefficients], *POLYNOMIAL[: self.polynomial],
-            *(TANGENTIAL if self.tangential else ()),
-        )  # fmt: skip
-        return " ".join(names) or "none"
+        return " ".join(self.names) or "none"
 
 
 @dataclass(frozen=True)

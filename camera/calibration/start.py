@@ -9,7 +9,7 @@ import numpy as np
 
 from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, residuals_of
 from camera.calibration.model import COUNT, FreeLens, lens_of
-from camera.distortion import one_to_one_radius, straightened
+from camera.distortion import straightened
 from camera.rotations import rotation_of
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
@@ -63,8 +63,7 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estim
     Infinitesimal plane-based pose estimation, IJCV 109, 2014; OpenCV's solver).
     """
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
-    coef, brown = lens_of(intrinsics)
-    straight = straightened(normalised, coef, brown, one_to_one_radius(coef, brown))
+    straight = straightened(normalised, lens_of(intrinsics))
     # A point beyond the fold is not changed, which is sufficient for a start.
     straight = np.where(np.isnan(straight), normalised, straight)
     found = []
@@ -89,11 +88,10 @@ def best_poses(estimate: Estimate, points: Points) -> Estimate:
         found = _fitted_where_seen(start, points, np.zeros((COUNT, 0)))
         fits.append(start if found is None else start.with_poses(found[1], found[0].estimate))
     errors = np.stack([view_errors(fit, points) for fit in fits])
-    best = fits[0]
-    for k, fit in enumerate(fits[1:], start=1):
-        better = np.flatnonzero(np.argmin(errors, axis=0) == k)
-        best = best.with_poses(better, fit.of(better))
-    return best
+    best, views = np.argmin(errors, axis=0), np.arange(errors.shape[1])
+    rotations = np.stack([fit.rotations for fit in fits])[best, views]
+    translations = np.stack([fit.translations for fit in fits])[best, views]
+    return Estimate(estimate.intrinsics, rotations, translations)
 
 
 def _fitted_where_seen(

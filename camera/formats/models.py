@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 
-from camera.distortion import NOT_TANGENTIAL, Tangential
+from camera.distortion import Tangential
 from camera.errors import ConversionError
 from camera.model import inverse_2x2
 from redetect.array_types import FloatArray
@@ -93,7 +93,7 @@ class ForeignCamera:
     def tangential(self) -> Tangential:
         """p1 and p2, which mean the same in all models that have them."""
         if self.model == "fisheye":
-            return NOT_TANGENTIAL
+            return 0.0, 0.0
         return self.distortion[P1], self.distortion[P1 + 1]
 
     @property

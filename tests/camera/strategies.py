@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from camera import Camera, CameraError
-from camera.distortion import Coef, fold_radius, inverse_table
+from camera.distortion import Coef, Lens, fold_radius, inverse_table
 from camera.model import Pose
 from camera.model_checks import border_pixels
 
@@ -23,7 +23,7 @@ WIDEST = math.tan(math.radians(80.0))
 
 def largest_distorted_radius(coef: Coef) -> float:
     """Largest distorted radius at which a ray is seen."""
-    return float(inverse_table(coef)[0][-1])
+    return float(inverse_table(Lens(coef))[0][-1])
 
 
 def coefficients() -> st.SearchStrategy[Coef]:
@@ -38,7 +38,7 @@ def coefficients() -> st.SearchStrategy[Coef]:
 
 
 def _has_no_pole(coef: Coef) -> bool:
-    end = min(fold_radius(coef), 25.0)
+    end = min(fold_radius(Lens(coef)), 25.0)
     denominator = np.polyval([*coef[:1:-1], 1.0], np.linspace(0.0, end, 150))
     return bool(np.all(denominator > 0.05))
 

@@ -16,6 +16,7 @@ from camera import Camera, CameraError, format_camera, parse_camera
 from camera.distortion import (
     RADIUS_LIMIT,
     Coef,
+    Lens,
     Polynomial,
     Tangential,
     distorted_jacobian,
@@ -131,7 +132,8 @@ def test_each_term_is_compiled_alike(published_camera: Camera, place: int) -> No
 
 def test_the_derivative_is_symmetric() -> None:
     places = np.random.default_rng(5).normal(size=(50, 2))
-    derivative = distorted_jacobian(places, PUBLISHED, BROWN)
+    k1, k2, p1, p2, k3 = BROWN
+    derivative = distorted_jacobian(places, Lens(PUBLISHED, (k1, k2, k3), (p1, p2)))
     np.testing.assert_allclose(derivative, derivative.swapaxes(-1, -2), rtol=1e-12)
 
 
@@ -145,33 +147,34 @@ POLYNOMIALS = st.tuples(SMALL, SMALL, SMALL) | st.just((0.0, 0.0, 0.0))
 def test_the_radial_part_grows_up_to_its_fold_and_comes_back(
     coef: Coef, polynomial: Polynomial, share: float
 ) -> None:
-    limit = min(fold_radius(coef, polynomial), 20.0)
+    limit = min(fold_radius(Lens(coef, polynomial)), 20.0)
     radius = share * limit * np.linspace(0.0, 1.0, 200)
-    factor = radial_factor(radius, coef, polynomial)
-    slope = factor + radius * radial_factor_derivative(radius, coef, polynomial)
+    factor = radial_factor(radius, Lens(coef, polynomial))
+    slope = factor + radius * radial_factor_derivative(radius, Lens(coef, polynomial))
     assert np.all(slope > 0.0)
-    back = undistorted_radius(radius * factor, coef, polynomial)
+    back = undistorted_radius(radius * factor, Lens(coef, polynomial))
     assert np.all(np.abs(back - radius) <= 1e-11 * np.maximum(1.0, radius) / np.minimum(slope, 1.0))
 
 
 @pytest.mark.parametrize("coef", [NONE, PUBLISHED])
 def test_past_the_fold_the_radial_part_falls(coef: Coef) -> None:
     polynomial = (-0.2, 0.01, -0.02)
-    fold = fold_radius(coef, polynomial)
+    fold = fold_radius(Lens(coef, polynomial))
     near = fold * np.array([1.0 - 1e-6, 1.0 + 1e-6])
-    slope = radial_factor(near, coef, polynomial)
-    slope = slope + near * radial_factor_derivative(near, coef, polynomial)
+    slope = radial_factor(near, Lens(coef, polynomial))
+    slope = slope + near * radial_factor_derivative(near, Lens(coef, polynomial))
     assert slope[0] > 0.0 > slope[1]
     # x - 0.1 x^3 folds at r = sqrt(1 / 0.3).
-    assert fold_radius(NONE, (-0.1, 0.0, 0.0)) == pytest.approx(np.sqrt(1.0 / 0.3), rel=1e-11)
+    assert fold_radius(Lens(NONE, (-0.1, 0.0, 0.0))) == pytest.approx(np.sqrt(1.0 / 0.3), rel=1e-11)
 
 
 @given(coefficients(), POLYNOMIALS, AMOUNT, AMOUNT, st.floats(0.01, 0.999))
 def test_up_to_r_max_the_lens_grows_in_all_directions_and_is_inverted(
     coef: Coef, polynomial: Polynomial, p1: float, p2: float, share: float
 ) -> None:
-    r_max = one_to_one_radius(coef, (*polynomial[:2], p1, p2, polynomial[2]))
-    assert 0.0 < r_max <= max(min(fold_radius(coef, polynomial), RADIUS_LIMIT), fold_radius(coef))
+    r_max = one_to_one_radius(Lens(coef, polynomial, (p1, p2)))
+    rational, radial = fold_radius(Lens(coef)), fold_radius(Lens(coef, polynomial))
+    assert 0.0 < r_max <= max(min(radial, RADIUS_LIMIT), rational)
     assume(r_max > 1e-3)
     camera = lens(coef, (p1, p2), polynomial)
     rays = circle(share * min(r_max, 20.0))

@@ -12,9 +12,9 @@ from redetect.landmarks import wrap_angle
 from redetect.plane import between, chain_steps
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.run import associate_run, without_clutter
+from redetect.slam.association.scoring import score_association
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import CircleRows, LineRows, Recording
-from redetect.slam.scoring import score_association
 from redetect.slam.settings import AssociateSettings, Method
 from tests.slam.ekf_rows import circle_rows
 

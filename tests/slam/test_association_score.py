@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redetect.slam.scoring import score_association
+from redetect.slam.association.scoring import score_association
 
 
 def test_everything_right_whatever_the_labels_are_called() -> None:

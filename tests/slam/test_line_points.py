@@ -16,9 +16,9 @@ from redetect.slam.association.line_points import (
     lines_by_points,
     rays_of,
 )
+from redetect.slam.association.scoring import score_association
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.recording import LineRows, Recording
-from redetect.slam.scoring import score_association
 from tests.slam.ekf_rows import circle_rows
 
 CAMERA_XY = (0.02, -0.08)

@@ -16,7 +16,7 @@ from camera.rotations import left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import RowErrors, Weighting, errors, layout_of, linearise
+from redetect.slam.mapping.graph_terms import RowErrors, Weighting, errors, linearise
 from redetect.slam.mapping.solve import marginals, moved, solve
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.mounting import mounting_change
@@ -61,15 +61,14 @@ def test_jacobians_are_those_of_finite_differences(
         turn = rotation_of(np.array([-0.02, 0.01, 0.03]))
         mounting = np.column_stack([turn @ published_camera.rotation, published_camera.centre])
         estimate = replace(estimate, mounting=mounting)
-    layout = layout_of(graph)
     problem = linearise(graph, estimate, weighting)
     for _ in range(4):
-        step = rng.standard_normal(layout.size)
+        step = rng.standard_normal(graph.unknowns)
         change = np.zeros(6)
         change[weighting.unknown_mounting] = rng.standard_normal(len(weighting.unknown_mounting))
         h = 1e-6
-        ahead = moved(estimate, layout, h * step, h * change)
-        behind = moved(estimate, layout, -h * step, -h * change)
+        ahead = moved(graph, estimate, h * step, h * change)
+        behind = moved(graph, estimate, -h * step, -h * change)
         numeric = [
             np.concatenate([x.ravel() for x in (e.odometry, e.discs, e.lines, e.place)])
             for e in (errors(graph, ahead, weighting), errors(graph, behind, weighting))
@@ -111,11 +110,10 @@ def test_marginals_with_mounting_are_those_of_the_dense_inverse(published_camera
     problem = linearise(graph, estimate, weighting)
     jacobian = np.hstack([problem.jacobian.toarray(), problem.border])
     dense = np.linalg.inv(jacobian.T @ jacobian)
-    layout = layout_of(graph)
     assert found.mounting is not None
     np.testing.assert_allclose(found.mounting, dense[-6:, -6:], rtol=1e-7)
     np.testing.assert_allclose(found.poses[60], dense[177:180, 177:180], rtol=1e-7)
-    at = layout.first_line
+    at = graph.first_line
     np.testing.assert_allclose(found.lines[0], dense[at : at + 2, at : at + 2], rtol=1e-7)
     np.testing.assert_array_equal(found.poses[0], 0.0)
 

@@ -16,11 +16,11 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.association.run import associate_run
+from redetect.slam.association.scoring import score_run
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import camera_xy_of, first_poses, joined, read_recording
-from redetect.slam.scoring import score_run
 from redetect.slam.settings import AssociateSettings
 from tools.evaluation.figures import Figures, Study, print_figures
 from tools.evaluation.tables import Table

@@ -85,33 +85,39 @@ def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatA
 def _append(
     factor: FloatArray,
     whitened: FloatArray,
-    size: int,
-    cross: FloatArray,
-    own: FloatArray,
+    predicted: FloatArray,
+    landmarks: IntArray,
+    noise: FloatArray,
     innovation: FloatArray,
 ) -> float:
     """Extend a Cholesky factor and the whitened innovation by one pair's block, in place.
 
-    Returns the pair's part of the squared distance; negative if it is not positive definite.
+    Takes the landmarks of the pairs so far, then that of the new pair, and its row's noise (d, d)
+    and innovation (d,). Returns the pair's part of the squared distance; negative if the covariance
+    is not positive definite.
     """
-    width = len(innovation)
+    width, last = len(innovation), len(landmarks) - 1
     added = 0.0
     for a in range(width):
-        row = size + a
-        for column in range(row):
-            value = cross[a, column] if column < size else own[a, column - size]
+        row = last * width + a
+        value = rest = 0.0
+        for column in range(row + 1):
+            other, b = column // width, column % width
+            value = predicted[landmarks[last] * width + a, landmarks[other] * width + b]
+            if other == last:
+                value += noise[a, b]
+            rest = value
             for k in range(column):
-                value -= factor[row, k] * factor[column, k]
-            factor[row, column] = value / factor[column, column]
-        square = own[a, a]
-        rest = innovation[a]
-        for k in range(row):
-            square -= factor[row, k] ** 2
-            rest -= factor[row, k] * whitened[k]
-        if not square > 1e-12 * own[a, a]:
+                rest -= factor[row, k] * factor[column, k]
+            if column < row:
+                factor[row, column] = rest / factor[column, column]
+        if not rest > 1e-12 * value:
             return -1.0
-        factor[row, row] = math.sqrt(square)
-        whitened[row] = rest / factor[row, row]
+        factor[row, row] = math.sqrt(rest)
+        off = innovation[a]
+        for k in range(row):
+            off -= factor[row, k] * whitened[k]
+        whitened[row] = off / factor[row, row]
         added += whitened[row] ** 2
     return added
 
@@ -171,16 +177,12 @@ def search_jointly(
     taken = np.zeros(m, dtype=np.bool_)
     factor = np.zeros((depth * width, depth * width))
     whitened = np.zeros(depth * width)
-    cross = np.zeros((width, depth * width))
-    own = np.zeros((width, width))
-    chosen_row = np.zeros(depth, dtype=np.int64)  # of the pairs so far
+    chosen = np.zeros(depth, dtype=np.int64)  # landmarks of the pairs so far
     total = np.zeros(depth + 1)  # squared distance after k pairs
     choice = np.zeros(depth + 1, dtype=np.int64)  # next candidate to try at each level
-    paired = np.zeros(depth, dtype=np.bool_)  # whether the level holds a pair now
     pairs, level, nodes = 0, 0, 0
     while level >= 0:
-        if level < depth and paired[level]:  # back from below: undo this level's pair
-            paired[level] = False
+        if level < depth and partner[rows[level]] >= 0:  # back from below: undo this level's pair
             pairs -= 1
             taken[partner[rows[level]]] = False
             partner[rows[level]] = -1
@@ -206,21 +208,13 @@ def search_jointly(
         if taken[j]:
             continue
         nodes += 1
-        for k in range(pairs):
-            other = partner[chosen_row[k]]
-            for a in range(width):
-                for b in range(width):
-                    cross[a, k * width + b] = predicted[j * width + a, other * width + b]
-        for a in range(width):
-            for b in range(width):
-                own[a, b] = predicted[j * width + a, j * width + b] + noise[row, a, b]
-        added = _append(factor, whitened, pairs * width, cross, own, innovations[row, j])
+        chosen[pairs] = j
+        landmarks = chosen[: pairs + 1]
+        added = _append(factor, whitened, predicted, landmarks, noise[row], innovations[row, j])
         if added < 0.0 or total[pairs] + added > gates[reachable]:
             continue
-        chosen_row[pairs] = row
         total[pairs + 1] = total[pairs] + added
         pairs += 1
-        paired[level] = True
         partner[row] = j
         taken[j] = True
         if total[pairs] <= gates[pairs] and (

@@ -137,13 +137,7 @@ def _best_run(
             continue
         seen = math.atan2(left, ahead)
         gained = missed
-        i, end = start[f], start[f + 1]
-        while i < end:  # the first ray within the gate
-            middle = (i + end) // 2
-            if bearing[middle] < seen - reach:
-                i = middle + 1
-            else:
-                end = middle
+        i = start[f] + np.searchsorted(bearing[start[f] : start[f + 1]], seen - reach)
         while i < start[f + 1] and bearing[i] <= seen + reach:
             off = (seen - bearing[i]) / sigma[i]
             if free[i] and abs(off) < _GATE and worth[i] - 0.5 * off * off > gained:

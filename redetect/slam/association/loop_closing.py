@@ -14,13 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.cluster.hierarchy import DisjointSet
-from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis
+from redetect.least_squares.solver import Block, normal_equations, stack
 from redetect.plane import apply, between, chain_steps, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
@@ -140,8 +140,7 @@ def in_order(labels: IntArray) -> IntArray:
     """Renumber labels (n,) from 0 without gaps, in the order of their first rows; -1 stays."""
     names, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     first[names < 0] = -1
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first)) - np.count_nonzero(names < 0)
+    rank = np.argsort(np.argsort(first)) - np.count_nonzero(names < 0)
     return rank[inverse]
 
 
@@ -253,12 +252,10 @@ def _chained(
     before: IntArray, after: IntArray, differences: FloatArray, weight: FloatArray, count: int
 ) -> FloatArray:
     """Values at nodes 0 (where they are 0) to count from weighted differences between nodes."""
-    edges = len(before)
-    row = np.tile(np.arange(edges), 2)
-    column = np.concatenate([after, before]) - 1
-    value = np.concatenate([weight, -weight])
-    free = column >= 0
-    matrix = csc_array((value[free], (row[free], column[free])), shape=(edges, count))
-    solver = splu((matrix.T @ matrix).tocsc(), permc_spec="MMD_AT_PLUS_A")
-    solved = solver.solve(np.asarray(matrix.T @ (differences * weight[:, None])))
-    return np.concatenate([np.zeros((1, differences.shape[1])), solved])
+    width = differences.shape[1]
+    by = weight[:, None, None] * np.eye(width)
+    edges = Block(
+        -weight[:, None] * differences, [(width * (after - 1), by), (width * (before - 1), -by)]
+    )
+    solved, _ = normal_equations(stack([edges], width * count, shared=0)).step(damping=0.0)
+    return np.concatenate([np.zeros((1, width)), solved.reshape(count, width)])

@@ -97,7 +97,7 @@ def _nearest_by_cell(fixed: FloatArray) -> _Cells:
 
 @kernel()
 def _agreement(
-    offsets: FloatArray,
+    moved: FloatArray,
     motion: tuple[float, float, float, float],
     fixed: FloatArray,
     cells: _Cells,
@@ -105,19 +105,19 @@ def _agreement(
 ) -> tuple[int, float]:
     """Number of landmarks that a motion puts on others, and their squared distances' sum (m^2).
 
-    `offsets` (n, 2) of the moved landmarks from their centre; `motion`: cosine and sine of the
-    rotation, and where it puts the centre. Stops as soon as there cannot be `enough`.
+    The motion is cosine and sine of the rotation, and the shift. Stops as soon as there cannot be
+    `enough`.
     """
-    cos, sin, centre_x, centre_y = motion
+    cos, sin, shift_x, shift_y = motion
     low_x, low_y, nearest = cells
     columns, rows = nearest.shape
-    n = len(offsets)
+    n = len(moved)
     count, squared = 0, 0.0
     for i in range(n):
         if count + n - i < enough:
             break
-        x, y = offsets[i, 0], offsets[i, 1]
-        at_x, at_y = centre_x + cos * x - sin * y, centre_y + sin * x + cos * y
+        x, y = moved[i, 0], moved[i, 1]
+        at_x, at_y = shift_x + cos * x - sin * y, shift_y + sin * x + cos * y
         column, row = int((at_x - low_x) / _CELL_M), int((at_y - low_y) / _CELL_M)
         if at_x < low_x or at_y < low_y or column >= columns or row >= rows:
             continue
@@ -132,31 +132,17 @@ def _agreement(
 
 
 @kernel()
-def _near(turn: float, x: float, y: float, others: FloatArray) -> bool:
-    """Whether a rotation and a shift are near one of others (k, 3)."""
-    for k in range(len(others)):
-        off = math.hypot(x - others[k, 1], y - others[k, 2])
-        if off < _OTHER_SHIFT_M and math.cos(turn - others[k, 0]) > math.cos(_OTHER_TURN_RAD):
-            return True
-    return False
-
-
-@kernel()
 def _best_motion(
     moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
-    Every pair of landmarks of the first with every pair of the second of the same length gives a
-    motion. Returns the rotation about the first constellation's centre and the shift, the number of
-    agreeing landmarks, and that of motions tried, without those near `besides` (k, 3).
+    Both are relative to the centre of the first. Every pair of its landmarks with every pair of the
+    second of the same length gives a motion. Returns rotation and shift, the number of agreeing
+    landmarks, and that of motions tried, without those near `besides`: a rotation and a shift (3,),
+    NaN for none.
     """
     n, m = len(moved), len(fixed)
-    centre_x, centre_y = 0.0, 0.0
-    for i in range(n):
-        centre_x += moved[i, 0] / n
-        centre_y += moved[i, 1] / n
-    offsets = moved - np.array([centre_x, centre_y])
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
     cells = _nearest_by_cell(fixed)
@@ -179,18 +165,19 @@ def _best_motion(
                         continue
                     cos, sin = math.cos(turn), math.sin(turn)
                     # The middle of one pair goes to the middle of the other.
-                    x = 0.5 * (moved[a, 0] + moved[b, 0]) - centre_x
-                    y = 0.5 * (moved[a, 1] + moved[b, 1]) - centre_y
-                    new_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
-                    new_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
-                    shift_x, shift_y = new_x - centre_x, new_y - centre_y
+                    x = 0.5 * (moved[a, 0] + moved[b, 0])
+                    y = 0.5 * (moved[a, 1] + moved[b, 1])
+                    shift_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
+                    shift_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
                     if math.hypot(shift_x, shift_y) > search.most_shift_m:
                         continue
-                    if _near(turn, shift_x, shift_y, besides):
+                    off = math.hypot(shift_x - besides[1], shift_y - besides[2])
+                    alike = math.cos(turn - besides[0]) > math.cos(_OTHER_TURN_RAD)
+                    if alike and off < _OTHER_SHIFT_M:
                         continue
                     tried += 1
-                    motion = (cos, sin, new_x, new_y)
-                    count, squared = _agreement(offsets, motion, fixed, cells, best_count)
+                    motion = (cos, sin, shift_x, shift_y)
+                    count, squared = _agreement(moved, motion, fixed, cells, best_count)
                     if count > best_count or (count == best_count and squared < best_squared):
                         best_turn, best_x, best_y = turn, shift_x, shift_y
                         best_count, best_squared = count, squared
@@ -315,10 +302,10 @@ def motion_onto(
     `besides` (3,), the best one that is not near this pose.
     """
     centre = moved.sum(axis=0) / max(len(moved), 1)
-    others = np.zeros((0, 3))
+    known = np.full(3, np.nan)
     if besides is not None:
-        others = np.array([[besides[2], *(apply(besides, centre) - centre)]])
-    turn, x, y, agreeing, tried = _best_motion(moved, fixed, search, others)
+        known = np.array([besides[2], *(apply(besides, centre) - centre)])
+    turn, x, y, agreeing, tried = _best_motion(moved - centre, fixed - centre, search, known)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 

@@ -22,14 +22,7 @@ from scipy.spatial import KDTree
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply, chain_steps, rotation
-from redetect.slam.association.loops import (
-    Search,
-    Stretch,
-    chance_of_agreeing,
-    log10_false_alarms,
-    motion_onto,
-    refined_motion,
-)
+from redetect.slam.association import loops
 from redetect.slam.recording import Recording
 
 #: Fewest frames that are tried, growth of their number, and most frames.
@@ -40,9 +33,9 @@ ONE_DISC_M = 0.25
 _RIVAL_SHARE = 0.7
 #: Least standard deviation of a disc (m): that of raw rows from a leaning camera.
 _DISC_SIGMA_M = 0.25
-ANYWHERE = Search(math.inf, math.inf, least_agreeing=5)
+ANYWHERE = loops.Search(math.inf, math.inf, least_agreeing=5)
 # Largest disagreement of stretches of one run, due to the drift of odometry.
-_DRIFT = Search()
+_DRIFT = loops.Search()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +99,19 @@ def located(
     least = ANYWHERE.least_agreeing
     if min(len(discs), len(disc_xy)) < least:
         return None
-    motion = motion_onto(discs, disc_xy, ANYWHERE)
-    found = refined_motion(discs, disc_xy, motion.pose, least) if motion.agreeing >= least else None
+    motion = loops.motion_onto(discs, disc_xy, ANYWHERE)
+    if motion.agreeing < least:
+        return None
+    found = loops.refined_motion(discs, disc_xy, motion.pose, least)
     if found is None:
         return None
     pose, pairs = found
-    chance = chance_of_agreeing(disc_xy)
-    if log10_false_alarms(len(pairs), len(discs), chance, motion.tried) > math.log10(false_alarms):
+    chance = loops.chance_of_agreeing(disc_xy)
+    alarms = loops.log10_false_alarms(len(pairs), len(discs), chance, motion.tried)
+    if alarms > math.log10(false_alarms):
         return None
     # Also one on the same discs: pairs in a corridor look alike from both ends, and a period on.
-    rival = motion_onto(discs, disc_xy, ANYWHERE, besides=pose)
+    rival = loops.motion_onto(discs, disc_xy, ANYWHERE, besides=pose)
     return None if rival.agreeing > _RIVAL_SHARE * len(pairs) else (pose, pairs)
 
 
@@ -139,7 +135,7 @@ def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> 
 
 
 def register_maps(
-    places: Sequence[FloatArray], stretches: Sequence[Sequence[Stretch]]
+    places: Sequence[FloatArray], stretches: Sequence[Sequence[loops.Stretch]]
 ) -> tuple[FloatArray, list[IntArray], list[int]]:
     """Register maps in the first one, or in those already registered.
 
@@ -179,7 +175,7 @@ def register_maps(
 
 
 def register(
-    stretches: Sequence[Stretch], xy: FloatArray
+    stretches: Sequence[loops.Stretch], xy: FloatArray
 ) -> tuple[FloatArray, list[tuple[IntArray, IntArray]]] | None:
     """The motion that registers a run's map in another one, and the identical landmarks.
 

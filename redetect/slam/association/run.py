@@ -368,10 +368,9 @@ def without_clutter(
 def _nearest_of_frame(frames: IntArray, labels: IntArray, squared: FloatArray) -> BoolArray:
     """(n,) mask of the rows with the least squared error of those with one label in a frame."""
     order = np.lexsort((squared, labels, frames))
-    first = np.ones(len(order), dtype=np.bool_)
-    first[1:] = (np.diff(frames[order]) != 0) | (np.diff(labels[order]) != 0)
+    _, first = np.unique(np.stack([frames, labels])[:, order], axis=1, return_index=True)
     nearest = np.zeros(len(order), dtype=np.bool_)
-    nearest[order] = first
+    nearest[order[first]] = True
     return nearest
 
 

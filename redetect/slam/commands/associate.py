@@ -16,13 +16,16 @@ from redetect.array_types import IntArray
 from redetect.bounds import NOT_NEGATIVE, demand, whole
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.slam.association.run import associate_run
+from redetect.slam.association.scoring import Scores, score_run
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
 from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
-from redetect.slam.scoring import Scores, score_run
 from redetect.storage import demand_free
+
+#: Labels (n,) of a file's rows, by the kind of the rows.
+Labels = dict[type[CircleLandmark] | type[LineLandmark], IntArray]
 
 
 def perform(options: Associate) -> int:
@@ -58,9 +61,10 @@ def perform(options: Associate) -> int:
     of_discs = np.split(result.circle_labels, np.cumsum([len(run.circles) for run in runs]))
     of_lines = np.split(result.line_labels, np.cumsum([len(run.lines) for run in runs]))
     for (k, source), target in zip(sources, targets):
-        rows, labels = list(read_rows(source)), (of_discs[k], of_lines[k])
-        write_rows(target, identified_rows(rows, *labels, source), overwrite=options.force)
-        print(f"{target}: {_counted(rows, *labels)}")
+        rows = list(read_rows(source))
+        labels: Labels = {CircleLandmark: of_discs[k], LineLandmark: of_lines[k]}
+        write_rows(target, identified_rows(rows, labels, source), overwrite=options.force)
+        print(f"{target}: {_counted(rows, labels)}")
     for run, own in zip(runs, of_discs):
         if 2 * np.count_nonzero(own < 0) > len(own):
             print(_doubt(run), file=sys.stderr)
@@ -90,18 +94,14 @@ def score_lines(noise: float, seconds: float, scores: Scores) -> list[str]:
     return lines
 
 
-def identified_rows(
-    rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray, source: Path
-) -> Iterator[Row]:
+def identified_rows(rows: Sequence[Row], labels: Labels, source: Path) -> Iterator[Row]:
     """Rows of a file with the IDs found, from 1, or -1; everything else unchanged."""
     numbers: dict[type, Iterator[int]] = {}
-    for kind, labels in ((CircleLandmark, circle_labels), (LineLandmark, line_labels)):
+    for kind, own in labels.items():
         count = sum(isinstance(row.record, kind) for row in rows)
-        if count not in (0, len(labels)):
-            raise SlamError(
-                f"{source}: {count} rows of a kind: expected the {len(labels)} associated"
-            )
-        numbers[kind] = iter(np.where(labels >= 0, labels + 1, UNKNOWN_ID).tolist())
+        if count not in (0, len(own)):
+            raise SlamError(f"{source}: {count} rows of a kind: expected the {len(own)} associated")
+        numbers[kind] = iter(np.where(own >= 0, own + 1, UNKNOWN_ID).tolist())
     for row in rows:
         if isinstance(row.record, CircleLandmark | LineLandmark):
             yield row.with_record(replace(row.record, ids=(next(numbers[type(row.record)]),)))
@@ -109,17 +109,14 @@ def identified_rows(
             yield row
 
 
-def _counted(rows: Sequence[Row], circle_labels: IntArray, line_labels: IntArray) -> str:
+def _counted(rows: Sequence[Row], labels: Labels) -> str:
     """The numbers of landmarks of each kind found in a file, in words."""
     parts = []
-    for kind, labels, name in (
-        (CircleLandmark, circle_labels, "discs"),
-        (LineLandmark, line_labels, "lines"),
-    ):
+    for (kind, own), name in zip(labels.items(), ("discs", "lines")):
         if any(isinstance(row.record, kind) for row in rows):
-            parts.append(f"{len(np.unique(labels[labels >= 0]))} {name}")
-            if np.any(labels < 0):
-                parts[-1] += f" and {np.count_nonzero(labels < 0)} rows that match none of them"
+            parts.append(f"{len(np.unique(own[own >= 0]))} {name}")
+            if np.any(own < 0):
+                parts[-1] += f" and {np.count_nonzero(own < 0)} rows that match none of them"
     return ", ".join(parts) or "no landmarks"
 
 

@@ -164,13 +164,14 @@ class Filter(ABC):
         common_tilt_variance: float,
     ) -> None:
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
+        #: Index of each landmark's first number in the state, by identifier.
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
         self.count = RowCount()
         # Numbers of the pose, and of the common tilt, if there is one.
         self._moving = np.arange(POSE_SIZE + 2 if common_tilt_variance else POSE_SIZE)
         self._tilt = slice(POSE_SIZE, len(self._moving))
-        self.size = len(self._moving)
+        self.size = len(self._moving)  #: Number of numbers in the state.
         self._state = np.zeros(self.size)
         self._state[_POSE] = start
         self._linearised = self._state.copy()
@@ -373,14 +374,11 @@ class Associator:
 
     def _discs(self, rows: CircleRows, estimate: Filter) -> IntArray:
         names = _near_discs(rows.xy, estimate)
-        found = np.full(len(rows), UNKNOWN_ID, dtype=np.int64)
-        closest = np.full(len(found), np.inf)
-        if len(names):
-            compared = estimate.compared(rows, names)
-            landmark = compatible(self.method, *compared, self.gate_probability)
-            found = np.append(names, UNKNOWN_ID)[landmark]
-            closest = np.min(individual_distances(*compared), axis=1)
+        compared = estimate.compared(rows, names)
+        landmark = compatible(self.method, *compared, self.gate_probability)
+        found = np.append(names, UNKNOWN_ID)[landmark]
         if self.new_id is not None:
+            closest = np.min(individual_distances(*compared), axis=1, initial=np.inf)
             far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
                 found[k] = self.new_id()
@@ -390,8 +388,6 @@ class Associator:
         names, slots = np.array([*estimate.line_slots.items()], dtype=np.int64).reshape(-1, 2).T
         away = np.linalg.norm(estimate.state[slots[:, None] + _XY] - estimate.state[:2], axis=1)
         names = names[away < FARTHEST_LINE_M]
-        if not len(names) or not len(rows):
-            return ((),) * len(rows)
         landmark = compatible(self.method, *estimate.compared(rows, names), self.gate_probability)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 

@@ -139,20 +139,19 @@ class EkfSlam(base.Filter):
         """Remove landmarks from the state."""
         if not discs and not lines:
             return
-        sizes = ((self.disc_slots, 2, discs), (self.line_slots, self.line_size, lines))
-        kept = [self._moving]
-        for slots, size, dropped in sizes:
+        kept = self._moving
+        for slots, size, dropped in (
+            (self.disc_slots, 2, discs),
+            (self.line_slots, self.line_size, lines),
+        ):
             for number in dropped:
                 del slots[number]
-            kept.append(base.numbers_from([*slots.values()], size).ravel())
-        index = np.concatenate(kept)
-        at = len(self._moving)
-        for slots, size, _ in sizes:
-            for number in slots:
-                slots[number], at = at, at + size
-        self.size = len(index)
-        self._state, self._linearised = self._state[index], self._linearised[index]
-        self._covariance = np.asfortranarray(self.block(index))
+            numbers = base.numbers_from([*slots.values()], size).ravel()
+            slots.update(zip([*slots], range(len(kept), len(kept) + len(numbers), size)))
+            kept = np.append(kept, numbers)
+        self.size = len(kept)
+        self._state, self._linearised = self._state[kept], self._linearised[kept]
+        self._covariance = np.asfortranarray(self.block(kept))
 
     def _update(self, rows: base.FrameRows) -> None:
         """Use rows whose landmarks are in the state."""

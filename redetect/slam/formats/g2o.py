@@ -157,20 +157,12 @@ def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
                 "disc, of the graph"
             )
     sights.sort(key=lambda row: rank[row.vertices[0]])
-    spreads = []
-    for some, size in ((steps, 3), (sights, 2)):
-        information = _symmetric(some, size)
-        some_at_all = np.diagonal(information, axis1=1, axis2=2).min(axis=1) > _LEAST_INFORMATION
-        for bad in np.flatnonzero(~(is_positive_definite(information) & some_at_all))[:1]:
-            raise SlamError(
-                f"{path}:{some[bad].line}: the information matrix is not positive definite"
-            )
-        spreads.append(_inverses(information))
+    step_covariance, sight_covariance = _covariances(path, steps, 3), _covariances(path, sights, 2)
     base = first_disc_vertex(order[-1])
     if min(discs, default=base) < base:
         base = 0
     moved = _table(steps, 3)
-    of_steps = in_turned_axes(spreads[0], -moved[:, 2])
+    of_steps = in_turned_axes(step_covariance, -moved[:, 2])
     recording = Recording(
         prefixes=tuple(f"vertex.{vertex}" for vertex in order[1:]),
         steps=to_dataset(moved),
@@ -178,7 +170,7 @@ def read_g2o(path: str | os.PathLike[str]) -> RunGraph:
         circles=CircleRows(
             frame=np.array([rank[row.vertices[0]] - 1 for row in sights], dtype=np.int64),
             xy=to_dataset(_table(sights, 2)),
-            covariance=covariance_from_dataset(spreads[1], back=True),
+            covariance=covariance_from_dataset(sight_covariance, back=True),
             ids=np.array([row.vertices[1] - base for row in sights], dtype=np.int64),
         ),
         lines=LineRows.of(),
@@ -248,11 +240,15 @@ def _table(rows: Sequence[_Row], width: int) -> FloatArray:
     return np.array([row.numbers[:width] for row in rows], dtype=np.float64).reshape(-1, width)
 
 
-def _symmetric(rows: Sequence[_Row], size: int) -> FloatArray:
-    """Information matrices from their upper triangles at the end of each row."""
+def _covariances(path: str | os.PathLike[str], rows: Sequence[_Row], size: int) -> FloatArray:
+    """Inverses of the information matrices, whose upper triangles are at the end of each row."""
     triangle = np.triu_indices(size)
     count = len(triangle[0])
-    matrices = np.zeros((len(rows), size, size))
-    last = np.array([row.numbers[-count:] for row in rows], dtype=np.float64)
-    matrices[:, *triangle] = last.reshape(-1, count)
-    return np.asarray(matrices + np.triu(matrices, 1).swapaxes(1, 2))
+    upper = np.zeros((len(rows), size, size))
+    upper[:, *triangle] = np.reshape([row.numbers[-count:] for row in rows], (-1, count))
+    information = upper + np.triu(upper, 1).swapaxes(1, 2)
+    usable = is_positive_definite(information)
+    usable &= np.all(np.diagonal(information, axis1=1, axis2=2) > _LEAST_INFORMATION, axis=1)
+    for bad in np.flatnonzero(~usable)[:1]:
+        raise SlamError(f"{path}:{rows[bad].line}: the information matrix is not positive definite")
+    return _inverses(information)

@@ -50,6 +50,21 @@ class Graph:
     common_tilt_variance: float = 0.0  # of pitch and roll common to all frames (rad^2)
 
     @property
+    def first_disc(self) -> int:
+        """Index of the discs in the vector of unknowns, after all poses but the first."""
+        return 3 * len(self.steps)
+
+    @property
+    def first_line(self) -> int:
+        """Index of the lines in the vector of unknowns."""
+        return self.first_disc + 2 * len(self.disc_ids)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns: poses, then discs, then lines."""
+        return self.first_line + 2 * len(self.line_ids)
+
+    @property
     def disc_row_counts(self) -> IntArray:
         """(M,) number of rows of each disc."""
         return np.bincount(self.disc_index, minlength=len(self.disc_ids)).astype(np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -58,21 +58,6 @@ class Weighting(Bounded, error=SlamError):
         return list(range(MOUNTING)) if self.place else [0, 1, 2, 5]
 
 
-class Layout(NamedTuple):
-    """Offsets of each kind in the vector of unknowns: poses except the first come first."""
-
-    first_disc: int
-    first_line: int
-    size: int
-
-
-def layout_of(graph: Graph) -> Layout:
-    """Layout of a problem's unknowns."""
-    first_disc = 3 * len(graph.steps)
-    first_line = first_disc + 2 * len(graph.disc_ids)
-    return Layout(first_disc, first_line, first_line + 2 * len(graph.line_ids))
-
-
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Whitened errors by kind, not robustified."""
@@ -111,12 +96,12 @@ def cost(graph: Graph, estimate: Estimate, weighting: Weighting) -> float:
 def linearise(
     graph: Graph, estimate: Estimate, weighting: Weighting, *, by_tilt: bool = False
 ) -> Linear:
-    """The problem linearised at an estimate, with unknowns as in `Layout`; the mounting is shared.
+    """The problem linearised at an estimate; poses, discs and lines are in the order of
+    `Graph.unknowns`, the mounting is shared.
 
     The unknown numbers of the mounting change by a rotation vector in the robot frame, applied from
     the left, and a translation; with `by_tilt` pitch and roll of all frames take their place.
     """
-    layout = layout_of(graph)
     error = errors(graph, estimate, weighting)
     loss = Loss(weighting.loss, weighting.loss_scale)
     by_first, by_second = models.between_jacobians(estimate.poses[:-1], estimate.poses[1:])
@@ -128,7 +113,7 @@ def linearise(
     if by_tilt:
         by_shared = graph.disc_whitening @ models.common_tilt_jacobian(graph.disc_xy)
     of_pose = 3 * (graph.disc_pose - 1)  # below 0 for the first, which is not unknown
-    seen = [(of_pose, by_pose), (layout.first_disc + 2 * graph.disc_index, by_disc)]
+    seen = [(of_pose, by_pose), (graph.first_disc + 2 * graph.disc_index, by_disc)]
     whiten = graph.step_whitening
     blocks = [
         Block(error.odometry, [(step - 3, whiten @ by_first), (step, whiten @ by_second)]),
@@ -136,13 +121,13 @@ def linearise(
         *_line_blocks(graph, estimate, error.lines, loss),
     ]
     if len(error.prior):
-        of_line = layout.first_line + 2 * np.arange(len(error.prior), dtype=np.int64)
+        of_line = graph.first_line + 2 * np.arange(len(error.prior), dtype=np.int64)
         near = np.tile(np.eye(2) / LINE_PRIOR_M, (len(error.prior), 1, 1))
         blocks.append(Block(error.prior, [(of_line, near)]))
     if len(error.place) and unknown:
         by_place = np.eye(MOUNTING)[None, 3:5, unknown] / PLACE_PRIOR_M
         blocks.append(Block(error.place, [], by_place))
-    return stack(blocks, layout.size, 2 if by_tilt else len(unknown))
+    return stack(blocks, graph.unknowns, 2 if by_tilt else len(unknown))
 
 
 def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -187,7 +172,6 @@ def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss
     """A row's derivatives are those of all its lines."""
     if len(graph.line_pose) == 0:
         return []
-    layout = layout_of(graph)
     pose, share = _members(graph)
     line_xy = estimate.line_xy[graph.member_line]
     by_pose, by_line = models.bearing_jacobians(estimate.poses[pose], line_xy, graph.camera_xy)
@@ -202,6 +186,6 @@ def _line_blocks(graph: Graph, estimate: Estimate, error: FloatArray, loss: Loss
     by = [(3 * (graph.line_pose - 1), of_row[:, None, :])]
     for k in range(int(count.max())):
         member = order[start + np.minimum(k, count - 1)]
-        first = layout.first_line + 2 * graph.member_line[member]
+        first = graph.first_line + 2 * graph.member_line[member]
         by.append((np.where(k < count, first, -1), by_line[member][:, None, :]))
     return [Block(error[:, None], by, loss=loss)]

@@ -225,21 +225,18 @@ def map_run(
     _check_usable(recording, camera, wanted, name)
     graph = graph_of_recording(recording, camera)
     begin = _parts_registered(recording, graph, first_sight(graph, start), name)
-    has_lines = len(recording.lines) > 0
-    plain_only = not has_lines and wanted == Weighting() and solver == "separable"
+    plain_only = not len(recording.lines) and wanted == Weighting() and solver == "separable"
     # First odometry and discs, then with lines.
     minima = [_fitted_to_discs(recording, graph, begin, 1e-10 if plain_only else _COARSE, name)]
     estimate = minima[-1].at
-    placed = InitialLines(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
-    if has_lines:
-        placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
-        if not len(placed.ids) and not len(graph.disc_ids):
-            raise SlamError(
-                f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its "
-                "own: there is nothing to map"
-            )
-        graph, estimate, with_them = _with_lines(graph, recording, estimate, placed)
-        minima += with_them
+    placed = place_lines(estimate.poses, recording.lines, graph.camera_xy)
+    if not len(placed.ids) and not len(graph.disc_ids):
+        raise SlamError(
+            f"{name}: none of {len(placed.unplaced)} lines has enough parallax in rows of its own: "
+            "there is nothing to map"
+        )
+    graph, estimate, with_them = _with_lines(graph, recording, estimate, placed)
+    minima += with_them
     # From there the wanted loss, and last the mounting.
     final: Descent = solve_gtsam
     if solver != "gtsam":

@@ -20,14 +20,7 @@ from redetect.least_squares import solver
 from redetect.least_squares.covariance import chosen_covariance, diagonal_blocks
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.mapping.graph_terms import (
-    MOUNTING,
-    Layout,
-    Weighting,
-    cost,
-    layout_of,
-    linearise,
-)
+from redetect.slam.mapping.graph_terms import MOUNTING, Weighting, cost, linearise
 
 _MOST_STEPS = 200
 
@@ -58,22 +51,21 @@ class _MapProblem:
     def moved(self, at: Estimate, step: FloatArray, shared: FloatArray) -> Estimate:
         change = np.zeros(MOUNTING)
         change[self.weighting.unknown_mounting] = shared
-        return moved(at, layout_of(self.graph), step, change)
+        return moved(self.graph, at, step, change)
 
     def with_best_positions(self, trial: Estimate, reached: float) -> tuple[Estimate, float]:
         """A trial with positions fitted to its headings, if that lowers the cost, and its cost."""
-        layout = layout_of(self.graph)
         problem = self.linear(trial)
-        free = np.ones(layout.size, dtype=bool)
-        free[2 : layout.first_disc : 3] = False
+        free = np.ones(self.graph.unknowns, dtype=bool)
+        free[2 : self.graph.first_disc : 3] = False
         jacobian = problem.jacobian.tocsc()[:, np.flatnonzero(free)]
-        step = np.zeros(layout.size)
+        step = np.zeros(len(free))
         try:
             normal = solver.factor((jacobian.T @ jacobian).tocsc())
         except np.linalg.LinAlgError:
             return trial, reached
         step[free] = -normal.solve(jacobian.T @ problem.residual)
-        fitted = moved(trial, layout, step, np.zeros(MOUNTING))
+        fitted = moved(self.graph, trial, step, np.zeros(MOUNTING))
         fitted_cost = self.cost(fitted)
         return (fitted, fitted_cost) if fitted_cost < reached else (trial, reached)
 
@@ -140,11 +132,10 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
     With a robust loss, the information of rows is multiplied by their weights. Raises `SlamError`
     if the measurements do not determine the unknowns.
     """
-    layout = layout_of(graph)
     blocks = [
-        (3, np.arange(0, layout.first_disc, 3)),
-        (2, np.arange(layout.first_disc, layout.first_line, 2)),
-        (2, np.arange(layout.first_line, layout.size, 2)),
+        (3, np.arange(0, graph.first_disc, 3)),
+        (2, np.arange(graph.first_disc, graph.first_line, 2)),
+        (2, np.arange(graph.first_line, graph.unknowns, 2)),
     ]
     with _determined("covariances"):
         found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
@@ -160,15 +151,14 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
 
     Returns (2 M, 2 M): discs, then lines (m^2).
     """
-    layout = layout_of(graph)
-    landmarks = np.arange(layout.first_disc, layout.size)
+    landmarks = np.arange(graph.first_disc, graph.unknowns)
     with _determined("covariances"):
         return chosen_covariance(equations_at(graph, estimate, weighting), landmarks)
 
 
-def moved(estimate: Estimate, layout: Layout, step: FloatArray, mounting: FloatArray) -> Estimate:
+def moved(graph: Graph, estimate: Estimate, step: FloatArray, mounting: FloatArray) -> Estimate:
     """An estimate after a step (K,) of all unknowns except the mounting, and (6,) of that."""
-    poses, discs, lines = np.split(step, [layout.first_disc, layout.first_line])
+    poses, discs, lines = np.split(step, [graph.first_disc, graph.first_line])
     after = replace(
         estimate,
         poses=estimate.poses + np.concatenate([np.zeros((1, 3)), poses.reshape(-1, 3)]),
