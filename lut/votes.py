@@ -78,7 +78,9 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
             fingerprint(camera, shape),
         )  # fmt: skip
     direction = offset[usable].mean(axis=0)
-    direction /= max(float(np.hypot(*direction)), 1e-9)
+    distance = float(np.hypot(*direction))
+    # If the camera looks straight down, any direction will do.
+    direction = direction / distance if distance > 1e-6 * radius else np.array([0.0, 1.0])
     turn = np.array([[-direction[1], direction[0]], direction])
     place = offset @ turn.T
     per_row = np.linalg.norm(np.gradient(place, axis=0), axis=-1)

@@ -24,6 +24,8 @@ EXACT_PX = 1e-6
 
 # Number of rounds of Lawson's reweighting, which minimises the largest deviation.
 _LAWSON_ROUNDS = 25
+# Number of rounds of the approximation from which the fit of a wide lens starts.
+_BENDS = 5
 _STEPS, _LAWSON_STEPS = 60, 5
 # Cost of parameters that are impossible or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
@@ -255,11 +257,34 @@ def convert_to_camera(
         measured=measured,
     )
     best = _nearest(fit, start, spans)
+    if best.deviation_px > _NEAR_PX:  # a wide fisheye lens is too far from a pinhole
+        bent = _bent_as(start, pixels, rays)
+        if is_possible(bent, width, height):
+            best = nearer(best, _nearest(fit, bent, spans[5:]))
     if best.deviation_px <= _NEAR_PX:
         return best
     assert isinstance(best.camera, Camera)
     together = [FreeLens(5, decentred, 3).span(None)]
     return nearer(best, _nearest(fit, intrinsics_of(best.camera), together))
+
+
+def _bent_as(intrinsics: FloatArray, pixels: FloatArray, rays: FloatArray) -> FloatArray:
+    """Intrinsics with a rational part that approximates the radii of (N, 2) pixels and their rays.
+
+    Least squares linear in a2, a3, b1, b2, b3, each time divided by the last denominator (C. K.
+    Sanathanan and J. Koerner, Transfer function synthesis as a ratio of two complex polynomials,
+    IEEE Transactions on Automatic Control 8, 1963).
+    """
+    radius = np.hypot(*rays.T)
+    added = np.hypot(*((pixels - intrinsics[2:4]) / intrinsics[:2]).T) - radius
+    powers = radius[:, None] ** np.arange(1, 4)
+    matrix = np.hstack([radius[:, None] * powers[:, :2], -added[:, None] * powers])
+    coef, denominator = np.zeros(5), np.ones(len(radius))
+    for _ in range(_BENDS):
+        weight = 1.0 / np.maximum(denominator, 1.0)
+        coef = np.linalg.lstsq(weight[:, None] * matrix, weight * added, rcond=None)[0]
+        denominator = 1.0 + powers @ coef[2:]
+    return np.concatenate([intrinsics[:4], coef, intrinsics[9:]])
 
 
 def contained(source: AnyCamera, model: Model, number: int) -> ForeignCamera | None:

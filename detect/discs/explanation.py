@@ -272,7 +272,7 @@ def _place(at: tuple[float, float], scene: _Examined) -> str:
     votes, judgement = scene.judgement
     near = np.hypot(*(judgement.traced_from - [x, y]).T) < settings.radius_m
     if not near.any():
-        return f"{words}: no edges there vote for a disc of {settings.radius_m:g} m."
+        return f"{words}: too few edges there vote for a disc of {settings.radius_m:g} m."
     return f"{words}: edges there have {votes[near].max():.1f} times the usual votes for a disc."
 
 

@@ -20,7 +20,7 @@ from detect.run_tilt import (
 )
 from detect.runs.outputs import RUN_TILT
 from detect.runs.plan import FrameRows, Lean, RunSummary
-from detect.settings import CircleSettings
+from detect.settings import LEAST_FRAMES, CircleSettings
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
     FrameTilt,
@@ -51,9 +51,18 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt |
     return found, found.usual_rad if found else usual_tilt(verticals, outlines)
 
 
-def searched_lean(tilt: RunTilt) -> Lean | None:
-    """The lean for the search for discs; None if it is so small that it makes no difference."""
-    lean_deg = np.degrees(tilt.lean).round(1)  # so that runs of a camera share a cached table
+def lean_of_outlines(frames: Iterable[FrameRows]) -> FloatArray:
+    """(2,) median pitch and roll that the outlines of discs show in some frames (rad); zero if few
+    frames show any.
+    """
+    _, _, outlines = _tilts_of(rows.rows for rows in frames)
+    known = outlines.tilt[outlines.known]
+    return np.median(known, axis=0) if len(known) >= LEAST_FRAMES else np.zeros(2)
+
+
+def searched_lean(lean: FloatArray) -> Lean | None:
+    """The lean (2,) for the search for discs (rad); None if it hardly makes a difference."""
+    lean_deg = np.degrees(lean).round(1)  # so that runs of a camera share a cached table
     if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:
         return None
     pitch, roll = np.radians(lean_deg).tolist()

@@ -56,6 +56,7 @@ _COMPLETE = "complete"
 #: Largest number of frames from which a run's tilt is estimated first, and their largest spacing.
 _FIRST_FRAMES = 32
 _FIRST_SPACING = 20
+_FIRST_ROUNDS = 2  #: How often they are searched with a lean.
 
 _log = logging.getLogger("redetect")
 
@@ -235,7 +236,8 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
         return plan
     if (run.frames.expected or 0) < LEAST_FRAMES:
         return plan
-    from detect.runs.level_run import searched_lean, tilt_of_some  # loads the compiler
+    # This loads the compiler.
+    from detect.runs.level_run import lean_of_outlines, searched_lean, tilt_of_some
 
     tasks = [FrameTask(frame) for frame in spread_frames(run.frames, _FIRST_FRAMES, _FIRST_SPACING)]
 
@@ -249,12 +251,19 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     if known and circles.tilt_sigma_deg is None and plan.levelling != "run":
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(usual_rad), 2))
         plan = replace(plan, circles=circles)
-    lean = searched_lean(tilt) if tilt else None
-    if lean is None:
-        return plan
-    leaning = replace(level, lean=lean)
-    evidence, with_lean = (sum(each.evidence for each in of) for of in (rows, rows_by(leaning)))
-    return replace(plan, lean=lean) if lean_finds_more(with_lean, evidence) else plan
+    lean = searched_lean(tilt.lean) if tilt else None
+    evidence = sum(each.evidence for each in rows)
+    for _ in range(_FIRST_ROUNDS):
+        if lean in (None, plan.lean):
+            break
+        rows, before = rows_by(replace(level, lean=lean)), evidence
+        evidence = sum(each.evidence for each in rows)
+        if not lean_finds_more(evidence, before):
+            break
+        plan = replace(plan, lean=lean)
+        # Discs that are found without the lean show less of it.
+        lean = searched_lean(lean_of_outlines(rows))
+    return plan
 
 
 class RunFiles:

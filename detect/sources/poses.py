@@ -251,7 +251,9 @@ class FramesAlongPoses(Frames):
     def __init__(self, source: Source, stream: PoseStream) -> None:
         self._source, self._stream = source, stream
         self.ships_images, self.expected = source.ships_images, source.expected
-        self.why_left_out = f"images without a pose of {stream.name}, or out of order: left out"
+        self.why_left_out = (
+            f"images without a time or a pose of {stream.name}, or not in order: left out"
+        )
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0

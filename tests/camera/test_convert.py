@@ -211,6 +211,14 @@ def test_without_radial_terms_the_tangential_ones_go_and_come_exactly() -> None:
     assert convert_to_foreign(there.camera, "fisheye").deviation_px > 0.1
 
 
+@pytest.mark.parametrize("focal_px", [420.0, 370.0, 330.0])
+def test_a_wide_fisheye_lens_is_followed(focal_px: float) -> None:
+    """Corners are 55 to 69 degrees off the axis: least squares from a pinhole ends pixels away."""
+    distortion = (-0.02, 0.004, -0.001, 0.0)
+    lens = ForeignCamera("fisheye", 640, 480, focal_px, focal_px, 320.0, 240.0, distortion)
+    assert convert_to_camera(lens).deviation_px < 0.02
+
+
 def test_a_lens_that_changes_from_barrel_to_pincushion_is_followed() -> None:
     """From a lens without distortion least squares ends a pixel away."""
     wavy = ForeignCamera(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from detect.cli import main
 from detect.levelling import as_calibrated, level_discs
 from detect.projection import leaning_camera
 from detect.runs.frame import lean_of_frame
+from detect.settings import LEAST_FRAMES
 from detect.settings_files import read_settings
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames, squared_mahalanobis
 from tests.detect.commands import Captured
@@ -103,6 +105,27 @@ def test_frames_that_are_levelled_by_themselves_say_so(
     said = capsys.readouterr().out
     assert "not levelled" not in said
     assert "assumed level within 1." in said
+
+
+def test_discs_are_searched_with_all_of_a_lean_that_only_they_show(
+    published_camera: Camera, tmp_path: Path, capsys: Captured
+) -> None:
+    """Outlines that are found without the lean show less of it."""
+    rng = np.random.default_rng(3)
+    (tmp_path / "run" / "images").mkdir(parents=True)
+    lean_deg = np.array([2.2, -0.8])
+    grid = np.stack(np.meshgrid([-0.9, 0.0, 0.9], [-2.5, -4.2, -5.2]), axis=-1).reshape(-1, 2)
+    for k in range(LEAST_FRAMES):
+        pitch, roll = np.radians(lean_deg + 0.2 * rng.normal(size=2)).tolist()
+        floor = PaintedFloor(leaning_camera(published_camera, (pitch, roll)))
+        for xy in grid + rng.uniform(-0.2, 0.2, grid.shape):
+            floor.disc(xy, LIGHT)
+        cv2.imwrite(str(tmp_path / "run" / "images" / f"{k:02d}.png"), floor.image(seed=k))
+    write_camera(published_camera, tmp_path / "run" / "run.cam")
+    assert main(["circles", str(tmp_path / "run")]) == 0
+    searched = re.search(r"pitch (-?[0-9.]+), roll (-?[0-9.]+)", capsys.readouterr().out)
+    assert searched is not None
+    np.testing.assert_allclose([float(x) for x in searched.groups()], lean_deg, atol=0.3)
 
 
 def test_on_a_bare_floor_discs_level_the_run(

@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from camera import Camera
+from detect.circles import detect_circles
+from detect.settings import CircleSettings
 from lut import VoteShape, build_vote_table, cached_vote_table
+from tests.detect.painted_floor import PaintedFloor
 
 SHAPE = VoteShape()
 
@@ -36,3 +39,17 @@ def test_a_table_is_read_back_as_it_was_kept(published_camera: Camera, tmp_path:
     for name, ours, theirs in zip(built._fields, read, built, strict=True):
         np.testing.assert_array_equal(ours, theirs, err_msg=name)
         assert isinstance(ours, type(theirs)), name
+
+
+def test_a_camera_that_looks_straight_down_finds_discs() -> None:
+    """On the mean, its pixels are right below it."""
+    pose = (-1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.2)
+    camera = Camera(320, 240, 250.0, 250.0, 160.0, 120.0, (0.0,) * 5, pose)
+    places = np.array([(0.2, -0.1), (-0.3, 0.15), (0.35, 0.3)])
+    floor = PaintedFloor(camera)
+    for place in places:
+        floor.disc(place)
+    found = detect_circles(floor.image(), camera, build_vote_table(camera, SHAPE), CircleSettings())
+    apart = np.hypot(*np.moveaxis(found.floor_xy[:, None] - places, -1, 0))
+    assert len(found) == len(places)
+    assert apart.min(axis=0).max() < 2e-3
