@@ -83,7 +83,7 @@ class CircleSettings(Bounded, error=DetectError):
     #: highest quality, as published.
     refine: bool = True
     #: Least evidence of a disc found by its rim, log-odds (`detect.discs.judgement`).
-    evidence: Annotated[float, FINITE] = 0.0
+    evidence: Annotated[float, FINITE] = 0.2
     #: Systematic error of a refined position, pixels: added to its covariance.
     systematic_px: NotNegative = 0.002
     #: Error of a calibration without a covariance, pixels: commands add it to the covariance of

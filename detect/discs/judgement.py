@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from camera.kernels import distance_of_floor_point, project_floor_point
 from detect.discs.hough import HoughCandidates
-from detect.discs.model import F32
 from detect.discs.rim import (
-    AROUND_AT,
     COS,
     DIRECTIONS,
     FARTHEST,
@@ -30,9 +28,7 @@ from detect.discs.rim import (
     Rim,
     follow_rim,
     median,
-    nearest_grey,
     profiles,
-    surroundings,
 )
 from detect.discs.rim_network import (
     HOPELESS,
@@ -52,9 +48,8 @@ GLANCED = DIRECTIONS // 2
 GLANCED_AT = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
-#: Distances of what the network sees about a rim, nominal radii: means of pairs of steps, and the
-#: surroundings.
-LOOKED_AT = np.append(np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1), AROUND_AT)
+#: Distances of what the network sees about a rim, nominal radii: means of pairs of steps.
+LOOKED_AT = np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1)
 _AT_ONCE = 16  #: Candidates at which a network glances at a time.
 _LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
@@ -138,9 +133,8 @@ def judge(
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
-    at_a_glance, look = networks
     contrast, glanced = _glance_odds(
-        image, candidates, nominal, least_step, camera_numbers, at_a_glance
+        image, candidates, nominal, least_step, camera_numbers, networks.glance
     )
     for i in range(n):
         if contrast[i] == 0.0:
@@ -159,15 +153,13 @@ def judge(
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, rim_features = _rim_odds(image, camera_numbers, radial, rim, score, sign, look)
+        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.look)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, radial, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, features_again = _rim_odds(
-                    image, camera_numbers, radial_again, again, score, sign, look
-                )
+                more, features_again = _rim_odds(radial_again, again, score, sign, networks.look)
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
@@ -222,7 +214,7 @@ def _glance_odds(
         end = min(first + _AT_ONCE, n)
         sign, score = candidates.sign[first:end], candidates.score[first:end]
         grey, scale = glance(image, camera_numbers, candidates.floor_xy[first:end], nominal)
-        inputs, scales = network_inputs(grey, scale, sign, len(GLANCED_AT))
+        inputs, scales = network_inputs(grey, scale, sign)
         log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)
         for k in range(end - first):
             contrast[first + k] = _contrast(grey[k], sign[k], least_step)
@@ -243,6 +235,7 @@ def glance(
     count = len(floor_xy)
     grey = np.empty((count, GLANCED, len(GLANCED_AT)), np.float32)
     scale = np.empty((count, GLANCED))
+    height, width = image.shape
     step = GLANCED_AT[1] - GLANCED_AT[0]
     for i in range(count):
         x, y = floor_xy[i]
@@ -260,22 +253,21 @@ def glance(
                 if not flat:
                     off = radius * GLANCED_AT[m]
                     u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
-                grey[i, k, m] = nearest_grey(image, u, v)
+                u, v = u + 0.5, v + 0.5
+                inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
+                grey[i, k, m] = image[np.uint64(v), np.uint64(u)] if inside else math.nan
     return grey, scale
 
 
 @kernel()
-def look_at(image: GreyImage, camera_numbers: FloatArray, radial: Profiles) -> Float32Array:
-    """(DIRECTIONS, len(LOOKED_AT)) grey values about a point, as the network sees them."""
+def pairs_of_steps(grey: Float32Array) -> Float32Array:
+    """Profiles as the network sees them: means of pairs of steps."""
     # Loops, here and below: expressions of arrays take several times as long to compile.
-    seen = np.empty((DIRECTIONS, len(LOOKED_AT)), np.float32)
-    around = surroundings(image, camera_numbers, radial.x, radial.y, radial.radius)
-    for k in range(DIRECTIONS):
-        for m in range(STEPS // 2):
-            seen[k, m] = F32(0.5) * (radial.grey[k, 2 * m] + radial.grey[k, 2 * m + 1])
-        for m in range(len(AROUND_AT)):
-            seen[k, STEPS // 2 + m] = around[k, m]
-    return seen
+    pairs = np.empty((len(grey), grey.shape[1] // 2), np.float32)
+    for k in range(len(grey)):
+        for m in range(grey.shape[1] // 2):
+            pairs[k, m] = np.float32(0.5) * (grey[k, 2 * m] + grey[k, 2 * m + 1])
+    return pairs
 
 
 @kernel()
@@ -315,9 +307,8 @@ def _quality(grey: Float32Array) -> tuple[float, float]:
 
 @kernel()
 def _rim_odds(
-    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, rim: Rim, score: float,
-    sign: float, network: RimNetwork,
-) -> tuple[float, FloatArray]:  # fmt: skip
+    radial: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
+) -> tuple[float, FloatArray]:
     """Log-odds that a rim, seen from its centre, is a disc's; and its features.
 
     Each feature is bounded, so that no single one decides.
@@ -331,7 +322,7 @@ def _rim_odds(
     features[4] = 10.0 * off * off
     features[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
     features[6] = min(score, 12.0)
-    grey = look_at(image, camera_numbers, radial).reshape(1, DIRECTIONS, -1)
-    scale = radial.pixels_per_radius.reshape(1, -1)
-    inputs, scales = network_inputs(grey, scale, np.full(1, sign), STEPS // 2)
+    grey, scale = pairs_of_steps(radial.grey), radial.pixels_per_radius
+    signs = np.full(1, sign)
+    inputs, scales = network_inputs(grey.reshape(1, DIRECTIONS, -1), scale.reshape(1, -1), signs)
     return network_log_odds(inputs, scales, features.reshape(1, -1), network)[0], features

@@ -30,8 +30,6 @@ DIRECTIONS = 32  #: Directions from the centre of a candidate.
 STEPS = 32  #: Steps along each of the `DIRECTIONS` in which the rim is searched.
 #: Where the search along a direction begins and ends, in nominal radii.
 NEAREST, FARTHEST = 0.35, 1.65
-#: Distances of the surroundings, nominal radii.
-AROUND_AT = np.array([2.0, 2.5, 3.2, 4.0])
 LEAST_STEP = 0.35  #: Least step of the grey value, as a share of the disc's contrast.
 #: Tolerance of a point on the circle: a share of the radius plus a number of pixels.
 TOLERANCE_RADII, TOLERANCE_PX = 0.04, 0.4
@@ -145,28 +143,6 @@ def profiles(
                 lower += across[m] * (F32(pixels[at + below + one]) - lower)
                 grey[k, m] = upper + down[m] * (lower - upper)
     return Profiles(x, y, radius, grey, scale)
-
-
-@kernel()
-def surroundings(
-    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
-) -> Float32Array:
-    """(DIRECTIONS, len(AROUND_AT)) nearest-pixel grey values of the surroundings, as `profiles`."""
-    grey = np.empty((DIRECTIONS, len(AROUND_AT)), np.float32)
-    for k in range(DIRECTIONS):
-        for m in range(len(AROUND_AT)):
-            away = radius * AROUND_AT[m]
-            u, v = project_floor_point(camera_numbers, x + away * COS[k], y + away * SIN[k])
-            grey[k, m] = nearest_grey(image, u, v)
-    return grey
-
-
-@kernel(inline="always")
-def nearest_grey(image: GreyImage, u: float, v: float) -> float:
-    """Grey value of the pixel at (u, v); NaN outside the image."""
-    u, v = u + 0.5, v + 0.5
-    inside = 0.0 <= u < image.shape[1] and 0.0 <= v < image.shape[0]  # not if NaN
-    return float(image[np.uint64(v), np.uint64(u)]) if inside else math.nan
 
 
 @kernel()

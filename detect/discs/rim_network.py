@@ -34,7 +34,6 @@ WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 OTHERS, SCALES = 2, 2
 #: Added to the variance of the grey values, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-LARGEST_DEVIATION = 6.0  #: Of a grey value from the mean, root mean squares.
 #: Mean log-odds below and above which further networks are skipped.
 HOPELESS, CERTAIN = -3.0, 3.0
 
@@ -76,15 +75,14 @@ def trained_networks() -> Networks:
 
 @kernel()
 def network_inputs(
-    grey: Float32Array, pixels_per_radius: FloatArray, sign: FloatArray, near: int
+    grey: Float32Array, pixels_per_radius: FloatArray, sign: FloatArray
 ) -> tuple[_Weights, _Weights]:
     """The input of a network for N looks: (N, K, M) grey values in K directions at M distances.
 
     Grey values are NaN outside the image. `sign` (N,) is -1 for dark discs, which are seen as light
-    ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean of the values at the first
-    `near` distances relative to their root mean square, at most `LARGEST_DEVIATION` and 0 outside
-    the image; the logarithm of the pixels per radius; the share outside. Those of each look are
-    padded by the last direction in front and the first at the end. The
+    ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean relative to their root
+    mean square, 0 outside the image; the logarithm of the pixels per radius; the share outside.
+    Those of each look are padded by the last direction in front and the first at the end. The
     scales (N, SCALES) are logarithms of the pixels per radius and of the root mean square, relative
     to usual ones.
     """
@@ -97,7 +95,7 @@ def network_inputs(
         n = 0
         for k in range(directions):
             sum_k = squares_k = 0.0  # sums by direction do not wait for each other
-            for m in range(near):
+            for m in range(distances):
                 value = np.float64(grey[look, k, m])
                 if value == value:
                     sum_k += value
@@ -113,9 +111,7 @@ def network_inputs(
             for m in range(distances):
                 value = np.float64(grey[look, k, m])
                 if value == value:
-                    inputs[m, first + k] = min(
-                        max(scale * (value - mean), -LARGEST_DEVIATION), LARGEST_DEVIATION
-                    )
+                    inputs[m, first + k] = scale * (value - mean)
                 else:
                     outside += 1
             log_size = math.log(np.float32(pixels_per_radius[look, k])) - 1.5

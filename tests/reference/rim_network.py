@@ -5,22 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.rim_network import CERTAIN, HOPELESS, LARGEST_DEVIATION, RimNetwork
+from detect.discs.rim_network import CERTAIN, HOPELESS, RimNetwork
 
 FloatArray = NDArray[np.floating]
 
 
 def inputs_of(
-    grey: FloatArray, pixels_per_radius: FloatArray, sign: float, near: int
+    grey: FloatArray, pixels_per_radius: FloatArray, sign: float
 ) -> tuple[FloatArray, FloatArray]:
     """See `detect.discs.rim_network.network_inputs`; the inputs as (K, I)."""
     values = sign * grey
     outside = np.isnan(values)
-    off = values - np.nanmean(values[:, :near])
-    deviation = np.sqrt(np.nanmean(off[:, :near] ** 2) + 9.0)
+    off = values - np.nanmean(values)
+    deviation = np.sqrt(np.nanmean(off**2) + 9.0)
     size = np.log(pixels_per_radius) - 1.5
-    relative = np.clip(np.nan_to_num(off / deviation), -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    inputs = np.column_stack([relative, size, outside.mean(axis=1)])
+    inputs = np.column_stack([np.nan_to_num(off / deviation), size, outside.mean(axis=1)])
     return inputs, np.array([size.mean(), np.log(deviation) - 2.5])
 
 

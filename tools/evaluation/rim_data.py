@@ -25,7 +25,7 @@ from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
 from detect.circles import candidates_of, judged, scene_of, vote_shape
-from detect.discs.judgement import FEATURES, GLANCED_AT, LOOKED_AT, Fate, glance, look_at
+from detect.discs.judgement import FEATURES, GLANCED_AT, LOOKED_AT, Fate, glance, pairs_of_steps
 from detect.discs.rim import DIRECTIONS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.settings import CircleSettings
@@ -39,10 +39,10 @@ _SETTINGS = CircleSettings()
 #: Of a disc, metres.
 _RADIUS = 0.1
 #: How much a disc and what is none count: of a rendered building, a disturbed disc, a real image, a
-#: rendered floor, a board, a photograph; and how much less what is of the other polarity than the
-#: discs there.
+#: rendered floor, a board, a photograph; and how much less what is darker than the floor: nearly
+#: all discs there are lighter, but dark ones are to be found elsewhere.
 _BUILDING, _DISTURBED, _REAL = (4.0, 4.0), (0.2, 0.2), (2.0, 0.9)
-_SCENE, _BOARD, _PHOTOGRAPH, _OTHER_SIGN = (0.15, 0.25), (0.04, 0.2), (0.3, 0.5), 0.3
+_SCENE, _BOARD, _PHOTOGRAPH, _DARK_OTHERS = (0.15, 0.25), (0.04, 0.2), (0.3, 0.5), 0.1
 #: Frames of the recorded run that one process looks at.
 _AT_ONCE = 50
 #: How often discs of a frame are disturbed, and how many each time.
@@ -118,25 +118,23 @@ class _Gathering:
 
     def add(
         self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float],
-        source: str, other_sign: float = 1.0, kept: float = 1.0,
+        source: str, dark_others: float = 1.0, kept: float = 1.0,
     ) -> None:  # fmt: skip
         """Look at an image; a share of what is no disc is kept, and all of `truth.others`."""
         kept = kept if truth.others is None else 1.0
         table = cached_vote_table(camera, vote_shape(_SETTINGS))
         scene = scene_of(image, camera, table, _SETTINGS)
-        signs = len(truth.light) > 0, len(truth.dark) > 0
 
         def known(places: FloatArray, sign: FloatArray) -> Iterator[tuple[int, bool, float, str]]:
             for k, uv in enumerate(camera.project_floor(places)):
                 discs = truth.light if sign[k] > 0.0 else truth.dark
-                other = any(signs) and not signs[0 if sign[k] > 0.0 else 1]
                 is_disc = _nearest(uv, discs) < 0.6
                 elsewhere = min(_nearest(uv, discs), _nearest(uv, truth.unsure)) > 1.5
                 if truth.others is not None:
                     elsewhere = _nearest(uv, truth.others) < 0.6
                 if is_disc or (elsewhere and self._rng.random() < kept):
-                    counted = weight[0] if is_disc else weight[1] / kept
-                    yield k, is_disc, counted * (other_sign if other else 1.0), source
+                    less = dark_others if sign[k] < 0.0 else 1.0
+                    yield k, is_disc, weight[0] if is_disc else less * weight[1] / kept, source
 
         candidates = candidates_of(scene, table, _SETTINGS)
         grey, scale = glance(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
@@ -162,7 +160,7 @@ class _Gathering:
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
             radial = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
-            grey[k] = _as_light(look_at(image, numbers, radial), sign)
+            grey[k] = _as_light(pairs_of_steps(radial.grey), sign)
             scale[k] = radial.pixels_per_radius
         return grey, scale
 
@@ -202,21 +200,21 @@ def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatA
 
 
 def gather(
-    data: Path, every: int, scenes: int, seed: int, without: str = ""
+    data: Path, frames: slice, scenes: int, seed: int, without: str = ""
 ) -> tuple[Looks, Looks]:
-    """Glances and looks at the sources of a folder of data; of the real frames, every n-th.
+    """Glances and looks at the sources of a folder of data, and at some frames of the recorded run.
 
     A rendered building may be left out.
     """
     camera = read_camera(data / "dlr" / "e" / "e.cam")
     kinds = [*DISTURBANCES, *DISTURBANCES, *[BORDER] * 4, *BLURRED, *LOOK_ALIKES]
     photographs = sorted((data / "york").glob("dev/*/images/*"))
-    frames = [
+    recorded = [
         (data / "dlr" / "e" / "images" / f"{name}.jpg", mapped, shipped)
         for name, mapped, shipped in _mapped(data / "dlr", camera)
     ]
     buildings = [of for of in sorted((data / "rendered").glob("r*")) if of.name != without]
-    frames = [frame for frame in frames[::every] if frame[0].is_file()]
+    recorded = [frame for frame in recorded[frames] if frame[0].is_file()]
     parts: list[tuple[Any, ...]] = [
         *(
             (_scenes, camera, kinds, photographs, _SCENES_PER_STAGE)
@@ -228,7 +226,7 @@ def gather(
         ),
         *((_photograph, folder) for folder in sorted((data / "york").glob("dev/*/"))),
         *((_building, folder) for folder in buildings),
-        *((_real, camera, frames[k : k + _AT_ONCE]) for k in range(0, len(frames), _AT_ONCE)),
+        *((_real, camera, recorded[k : k + _AT_ONCE]) for k in range(0, len(recorded), _AT_ONCE)),
     ]
     with ProcessPoolExecutor() as pool:
         done = [pool.submit(_gather, [seed, n], *part) for n, part in enumerate(parts)]
@@ -265,7 +263,7 @@ def _scenes(
             clear = heights >= 2.0 * _LEAST_HALF_PX
             clear &= np.array([_contrast(image, stage.camera, at) for at in places]) > 6.0
             truth = Truth(at[clear], unsure=at[~clear])
-        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _OTHER_SIGN, _KEPT)
+        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _DARK_OTHERS, _KEPT)
 
 
 def _photographed(
@@ -308,7 +306,7 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
         seen = camera.floor_from_pixel(np.array([[c["u"], c["v"]] for c in frame["circles"]]))
         sure = np.array([c["mandatory"] for c in frame["circles"]], np.bool_)
         truth = Truth(_images(camera, seen[sure]), unsure=_images(camera, seen[~sure]))
-        gathering.add(image, camera, truth, _BUILDING, folder.name, _OTHER_SIGN)
+        gathering.add(image, camera, truth, _BUILDING, folder.name, _DARK_OTHERS)
         _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
         _add_painted(gathering, image, camera, seen, rng, f"{folder.name} painted")
 
@@ -317,7 +315,7 @@ def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder:
     """Look at a photograph of a building, as it is and with discs on its floor."""
     camera = read_camera(folder / f"{folder.name}.cam")
     photograph = _read(folder / "images" / f"{folder.name}.jpg")
-    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs")
+    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs", _DARK_OTHERS)
     for _ in range(_PHOTOGRAPH_ROUNDS):
         grey = 255.0 * (photograph / 255.0) ** rng.uniform(0.7, 1.5)
         blurred = cv2.GaussianBlur(grey, (0, 0), rng.uniform(0.3, 1.2))
@@ -343,7 +341,7 @@ def _add_painted(
             break
     at = np.array(places).reshape(-1, 2)
     truth = Truth(_images(camera, at), unsure=_images(camera, known))
-    gathering.add(image, camera, truth, _PHOTOGRAPH, source, _OTHER_SIGN)
+    gathering.add(image, camera, truth, _PHOTOGRAPH, source, _DARK_OTHERS)
     _add_disturbed(gathering, image, camera, at, rng, f"{source} disturbed")
 
 
@@ -358,7 +356,8 @@ def _real(
         shipped = rows_xy[np.array(is_mapped, np.bool_)]
         light = np.array([_contrast(image, camera, xy) for xy in shipped]) > 0.0
         of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
-        gathering.add(image, camera, Truth(of_light, of_dark, mapped), _REAL, "real")
+        truth = Truth(of_light, of_dark, mapped)
+        gathering.add(image, camera, truth, _REAL, "real", _DARK_OTHERS)
         if number % 6 == 0:
             _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
 

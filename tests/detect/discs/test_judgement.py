@@ -65,7 +65,7 @@ def test_a_disc_with_a_leg_on_its_middle_is_a_row(
         def leg(
             x: NDArray[np.float64], y: NDArray[np.float64], lean: float = lean
         ) -> NDArray[np.bool_]:
-            return np.asarray((abs(x + lean * y) < 0.066) & (y < 0.085))
+            return np.asarray((abs(x + lean * y) < 0.055) & (y < 0.085))
 
         def on_disc(
             x: NDArray[np.float64], y: NDArray[np.float64], leg: Shape = leg

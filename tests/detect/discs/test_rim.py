@@ -8,17 +8,7 @@ from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import (
-    AROUND_AT,
-    DIRECTIONS,
-    RADIUS_SIGMA,
-    Circle,
-    Rim,
-    fit_circle,
-    follow_rim,
-    profiles,
-    surroundings,
-)
+from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim, profiles
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 PLACES = np.array([(0.0, -1.2), (0.5, -1.5), (-0.6, -1.9), (0.4, -2.3)])
@@ -106,19 +96,3 @@ def test_covariances_of_the_rim_cover_its_errors(published_camera: Camera) -> No
         squares.append(error @ np.linalg.solve(covariance, error) / 2.0)
     # They place discs only where sectors of the edge disagree: there they are worse than here.
     assert 0.1 < np.median(squares) / np.log(2.0) < 1.6
-
-
-@pytest.mark.parametrize("place", [PLACES[0], np.array([1.3, -3.0]), np.array([0.0, 3.0])])
-def test_surroundings_are_the_pixels_on_circles_of_the_floor(
-    published_camera: Camera, place: NDArray[np.float64]
-) -> None:
-    camera = published_camera
-    image = np.random.default_rng(4).integers(0, 256, (camera.height, camera.width), np.uint8)
-    seen = surroundings(image, camera_numbers(camera), place[0], place[1], RADIUS)
-    angle = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    circle = RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    pixels = camera.project_floor(place + circle[:, None] * AROUND_AT[:, None])
-    u, v = np.moveaxis(np.floor(np.nan_to_num(pixels, nan=-9.0) + 0.5).astype(int), -1, 0)
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    assert (np.isnan(seen) == ~inside).all()
-    assert (seen[inside] == image[v[inside], u[inside]]).all()

@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from detect.discs.judgement import FEATURES, LOOKED_AT
+from detect.discs.judgement import FEATURES
 from detect.discs.rim import DIRECTIONS, STEPS
 from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds, trained_networks
 from tests.reference import rim_network as reference
 
 FloatArray = NDArray[np.float64]
 Profiles = tuple[FloatArray, FloatArray, FloatArray]
-NEAR = STEPS // 2  # Distances up to just beyond the rim.
 
 
 def some_profiles(seed: int) -> Profiles:
     """Grey values, pixels per radius and features; of every other seed with a part unseen."""
     rng = np.random.default_rng(seed)
-    grey = rng.uniform(0.0, 255.0, (DIRECTIONS, len(LOOKED_AT)))
-    # Bright surroundings, as beyond a window.
-    grey[:, NEAR:] += 900.0 * rng.uniform(size=(DIRECTIONS, len(LOOKED_AT) - NEAR)) ** 8
+    grey = rng.uniform(0.0, 255.0, (DIRECTIONS, STEPS // 2))
     if seed % 2:
         grey[5:9, STEPS // 4 :] = np.nan
     return grey, rng.uniform(3.0, 30.0, DIRECTIONS), rng.uniform(0.0, 1.0, len(FEATURES))
@@ -29,7 +26,7 @@ def some_profiles(seed: int) -> Profiles:
 
 def odds_of(profiles: list[Profiles], signs: list[float], network: RimNetwork) -> FloatArray:
     grey, scale, features = (np.array(each) for each in zip(*profiles, strict=True))
-    inputs = network_inputs(grey.astype(np.float32), scale, np.array(signs), NEAR)
+    inputs = network_inputs(grey.astype(np.float32), scale, np.array(signs))
     return network_log_odds(*inputs, features, network)
 
 
@@ -37,9 +34,8 @@ def odds_of(profiles: list[Profiles], signs: list[float], network: RimNetwork) -
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_compiled_network_is_its_equation(seed: int, sign: float) -> None:
     grey, scale, features = some_profiles(seed)
-    looks = grey[None].astype(np.float32), scale[None], np.array([sign])
-    inputs, scales = network_inputs(*looks, NEAR)
-    expected, expected_scales = reference.inputs_of(grey, scale, sign, NEAR)
+    inputs, scales = network_inputs(grey[None].astype(np.float32), scale[None], np.array([sign]))
+    expected, expected_scales = reference.inputs_of(grey, scale, sign)
     np.testing.assert_allclose(inputs[:, 1:-1].T, expected, atol=2e-6)
     np.testing.assert_allclose(scales[0], expected_scales, atol=2e-6)
     [found] = network_log_odds(inputs, scales, features[None], trained_networks().look)
@@ -64,10 +60,11 @@ def test_turned_directions_and_a_dark_disc_are_the_same() -> None:
 
 
 def test_a_clear_disc_is_likelier_than_a_flat_floor() -> None:
+    at = np.linspace(0.37, 1.63, STEPS // 2)
     rng = np.random.default_rng(1)
-    noise = rng.normal(0.0, 2.0, (DIRECTIONS, len(LOOKED_AT)))
+    noise = rng.normal(0.0, 2.0, (DIRECTIONS, STEPS // 2))
     scale = np.full(DIRECTIONS, 8.0)
-    disc = 90.0 + 60.0 / (1.0 + np.exp((LOOKED_AT - 1.0) / 0.08)) + noise
+    disc = 90.0 + 60.0 / (1.0 + np.exp((at - 1.0) / 0.08)) + noise
     whole = np.array([1.0, 0.0, 0.3, 0.02, 0.004, 0.3, 0.15])
     none = np.array([0.4, 4.0, 0.8, 0.2, 0.4, 0.3, 0.13])
     looks = [(disc, scale, whole), (90.0 + noise, scale, none)]

@@ -56,17 +56,9 @@ def test_training_learns_and_the_detector_computes_the_same() -> None:
     odds = training.log_odds(network, unseen, every[:40])
     assert ((odds > 0.0) == unseen.is_disc).all()
     grey, scale = unseen.grey[:, 0], unseen.pixels_per_radius[:, 0].astype(float)
-    inputs = network_inputs(grey, scale, np.ones(40), STEPS // 2)
+    inputs = network_inputs(grey, scale, np.ones(40))
     found = network_log_odds(*inputs, unseen.features, network)
     assert found == pytest.approx(odds, abs=1e-3)
-
-
-def test_every_second_network_ignores_the_surroundings() -> None:
-    looks = looks_of(60, 10)
-    network = training.train(looks, np.ones(60, np.bool_), training.Shape(3, 2, 2, 1), 1)
-    away = network.around[:, :, STEPS // 2 : len(LOOKED_AT)]
-    assert (away[0] == 0.0).all()
-    assert (away[1] != 0.0).all()
 
 
 def test_a_glance_loses_few_discs() -> None:
