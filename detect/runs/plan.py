@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
 
 #: Factor by which a search with a lean must find more evidence: a building itself may lean.
-_MORE_EVIDENCE = 1.03
+_MORE_EVIDENCE = 1.06
 
 #: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
 Lean = tuple[float, float]
