@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
 
 
 def rotation_of(vectors: FloatArray) -> FloatArray:
     """(..., 3, 3) rotations of (..., 3) rotation vectors."""
-    matrices = Rotation.from_rotvec(np.reshape(vectors, (-1, 3))).as_matrix()
-    return np.asarray(matrices).reshape(*np.shape(vectors), 3)
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = cross_matrices(vectors)
+    # Rodrigues' formula; `np.sinc` is the normalised one, with a factor pi.
+    of_square = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * cross + of_square * (cross @ cross))
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:
