@@ -17,7 +17,7 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
-from detect.discs.candidates import local_maxima, suppress_close, suppress_published
+from detect.discs.candidates import best_apart, local_maxima, suppress_published
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
@@ -182,11 +182,7 @@ def judged_discs(
     """The candidates that are discs, and their log-odds."""
     judgement = judged(scene, settings, candidates_of(scene, table, settings))
     log_odds = adjusted_log_odds(judgement, settings)
-    taken = np.flatnonzero(log_odds >= settings.evidence)
-    best_first = np.argsort(-log_odds[taken], kind="stable")
-    # Without those too close to a better one.
-    kept = suppress_close(judgement.floor_xy[taken], best_first, settings.separation_m)
-    best = taken[np.sort(kept)]
+    best = best_apart(judgement.floor_xy, log_odds, settings.evidence, settings.separation_m)
     return judgement.where(best), log_odds[best]
 
 

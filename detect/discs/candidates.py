@@ -56,6 +56,16 @@ def suppress_close(floor_xy: FloatArray, order: IntArray, separation: float) -> 
 
 
 @kernel()
+def best_apart(
+    floor_xy: FloatArray, score: FloatArray, least: float, separation: float
+) -> IntArray:
+    """Indices of positions with at least some score, without those too close to a better one."""
+    kept = np.argsort(-score, kind="mergesort")
+    kept = kept[: np.sum(score >= least)]
+    return np.sort(suppress_close(floor_xy, kept, separation))
+
+
+@kernel()
 def suppress_published(
     pixels: IntArray, quality: FloatArray, floor_xy: Float32Array,
     separation: float,
