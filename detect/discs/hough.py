@@ -186,7 +186,7 @@ def _vote(
             votes[np.uint64(row_of_step[step] * columns + column)] += share[i]
 
 
-@kernel(fastmath={"reassoc", "nsz"})
+@kernel(fastmath={"reassoc", "nsz"}, forceinline=True)
 def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Positions (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
@@ -210,11 +210,8 @@ def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArra
     n = 0
     for i in range(1, rows - 1):
         left, right = first[i] - 1, last[i] + 1
-        before, same, after = (
-            score[i - 1, left:right],
-            score[i, left:right],
-            score[i + 1, left:right],
-        )
+        before, same = score[i - 1, left:right], score[i, left:right]
+        after = score[i + 1, left:right]
         for k in range(1, len(same) - 1):
             value = same[k]
             if value < _LEAST_SCORE or n == _MOST_PEAKS:
