@@ -31,7 +31,7 @@ from redetect.compiled import kernel
 
 #: Added to the mean votes at a distance, so that a few votes among empty cells score low.
 _BACKGROUND = 0.3
-_LEAST_SCORE = np.float32(1.7)  #: Of a candidate.
+_LEAST_SCORE = np.float32(1.9)  #: Of a candidate.
 _CLEAR_SCORE = 3.0  #: Of a clear one.
 _MOST_DOUBTFUL = 150  #: Doubtful candidates of an image.
 _MOST_COMPARED = 600  #: Candidates that are compared with their neighbours, unless all are clear.
