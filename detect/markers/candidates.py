@@ -34,6 +34,9 @@ _LEAST_LEVEL_PX = 16
 _SMOOTH_BELOW = 0.2
 #: With more noise than this (grey levels) it is smoothed more.
 _MUCH_NOISE = 2.5
+#: A seam of white around a marker on a dark ground is bright only beside what is next to it: in the
+#: finest layer, pixels darker than the mean of these squares, by this share, are dark, too.
+_LOCAL_PX, _LOCAL_THRESHOLD = (5, 13), 0.12
 
 #: Reasons for rejection, as reported.
 AT_THE_BORDER = "at the image's border"
@@ -91,7 +94,7 @@ def candidate_regions(
     rejected: Counter[str] = Counter()
     for layer in layers:
         widest = math.inf if layer is layers[-1] else _WIDEST_RADII * layer.radius
-        for dark in _masks(layer, noise, settings):
+        for dark in _masks(layer, noise, settings, layer is layers[0]):
             for found in _marker_regions(dark, layer.scale, widest, white, settings):
                 if isinstance(found, str):
                     rejected[found] += 1
@@ -126,7 +129,9 @@ def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
     return layers
 
 
-def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[GreyImage]:
+def _masks(
+    layer: Layer, noise: float, settings: MarkerSettings, finest: bool
+) -> Iterator[GreyImage]:
     """Masks of dark pixels for each threshold; for low ones, the full image is smoothed first."""
     gate = settings.dark_noise * noise / layer.scale
     plain = smooth = layer.grey, layer.closed
@@ -138,6 +143,10 @@ def _masks(layer: Layer, noise: float, settings: MarkerSettings) -> Iterator[Gre
         soft = threshold < _SMOOTH_BELOW and smooth is not plain
         source, least = (smooth, 0.5 * gate) if soft else (plain, gate)
         yield dark_pixels(*source, threshold, least)
+    if finest:
+        for side in _LOCAL_PX:
+            mean = cv2.blur(layer.grey, (side, side))
+            yield dark_pixels(layer.grey, np.asarray(mean, np.uint8), _LOCAL_THRESHOLD, gate)
 
 
 def dark_pixels(grey: GreyImage, closed: GreyImage, threshold: float, gate: float) -> GreyImage:

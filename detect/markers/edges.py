@@ -66,13 +66,18 @@ def refine_quadrangle(
     of the rough ones. Three or more parts per edge give the covariance from the residuals of the
     steps. Returns the reason for rejection if there are no edges.
     """
-    found = _edges_near(picture, rough, border, capture_px, settings, parts)
-    if not isinstance(found, str):
-        reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
-        found = _edges_near(picture, found.corners, border, reach, settings, parts)
-    if isinstance(found, str) or np.abs(found.corners - rough).max() <= _LARGEST_MOVE * capture_px:
-        return found
-    return NO_EDGE
+    found: RefinedQuadrangle | str = NO_EDGE
+    for seam in (False, True):  # If there is no edge, white may be a mere seam.
+        found = _edges_near(picture, rough, border, capture_px, settings, parts, seam)
+        if not isinstance(found, str):
+            reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
+            found = _edges_near(picture, found.corners, border, reach, settings, parts, seam)
+        if isinstance(found, str):
+            continue
+        if np.abs(found.corners - rough).max() <= _LARGEST_MOVE * capture_px:
+            return found
+        found = NO_EDGE
+    return found
 
 
 def _edges_near(
@@ -82,8 +87,12 @@ def _edges_near(
     reach: float,
     settings: MarkerSettings,
     parts: int,
+    seam: bool,
 ) -> RefinedQuadrangle | str:
-    """The edges within reach of a quadrangle's, or the reason for rejection."""
+    """The edges within reach of a quadrangle's, or the reason for rejection.
+
+    If what is white outside is a mere `seam` before a darker ground, that ground counts as white.
+    """
     side = corners[_NEXT] - corners
     length = np.hypot(side[:, 0], side[:, 1])
     outwards = side[:, ::-1] * _QUARTER_TURN / length[:, None]
@@ -102,6 +111,12 @@ def _edges_near(
         return NO_EDGE
     grey = grey.reshape(parts, _ROWS, _SAMPLES, 4)
     rows = np.partition(grey, _ROWS // 2, axis=1)[:, _ROWS // 2].astype(np.float64)
+    if seam:
+        # From the darkest sample of the inner half outwards, rows never get darker.
+        inner = rows[:, : _SAMPLES // 2]
+        before = np.arange(_SAMPLES)[:, None] < np.argmin(inner, axis=1)[:, None]
+        level = inner.min(axis=1, keepdims=True)
+        rows = np.maximum.accumulate(np.where(before, level, rows), axis=1)
     place, dark, light = _steps(rows)
     if not np.all((light > dark) & np.isfinite(place)):
         return NO_EDGE

@@ -1,12 +1,12 @@
 """Odometry from a localisation: a rigid motion plus stationary errors, without drift.
 
 A localisation in a map, or a path with closed loops, does not drift as wheels do. Its poses are
-those of the ground truth after a rigid motion, plus stationary errors: an Ornstein-Uhlenbeck
-process for x, y and the heading, each with a deviation and a correlation time (Rasmussen and
-Williams, Gaussian Processes for Machine Learning, 2006, appendix B). The process is Markov: in a
-gap between measurements the errors depend only on those at its two ends, in closed form. Odometry
-is treated as a localisation if that model predicts the measurements better than the movements
-between its poses.
+those of the ground truth after a rigid motion, for another point on the robot, plus stationary
+errors: an Ornstein-Uhlenbeck process for x, y and the heading, each with a deviation and a
+correlation time (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, appendix
+B). The process is Markov: in a gap between measurements the errors depend only on those at its two
+ends, in closed form. Odometry is treated as a localisation if that model predicts the measurements
+better than the movements between its poses.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from redetect.groundtruth.trajectories.streams import (
     pose_differences,
 )
 from redetect.landmarks import wrap_angle
+from redetect.plane import rotation
 
 # Both models of odometry are compared on thinned measurements, if there are enough, and only if a
 # longer gap has to be bridged.
@@ -38,11 +39,13 @@ _FEWEST = 10
 _LEAST_EXTENT_M = 0.01
 _LEAST_GAP_S = 20.0
 _MOST_TO_LEARN_FROM = 500
-# Prior mean and deviation of the logarithm of the correlation time, which a few visits hardly
-# determine.
-_USUAL_CORRELATION_S = 10.0
+# Prior means of the correlation times of positions and of headings, which a few visits hardly
+# determine, and the deviation of their logarithms.
+_POSITION_CORRELATION_S, _HEADING_CORRELATION_S = 10.0, 2.0
 _LOG_CORRELATION_SIGMA = 0.7
-_LEVEL_SIGMA = 10.0  # Prior deviation of unknowns (m, rad)
+# Prior deviation of the motion (m, rad), and those of the point on the robot (m): the same point as
+# the ground truth's, or another.
+_LEVEL_SIGMA, _POINT_SIGMAS = 10.0, (1e-6, 0.2)
 # Differences this many times the median are gross errors, of which there is one in 10000, anywhere
 # within 10 m by 10 m.
 _USUAL = 6.0
@@ -59,6 +62,10 @@ class LocalisationErrors:
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
     heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
+    # Forward and left from the localisation's point on the robot to that of the ground truth (m). A
+    # clock with a constant error looks like a distance forward.
+    forward_m: float
+    left_m: float
 
 
 def as_localisation(
@@ -86,18 +93,33 @@ def as_localisation(
     errors = pose_differences(measured.poses[usual], there)
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
     centre = there[:, :2].mean(axis=0)
-    design = _by_motion(there[:, :2] - centre)
-    position = _stationary(times_s, errors[:, :2], np.mean(variances[:, :2], axis=1), design)
-    heading = _stationary(times_s, errors[:, 2:], variances[:, 2], np.ones((len(errors), 1, 1)))
+    design, motion_priors = _by_motion_and_point(there, centre), np.full(POSE, _LEVEL_SIGMA)
+    variance = np.mean(variances[:, :2], axis=1)
+    # Another point on the robot only if the measurements say so.
+    position = min(
+        (
+            _stationary(times_s, errors[:, :2], variance, design, priors, _POSITION_CORRELATION_S)
+            for priors in (np.append(motion_priors, [point] * 2) for point in _POINT_SIGMAS)
+        ),
+        key=lambda found: found.deviance,
+    )
+    heading = _stationary(
+        times_s,
+        errors[:, 2:],
+        variances[:, 2],
+        np.ones((len(errors), 1, 1)),
+        motion_priors[2:],
+        _HEADING_CORRELATION_S,
+    )
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
     if not deviance < thin.innovations(noise).deviance:
         return None
     aligned = moved_poses(odometry, motion)
-    by_motion = _by_motion(aligned.poses[:, :2] - centre)
-    aligned.poses[:, :2] += by_motion @ position.mean
+    design = _by_motion_and_point(aligned.poses, centre)
+    aligned.poses[:, :2] += design @ position.mean
     aligned.poses[:, 2] += heading.mean
     spread = np.zeros((len(aligned), POSE, POSE))
-    spread[:, :2, :2] = by_motion @ position.mean_covariance @ np.swapaxes(by_motion, 1, 2)
+    spread[:, :2, :2] = design @ position.mean_covariance @ np.swapaxes(design, 1, 2)
     spread[:, 2, 2] = heading.mean_covariance[0, 0]
     found = LocalisationErrors(
         position_sigma=position.sigma,
@@ -105,6 +127,8 @@ def as_localisation(
         position_correlation_s=position.correlation_s,
         heading_correlation_s=heading.correlation_s,
         heading_offset=float(heading.mean[0]),
+        forward_m=float(position.mean[POSE]),
+        left_m=float(position.mean[POSE + 1]),
     )
     aligned = PlanarPoses(aligned.times_s, aligned.poses, spread)
     return _bridged(path, aligned, problem.measured_s, found), found
@@ -125,11 +149,14 @@ def _trimmed_alignment(
     return motion, usual
 
 
-def _by_motion(from_centre: FloatArray) -> FloatArray:
-    """(M, 2, 3) derivatives of positions (M, 2) by a motion x, y, theta about their centre."""
-    derivatives = np.zeros((len(from_centre), 2, POSE))
+def _by_motion_and_point(poses: FloatArray, centre: FloatArray) -> FloatArray:
+    """(M, 2, 5) derivatives of the positions of poses (M, 3) by a motion x, y, theta about a centre
+    (2,), and by another point on the robot, forward and to the left.
+    """
+    derivatives = np.zeros((len(poses), 2, POSE + 2))
     derivatives[:, :, :2] = np.eye(2)
-    derivatives[:, 0, 2], derivatives[:, 1, 2] = -from_centre[:, 1], from_centre[:, 0]
+    derivatives[:, :, 2] = (poses[:, :2] - centre)[:, ::-1] * [-1.0, 1.0]
+    derivatives[:, :, POSE:] = rotation(poses[:, 2])
     return derivatives
 
 
@@ -144,13 +171,19 @@ class _Stationary(NamedTuple):
 
 
 def _stationary(
-    times_s: FloatArray, values: FloatArray, variances: FloatArray, design: FloatArray
+    times_s: FloatArray,
+    values: FloatArray,
+    variances: FloatArray,
+    design: FloatArray,
+    priors: FloatArray,
+    usual_correlation_s: float,
 ) -> _Stationary:
     """Maximum likelihood estimate of the process for (M, n) values, with unknown mean.
 
-    `design` (M, n, k): the values' derivatives by the unknowns of the mean. Values have the
-    variances (M,) of their times. Since an estimated mean follows the errors, in particular with
-    few visits, the restricted likelihood is used (Rasmussen and Williams, section 2.7).
+    `design` (M, n, k): the values' derivatives by the unknowns of the mean, which have the prior
+    deviations `priors` (k,). Values have the variances (M,) of their times. Since an estimated mean
+    follows the errors, in particular with few visits, the restricted likelihood is used (Rasmussen
+    and Williams, section 2.7).
     """
     stride = 1 + len(times_s) // _MOST_TO_LEARN_FROM
     apart = np.abs(times_s[::stride, None] - times_s[::stride])
@@ -163,19 +196,19 @@ def _stationary(
         white = solve_triangular(lower, columns.reshape(len(columns), -1), lower=True)
         white = white.reshape(-1, columns.shape[2])
         normal = white.T @ white
-        covariance = np.linalg.inv(normal[:-1, :-1])
+        covariance = np.linalg.inv(normal[:-1, :-1] + np.diag(priors**-2))
         mean = covariance @ normal[:-1, -1]
         squared = normal[-1, -1] - normal[:-1, -1] @ mean
         determinant = 2.0 * values.shape[1] * np.sum(np.log(np.diagonal(lower)))
-        determinant -= np.linalg.slogdet(covariance / _LEVEL_SIGMA**2)[1]
+        determinant -= np.linalg.slogdet(covariance / np.outer(priors, priors))[1]
         deviance = stride * float(squared + determinant)
         return _Stationary(sigma, correlation, mean, covariance, deviance)
 
     def with_prior(logarithms: FloatArray) -> float:
-        off = logarithms[1] - math.log(_USUAL_CORRELATION_S)
+        off = logarithms[1] - math.log(usual_correlation_s)
         return fitted(logarithms).deviance / stride + float(off / _LOG_CORRELATION_SIGMA) ** 2
 
-    start = np.log(np.array([float(np.std(values)) + 1e-6, _USUAL_CORRELATION_S]))
+    start = np.log(np.array([float(np.std(values)) + 1e-6, usual_correlation_s]))
     options = {"xatol": 0.02, "fatol": 0.02}
     return fitted(minimize(with_prior, start, method="Nelder-Mead", options=options).x)
 

@@ -37,6 +37,9 @@ _GATE_SIGMA, _LEAST_COSINE, _LEAST_READINGS = 3.0, 0.25, 10
 # covariance where few walls determine it.
 _MAP_SIGMAS_M, _LIKELY_MAP_SIGMA_M = np.geomspace(1e-4, 0.3, 80), 0.02
 _MAP_EVIDENCE, _MOST_INFLATED = 7.0, 9.0
+# Too few walls to tell whether they are off: what is assumed then (m), and the least increase of
+# the deviance that refutes it.
+_USUAL_MAP_SIGMA_M, _REFUTED = 0.01, 4.0
 # Steps at each gate, most steps afterwards, and the change (m, rad) that ends them.
 _STEPS_PER_GATE, _MOST_STEPS, _SETTLED = 3, 15, 1e-6
 _SIGMA_PER_MEDIAN = 1.4826  # Of a normal distribution
@@ -147,7 +150,9 @@ class MapFit(NamedTuple):
 
     poses: FloatArray  # (poses, 3)
     covariance: FloatArray  # (3 poses, 3 poses): jointly
-    map_sigma_m: float  # Standard deviation of the offsets of the walls' ends; 0 if exact
+    # Standard deviation of the offsets of the walls' ends: 0 if exact, a usual one if few walls are
+    # seen.
+    map_sigma_m: float
     used: IntArray  # (poses,): number of readings on walls
     rms_m: FloatArray  # (poses,): of their distances from the walls
     open_directions: IntArray  # (poses,): number of directions that walls do not determine
@@ -398,7 +403,8 @@ def _map_sigma(h: FloatArray, g: FloatArray) -> tuple[float, float]:
     deviance = np.sum(np.log1p(variances * values) - (vectors.T @ g) ** 2 * gain, axis=1)
     best = int(np.argmin(deviance))
     if deviance[best] > -_MAP_EVIDENCE:
-        return 0.0, 1.0
+        usual = deviance[np.argmin(np.abs(_MAP_SIGMAS_M - _USUAL_MAP_SIGMA_M))]
+        return (0.0 if usual > _REFUTED else _USUAL_MAP_SIGMA_M), 1.0
     # Few walls hardly determine it: then errors have Student's distribution.
     freedom = float(np.sum(gain[best] * values))
     return float(_MAP_SIGMAS_M[best]), freedom / max(freedom - 2.0, freedom / _MOST_INFLATED)

@@ -132,6 +132,26 @@ def test_small_sharpened_tags_are_found(width: float) -> None:
         assert np.abs(found.corners[0] - corners).max() < 0.15
 
 
+@pytest.mark.parametrize("width", [16.0, 22.0, 30.0, 48.0])
+def test_tags_with_a_seam_of_white_are_found_on_dark_ground(width: float) -> None:
+    # As they are cut out of a sheet: the ground is as dark as the tag, on all sides or on some.
+    size = (100, 100)
+    rng = np.random.default_rng(3)
+    for roll_deg in (3.0, 33.0, 70.0):
+        corners = view_corners(View(width, 25.0, 40.0, roll_deg), (50.3, 49.8))
+        ground = 25.0 + 20.0 * cv2.GaussianBlur(rng.normal(size=size), (0, 0), 2.0)
+        for bright in (100, 45):
+            ground[:, bright:] += 130.0
+            grey = render(
+                size, [("apriltag_36h11", 5, corners)], background=np.asarray(ground),
+                quiet_cells=0.5, blur=0.6,
+            )  # fmt: skip
+            image = exposed(grey, 1.5, rng)
+            found = detect_markers(image, MarkerSettings(dictionary="apriltag_36h11"))
+            assert found.ids.tolist() == [5]
+            assert np.abs(found.corners[0] - corners).max() < 0.2
+
+
 def test_the_tone_curve_of_a_camera_moves_no_corner() -> None:
     corners = view_corners(View(90.0, 35.0, 20.0, 33.0), (80.3, 69.8))
     markers = [("6x6_250", 7, corners)]

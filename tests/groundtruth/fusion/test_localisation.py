@@ -16,6 +16,7 @@ from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, moved_poses, write_planar_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import rotation
 from tests.groundtruth.fusion.drives import drive, measure
 
 FloatArray = NDArray[np.float64]
@@ -65,6 +66,24 @@ def test_a_localisation_bridges_gaps_without_drift() -> None:
     assert fused < 1.1 * aligned
     # A few times its correlation time long, a visit has some ten independent numbers.
     assert 0.5 < np.mean([segment.normalised_error for segment in found]) < 1.8
+
+
+def test_a_localisation_may_be_that_of_another_point_on_the_robot() -> None:
+    forward_and_left_m, squared_m2 = np.array([0.25, -0.15]), np.zeros(2)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth, odometry = localisation(rng)
+        laser = {"laser": visits(rng, truth)}
+        shift = (rotation(odometry.poses[:, 2]) @ forward_and_left_m[:, None])[..., 0]
+        poses = np.column_stack([odometry.poses[:, :2] - shift, odometry.poses[:, 2]])
+        shifted = PlanarPoses(odometry.times_s, poses)
+        errors = fuse(shifted, laser).localisation
+        assert errors is not None
+        assert [errors.forward_m, errors.left_m] == pytest.approx(forward_and_left_m, abs=0.06)
+        assert errors.position_sigma < 0.1
+        both = (leave_out(one, laser)[0] for one in (odometry, shifted))
+        squared_m2 += [segment.position_rms_m**2 for segment in both]
+    assert squared_m2[1] < 1.5 * squared_m2[0]
 
 
 def test_odometry_that_drifts_is_no_localisation() -> None:

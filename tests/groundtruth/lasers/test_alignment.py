@@ -199,6 +199,22 @@ def test_walls_drawn_slightly_askew_do_not_move_a_scanner_along_a_corridor() -> 
     assert error @ np.linalg.solve(found.scanners[0].covariance, error) < 20.0
 
 
+def test_a_lone_scanner_between_two_walls_cannot_tell_whether_they_are_off() -> None:
+    """Between walls at 2 degrees, a centimetre of the drawing is half a metre along them."""
+    wide_m = 30.0 * np.tan(np.radians(2.0))
+    walls = np.array([[-30.0, 0.0, 30.0, 0.0], [-30.0, 3.0 + wide_m, 30.0, 3.0 - wide_m]])
+    one = scanner("wedge", np.array([0.5, 1.2, 0.2]), max_range_m=12.0)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scans = np.stack([ranges_mm(one, walls, rng) for _ in range(20)])
+        drawn = walls + rng.normal(0.0, 0.01, walls.shape)
+        stated = by_hand((one,), SHIFTS[seed : seed + 1])
+        found = align_scanners(stated, [Scans(np.arange(20) / 75.0, scans)], drawn)
+        assert found.undetermined == ("wedge",)
+        error = found.scanners[0].pose - one.pose
+        assert error @ np.linalg.solve(found.scanners[0].covariance, error) < 16.0
+
+
 def test_a_lone_scanner_notices_that_the_drawing_is_off() -> None:
     """Its few walls could be fitted to a millimetre, by rejecting what contradicts."""
     lone = (four_scanners()[0],)
