@@ -40,7 +40,7 @@ def _run(
     own = rng.standard_normal((2, len(frame)))
     error = np.sqrt(alike) * common + np.sqrt(1.0 - alike) * own[0]
     seen = Sightings(
-        PERIOD_S * np.arange(FRAMES),
+        np.arange(FRAMES, dtype=np.float64) * PERIOD_S,
         frame,
         np.hypot(x, y) + STATED[0] * ranges * error,
         np.arctan2(x, -y) + STATED[1] * bearings * own[1],
@@ -116,7 +116,14 @@ def test_steps_that_are_too_long_and_turn_too_little_are_corrected() -> None:
 def test_a_run_that_shows_little_has_the_usual_noise() -> None:
     run, seen, *_ = _run(np.random.default_rng(5), 3.0, 3.0, 3.0)
     part = run.part(0, 10)
-    few = Sightings(seen.times[:10], *(each[: len(part.circles)] for each in seen[1:]))
+    first = slice(len(part.circles))
+    few = Sightings(
+        seen.times[:10],
+        seen.frame[first],
+        seen.range_m[first],
+        seen.bearing_rad[first],
+        seen.ids[first],
+    )
     found, noise = learned(part, few, _stated(few))
     assert noise == Noise()
     np.testing.assert_array_equal(found.step_covariance, ASSUMED.covariance(part.steps))

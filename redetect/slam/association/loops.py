@@ -88,9 +88,9 @@ def _alike(moved: FloatArray, unsorted: FloatArray) -> _Alike:
     squared = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
     pairs = np.argsort(squared, axis=None, kind="stable")
     limits = (length[used] + [[-_LENGTH_TOLERANCE_M], [_LENGTH_TOLERANCE_M]]) ** 2
-    spans = np.searchsorted(squared.ravel()[pairs], limits)
+    starts, ends = np.searchsorted(squared.ravel()[pairs], limits)
     bins = np.searchsorted(fixed[:, 0], np.arange(low[0], fixed[-1, 0] + 0.5, _MARGIN_M))
-    return _Alike(fixed, low, bins, first[used], second[used], *spans, pairs)
+    return _Alike(fixed, low, bins, first[used], second[used], starts, ends, pairs)
 
 
 @kernel()

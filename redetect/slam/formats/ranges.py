@@ -7,6 +7,7 @@ of the map (W. Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, s
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ def discs_of_ranges(
     distance = np.asarray(range_m, dtype=np.float64)
     sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
     direction = np.stack([sin, -cos], axis=-1)
-    sigma_across = np.asarray(sigma_rad * distance)
+    sigma_across = np.asarray(sigma_rad, dtype=np.float64) * distance
     across = sigma_across[..., None] * np.stack([cos, sin], axis=-1)
     root = np.stack([np.asarray(sigma_m)[..., None] * direction, across], axis=-1)
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
@@ -129,12 +130,10 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
             variance = np.mean(error[right] ** 2, axis=0) / redundant
             both = error[pairs[np.all(right[pairs], axis=1)]]
             product = np.sum(both[:, 0] * both[:, 1], axis=0) / max(len(both), 1)
-            noise = Noise(
-                *np.sqrt(variance).tolist(),
-                *np.clip(product / variance, 0.0, 1.0).tolist(),
-                noise.steps * float(np.sqrt(check.odometry_factor)),
-                int(np.count_nonzero(~right)),
-            )
+            alike = np.clip(product / variance, 0.0, 1.0)
+            of_steps = noise.steps * math.sqrt(check.odometry_factor)
+            wrong = int(np.count_nonzero(~right))
+            noise = Noise._make([*np.sqrt(variance).tolist(), *alike.tolist(), of_steps, wrong])
             longer = check.length / (1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2)
             turn = check.turn_per_metre / (1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2)
             steps = run.steps * [1.0 + longer, 1.0 + longer, 1.0]
