@@ -224,10 +224,10 @@ class Import:
     # estimates; for a trajectory a path.csv; for a robot a .circles file, or the .csv of its true
     # path; for true landmarks a map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park, and of the
-    # UTIAS data set 0.03 and 2 %, the same for as long as a landmark is seen.
+    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park, and learned
+    # from the run in the UTIAS data set.
     range_sigma: float | None = None
-    # Standard deviation of a data set's bearings (rad); by default 0.03 and 0.02.
+    # Standard deviation of a data set's bearings (rad); by default 0.03, or learned.
     bearing_sigma: float | None = None
     # Correct what the UTIAS data set does not state: ranges are depths, and the robot moves later,
     # faster and farther than its odometry, by as much as the landmarks show.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import tracemalloc
 from itertools import permutations
 
 import numpy as np
@@ -21,9 +23,11 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.loops import (
+    REACH_M,
     Match,
     Search,
     Stretch,
+    chance_of_agreeing,
     find_matches,
     log10_false_alarms,
     motion_onto,
@@ -113,6 +117,26 @@ def test_random_constellations_do_not_match_and_one_place_seen_twice_does() -> N
     assert len(set(map(tuple, match.pairs.tolist())) & set(right)) >= 12
     assert match.motion[2] == pytest.approx(-0.3, abs=0.03)
     assert match.log10_false_alarms < -3
+
+
+def test_an_area_of_a_park_costs_no_more_than_that_of_a_room() -> None:
+    """Landmarks may be hundreds of metres apart: nothing is as large as the area between them."""
+    rng = np.random.default_rng(6)
+    fixed = rng.uniform(0, 400, (30, 2))
+    moved = (fixed[5:25] + rng.normal(0, 0.02, (20, 2)) - [3.0, 2.0]) @ rotation(0.2)
+    alike = motion_onto(moved[:2], fixed, Search(most_shift_m=math.inf))  # compiles
+    assert alike.agreeing == 0
+    tracemalloc.start()
+    try:
+        motion = motion_onto(moved, fixed, Search(most_shift_m=math.inf))
+        chance = chance_of_agreeing(fixed)
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert motion.agreeing >= 18
+    assert motion.pose == pytest.approx([3.0, 2.0, 0.2], abs=0.1)
+    assert chance == pytest.approx((REACH_M / 0.6) ** 2, rel=0.05)  # of landmarks far apart
+    assert most < 30e6
 
 
 def test_stretches_that_share_landmarks_already_are_not_matched() -> None:

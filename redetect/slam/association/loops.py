@@ -33,6 +33,8 @@ _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
 _OTHER_SHIFT_M, _OTHER_TURN_RAD = 0.5, 0.3
 #: Largest distance of landmarks that agree (m).
 REACH_M = 0.12
+# Landmarks within this distance of the middle of a cell may be within reach of a point in it.
+_MARGIN_M = REACH_M + _CELL_M
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
 # Spacing at which the area is measured.
@@ -63,44 +65,39 @@ class Search(NamedTuple):
     stretch_frames: int = STRETCH_FRAMES  # Length of the stretches.
 
 
-class _Cells(NamedTuple):
-    """A grid in which the nearest landmark is looked up."""
+class _Alike(NamedTuple):
+    """Landmarks in the order of x; pairs of others', with those of these of the same length."""
 
-    low_x: float  # its low corner (m)
-    low_y: float
-    nearest: IntArray  # (columns, rows): landmark nearest to a cell's centre, -1 if out of reach
+    fixed: FloatArray  # (m, 2)
+    low: FloatArray  # (2,): the low corner of the area within reach of them (m)
+    bins: IntArray  # (b + 1,): where each bin of x, as wide as the margin, begins
+    first: IntArray  # (k,): a pair's landmarks
+    second: IntArray
+    starts: IntArray  # (k,): where the others of its length begin and end in:
+    ends: IntArray
+    pairs: IntArray  # (m^2,): m times the first landmark of each other pair, plus the second
 
 
-@kernel()
-def _nearest_by_cell(fixed: FloatArray) -> _Cells:
-    """The grid over landmarks (m, 2)."""
-    margin = REACH_M + _CELL_M
-    low_x, low_y = fixed[:, 0].min() - margin, fixed[:, 1].min() - margin
-    columns = int((fixed[:, 0].max() + margin - low_x) / _CELL_M) + 1
-    rows = int((fixed[:, 1].max() + margin - low_y) / _CELL_M) + 1
-    nearest = np.full((columns, rows), -1, dtype=np.int64)
-    distance = np.full((columns, rows), margin * margin)
-    span = int(margin / _CELL_M) + 1
-    for j in range(len(fixed)):
-        column = int((fixed[j, 0] - low_x) / _CELL_M)
-        row = int((fixed[j, 1] - low_y) / _CELL_M)
-        for a in range(max(column - span, 0), min(column + span + 1, columns)):
-            for b in range(max(row - span, 0), min(row + span + 1, rows)):
-                off_x = low_x + (a + 0.5) * _CELL_M - fixed[j, 0]
-                off_y = low_y + (b + 0.5) * _CELL_M - fixed[j, 1]
-                squared = off_x * off_x + off_y * off_y
-                if squared < distance[a, b]:
-                    distance[a, b] = squared
-                    nearest[a, b] = j
-    return _Cells(low_x, low_y, nearest)
+def _alike(moved: FloatArray, unsorted: FloatArray) -> _Alike:
+    """Landmarks (n, 2) and (m, 2) compared."""
+    fixed = unsorted[np.argsort(unsorted[:, 0], kind="stable")]
+    low = fixed.min(axis=0) - _MARGIN_M
+    first, second = np.triu_indices(len(moved), 1)
+    length = np.hypot(*(moved[second] - moved[first]).T)
+    used = (second - first <= _NEIGHBOURS) & (length >= _LEAST_LENGTH_M)
+    squared = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
+    pairs = np.argsort(squared, axis=None, kind="stable")
+    limits = (length[used] + [[-_LENGTH_TOLERANCE_M], [_LENGTH_TOLERANCE_M]]) ** 2
+    starts, ends = np.searchsorted(squared.ravel()[pairs], limits)
+    bins = np.searchsorted(fixed[:, 0], np.arange(low[0], fixed[-1, 0] + 0.5, _MARGIN_M))
+    return _Alike(fixed, low, bins, first[used], second[used], starts, ends, pairs)
 
 
 @kernel()
 def _agreement(
     moved: FloatArray,
     motion: tuple[float, float, float, float],
-    fixed: FloatArray,
-    cells: _Cells,
+    alike: _Alike,
     enough: int,
 ) -> tuple[int, float]:
     """Number of landmarks that a motion puts on others, and their squared distances' sum (m^2).
@@ -109,21 +106,28 @@ def _agreement(
     `enough`.
     """
     cos, sin, shift_x, shift_y = motion
-    low_x, low_y, nearest = cells
-    columns, rows = nearest.shape
-    n = len(moved)
-    count, squared = 0, 0.0
+    fixed, bins = alike.fixed, alike.bins
+    low_x, low_y = alike.low
+    count, squared, n = 0, 0.0, len(moved)
     for i in range(n):
         if count + n - i < enough:
             break
         x, y = moved[i, 0], moved[i, 1]
         at_x, at_y = shift_x + cos * x - sin * y, shift_y + sin * x + cos * y
-        column, row = int((at_x - low_x) / _CELL_M), int((at_y - low_y) / _CELL_M)
-        if at_x < low_x or at_y < low_y or column >= columns or row >= rows:
+        # The landmark nearest to the middle of a cell.
+        middle_x = low_x + (int((at_x - low_x) / _CELL_M) + 0.5) * _CELL_M
+        middle_y = low_y + (int((at_y - low_y) / _CELL_M) + 0.5) * _CELL_M
+        k = int((middle_x - low_x) / _MARGIN_M)
+        if at_x < low_x or at_y < low_y or k + 1 >= len(bins):
             continue
-        j = nearest[column, row]
-        if j >= 0:
-            off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
+        nearest, least = -1, _MARGIN_M * _MARGIN_M
+        for j in range(bins[max(k - 1, 0)], bins[min(k + 2, len(bins) - 1)]):
+            off_x, off_y = middle_x - fixed[j, 0], middle_y - fixed[j, 1]
+            distance = off_x * off_x + off_y * off_y
+            if distance < least:
+                nearest, least = j, distance
+        if nearest >= 0:
+            off_x, off_y = fixed[nearest, 0] - at_x, fixed[nearest, 1] - at_y
             distance = off_x * off_x + off_y * off_y
             if distance <= REACH_M * REACH_M:
                 count += 1
@@ -133,7 +137,7 @@ def _agreement(
 
 @kernel()
 def _best_motion(
-    moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray
+    moved: FloatArray, alike: _Alike, search: Search, besides: FloatArray
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
@@ -142,45 +146,36 @@ def _best_motion(
     landmarks, and that of motions tried, without those near `besides`: a rotation and a shift (3,),
     NaN for none.
     """
-    n, m = len(moved), len(fixed)
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
-    cells = _nearest_by_cell(fixed)
-    squared_length = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
-    for a in range(n):
-        for b in range(a + 1, min(a + 1 + _NEIGHBOURS, n)):
-            ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]
-            length = math.hypot(ab_x, ab_y)
-            if length < _LEAST_LENGTH_M:
+    fixed = alike.fixed
+    for k in range(len(alike.first)):
+        a, b = alike.first[k], alike.second[k]
+        ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]
+        for place in range(alike.starts[k], alike.ends[k]):
+            c, d = alike.pairs[place] // len(fixed), alike.pairs[place] % len(fixed)
+            cd_x, cd_y = fixed[d, 0] - fixed[c, 0], fixed[d, 1] - fixed[c, 1]
+            turn = math.atan2(ab_x * cd_y - ab_y * cd_x, ab_x * cd_x + ab_y * cd_y)
+            if abs(turn) > search.most_turn_rad:
                 continue
-            shortest = (length - _LENGTH_TOLERANCE_M) ** 2
-            longest = (length + _LENGTH_TOLERANCE_M) ** 2
-            for c in range(m):
-                for d in range(m):
-                    if not shortest <= squared_length[c, d] <= longest:
-                        continue
-                    cd_x, cd_y = fixed[d, 0] - fixed[c, 0], fixed[d, 1] - fixed[c, 1]
-                    turn = math.atan2(ab_x * cd_y - ab_y * cd_x, ab_x * cd_x + ab_y * cd_y)
-                    if abs(turn) > search.most_turn_rad:
-                        continue
-                    cos, sin = math.cos(turn), math.sin(turn)
-                    # The middle of one pair goes to the middle of the other.
-                    x = 0.5 * (moved[a, 0] + moved[b, 0])
-                    y = 0.5 * (moved[a, 1] + moved[b, 1])
-                    shift_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
-                    shift_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
-                    if math.hypot(shift_x, shift_y) > search.most_shift_m:
-                        continue
-                    off = math.hypot(shift_x - besides[1], shift_y - besides[2])
-                    alike = math.cos(turn - besides[0]) > math.cos(_OTHER_TURN_RAD)
-                    if alike and off < _OTHER_SHIFT_M:
-                        continue
-                    tried += 1
-                    motion = (cos, sin, shift_x, shift_y)
-                    count, squared = _agreement(moved, motion, fixed, cells, best_count)
-                    if count > best_count or (count == best_count and squared < best_squared):
-                        best_turn, best_x, best_y = turn, shift_x, shift_y
-                        best_count, best_squared = count, squared
+            cos, sin = math.cos(turn), math.sin(turn)
+            # The middle of one pair goes to the middle of the other.
+            x = 0.5 * (moved[a, 0] + moved[b, 0])
+            y = 0.5 * (moved[a, 1] + moved[b, 1])
+            shift_x = 0.5 * (fixed[c, 0] + fixed[d, 0]) - (cos * x - sin * y)
+            shift_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
+            if math.hypot(shift_x, shift_y) > search.most_shift_m:
+                continue
+            off = math.hypot(shift_x - besides[1], shift_y - besides[2])
+            near = math.cos(turn - besides[0]) > math.cos(_OTHER_TURN_RAD)
+            if near and off < _OTHER_SHIFT_M:
+                continue
+            tried += 1
+            motion = (cos, sin, shift_x, shift_y)
+            count, squared = _agreement(moved, motion, alike, best_count)
+            if count > best_count or (count == best_count and squared < best_squared):
+                best_turn, best_x, best_y = turn, shift_x, shift_y
+                best_count, best_squared = count, squared
     if best_count < search.least_agreeing:
         best_count = 0
     return best_turn, best_x, best_y, best_count, tried
@@ -305,7 +300,9 @@ def motion_onto(
     known = np.full(3, np.nan)
     if besides is not None:
         known = np.array([besides[2], *(apply(besides, centre) - centre)])
-    turn, x, y, agreeing, tried = _best_motion(moved - centre, fixed - centre, search, known)
+    moved = moved - centre
+    alike = _alike(moved, fixed - centre)
+    turn, x, y, agreeing, tried = _best_motion(moved, alike, search, known)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 
@@ -352,9 +349,15 @@ def chance_of_agreeing(xy: FloatArray) -> float:
     """Probability that a landmark in the covered area falls on one of (n, 2) by chance."""
     low, high = xy.min(axis=0) - _COVER_M, xy.max(axis=0) + _COVER_M
     xs, ys = (np.arange(low[a], high[a] + _GRID_M, _GRID_M) for a in (0, 1))
-    x, y = xy.T[:, :, None, None]
-    squared = (xs[:, None] - x) ** 2 + (ys - y) ** 2
-    area_m2 = float(np.sum(squared.min(axis=0) <= _COVER_M**2) * _GRID_M**2)
+    covered = np.zeros((len(xs), len(ys)), dtype=np.bool_)
+    for x, y in xy:
+        near_x, near_y = (
+            slice(*np.searchsorted(axis, [at - _COVER_M - _GRID_M, at + _COVER_M + _GRID_M]))
+            for axis, at in ((xs, x), (ys, y))
+        )
+        squared = (xs[near_x, None] - x) ** 2 + (ys[near_y] - y) ** 2
+        covered[near_x, near_y] |= squared <= _COVER_M**2
+    area_m2 = float(np.count_nonzero(covered) * _GRID_M**2)
     return float(len(xy) * np.pi * REACH_M**2 / area_m2)
 
 

@@ -32,6 +32,7 @@ from redetect.landmarks.axes import covariance_from_dataset, to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import apply, between, chain_steps, compose, invert
 from redetect.slam.errors import SlamError
+from redetect.slam.formats.ranges import Noise, Sightings, discs_of_ranges, learned, places_of
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
 
@@ -43,19 +44,16 @@ _ROBOTS = 5
 _SET_BACK_S = 1.0
 # A log has a gap if nothing is logged for this many of its usual intervals, and this time.
 _GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.5
-#: What the logs call range is the depth along the camera's axis, and too long by this factor: in
-#: logs of three robots, of data sets 6 and 7, compared with the true poses, by 1.02, 1.03 and 1.05.
-_DEPTH_SCALE = 1.033
 #: Largest bearing that a camera sees, radians.
 _WIDEST_RAD = 1.2
-#: Errors of these ranges, metres and as a share; for how long they are alike; errors of bearings.
-_USUAL_SIGMA_M, _USUAL_SHARE, _ALIKE_S, _USUAL_SIGMA_RAD = 0.03, 0.02, 5.0, 0.02
+#: Usual errors of these ranges, metres and as a share; of bearings.
+_USUAL_SIGMA_M, _USUAL_SHARE, _USUAL_SIGMA_RAD = 0.03, 0.02, 0.02
 #: The same without calibration, and of Victoria Park's trees.
 _RAW_SIGMA_M, _RAW_SIGMA_RAD = 0.1, 0.03
 #: Zeros between commands that last less than this are ignored, seconds.
 _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
-#: of a landmark that show it, seconds.
+#: of landmarks that show it, seconds.
 _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
 #: Step of the derivatives of residuals by a response.
 _STEP = 1e-3
@@ -78,22 +76,6 @@ _LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
 def _names(times: FloatArray) -> tuple[str, ...]:
     """Names of frames: their times (s)."""
     return tuple(f"{time:.3f}" for time in times)
-
-
-def discs_of_ranges(
-    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: ArrayLike, sigma_rad: float
-) -> tuple[FloatArray, FloatArray]:
-    """Landmarks measured by range and bearing, as positions in the robot frame.
-
-    Takes `range_m, bearing_rad` (n,) and their standard deviations, that of ranges (n,) or one;
-    returns `xy` (n, 2), `covariance` (n, 2, 2).
-    """
-    distance = np.asarray(range_m, dtype=np.float64)
-    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
-    direction = np.stack([sin, -cos], axis=-1)
-    across = sigma_rad * distance[..., None] * np.stack([cos, sin], axis=-1)
-    root = np.stack([np.asarray(sigma_m)[..., None] * direction, across], axis=-1)
-    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
 class _Log(NamedTuple):
@@ -125,7 +107,8 @@ class _Log(NamedTuple):
         early_s = np.minimum(times - self.times[0] + _LEAST_GAP_S, 0.0)
         silent_s = np.diff(early_s + silence_s[rows] + since * gap[rows])[:, None]
         rates = self.along(np.arange(len(gap)), np.ones(len(gap)))
-        late = self.late_s * np.diff(rates[rows], axis=0)
+        # Before the first row there is no motion.
+        late = self.late_s * np.diff(rates[rows] * (times >= self.times[0])[:, None], axis=0)
         more = silent_s**2 * np.var(rates, axis=0) + late**2
         usual = ASSUMED.covariance(steps)
         stated = np.any(more > np.diagonal(usual, axis1=1, axis2=2), axis=1)
@@ -137,20 +120,10 @@ class _Log(NamedTuple):
         return rows, np.maximum(times - self.times[rows], 0.0)
 
 
-class _Sightings(NamedTuple):
-    """Landmarks that a robot saw."""
-
-    times: FloatArray  # (N,): of the frames (s), ascending
-    frame: IntArray  # (n,): the frame of each measurement, ascending
-    range_m: FloatArray  # (n,): from the origin of the robot frame
-    bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
-    ids: IntArray  # (n,): the landmark
-
-
-def _seen_by_robot(odometry: Path, *, calibrated: bool) -> _Sightings:
+def _seen_by_robot(odometry: Path, *, calibrated: bool) -> Sightings:
     """The measurements beside a robot's odometry; sightings of other robots are ignored.
 
-    Calibrated ones have ranges instead of depths.
+    Calibrated ones have ranges instead of depths, still too long.
     """
     measurements, listed = _beside(odometry, MEASUREMENTS), odometry.with_name(BARCODES)
     seen = _table(measurements, "time barcode range bearing")
@@ -174,8 +147,8 @@ def _seen_by_robot(odometry: Path, *, calibrated: bool) -> _Sightings:
                 f"within +-{_WIDEST_RAD:g}, as seen by a camera; --no-calibrated takes ranges and "
                 "odometry as they are"
             )
-        range_m = range_m / (_DEPTH_SCALE * np.cos(bearing_rad))
-    return _Sightings(times, frame, range_m, bearing_rad, ids[order])
+        range_m = range_m / np.cos(bearing_rad)
+    return Sightings(times, frame, range_m, bearing_rad, ids[order])
 
 
 class Response(NamedTuple):
@@ -184,17 +157,21 @@ class Response(NamedTuple):
     lag_s: float = 0.25  # how much later it moves
     speed: float = 1.0  # its speed over the commanded one
     turn: float = 1.0  # its turn rate over the commanded one
+    #: What the logs call range is the depth along the camera's axis, over the true one: in logs of
+    #: three robots, of data sets 6 and 7, compared with the true poses, 1.02, 1.03 and 1.05.
+    depth: float = 1.033
 
     def sentence(self) -> str:
         """Description of the response."""
         return (
             f"the robot is taken to move {self.lag_s:.2f} s after its commands, {self.speed:.3f} "
-            f"times as fast, and to turn {self.turn:.3f} times"
+            f"times as fast, and to turn {self.turn:.3f} times; depths are taken to be "
+            f"{self.depth:.3f} times too long"
         )
 
 
 #: How much responses vary.
-_RESPONSE_SIGMA = Response(0.25, 0.1, 0.1)
+_RESPONSE_SIGMA = Response(0.25, 0.1, 0.1, 0.02)
 
 
 def read_robot(
@@ -203,24 +180,19 @@ def read_robot(
     sigma_rad: float | None = None,
     *,
     calibrated: bool = True,
-) -> tuple[Recording, Response | None]:
-    """A robot's log, with landmarks as discs; most steps have no covariance.
+) -> tuple[Recording, Response | None, Noise | None]:
+    """A robot's log, with landmarks as discs; its response and noise, None without calibration.
 
     Parameters
     ----------
     odometry : Path
     sigma_m, sigma_rad : float, optional
-        Standard deviations of independent ranges and bearings; by default, those of calibrated
-        ranges are as found in logs with true poses, where their errors last (`_alike`).
+        Standard deviations of independent ranges and bearings; by default, those of calibrated ones
+        are learned, and so are covariances of steps (`redetect.slam.formats.ranges`); otherwise
+        most steps have none.
     calibrated : bool
         Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
         ranges are computed from the depths that the log has.
-
-    Returns
-    -------
-    Recording
-    Response or None
-        None without calibration.
 
     Raises
     ------
@@ -232,53 +204,74 @@ def read_robot(
     _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
     usual_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m) if calibrated else _RAW_SIGMA_M
     usual_rad = _USUAL_SIGMA_RAD if calibrated else _RAW_SIGMA_RAD
-    of_ranges = np.broadcast_to(usual_m if sigma_m is None else sigma_m, seen.range_m.shape)
-    of_bearings = usual_rad if sigma_rad is None else sigma_rad
-    response, log = None, _driven_by(velocity)
+    sigma = np.empty((len(seen.ids), 2))
+    sigma[:, 0] = usual_m if sigma_m is None else sigma_m
+    sigma[:, 1] = usual_rad if sigma_rad is None else sigma_rad
+    response, noise, log = None, None, _driven_by(velocity)
     if calibrated:
         velocity = _without_short_stops(velocity)
-        response = response_of(velocity, seen, of_ranges, of_bearings)
+        places = np.full((len(seen.ids), 2), np.nan)
+        if (file := odometry.with_name(LANDMARKS)).exists():
+            true = read_landmarks(file).discs
+            places = places_of(seen.ids, true.ids, true.xy)
+        response = response_of(velocity, seen, sigma, places)
+        seen = seen._replace(range_m=seen.range_m / response.depth)
         log = _driven_by(velocity, response)
-        if sigma_m is None:
-            of_ranges = of_ranges * np.sqrt(_alike(seen))
-    steps = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, of_ranges, of_bearings)
-    return _run(seen.times, *steps, CircleRows(seen.frame, *rows, seen.ids)), response
+    steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
+    run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
+    if calibrated and sigma_m is None and sigma_rad is None:
+        run, noise = learned(run, seen, sigma)
+    return run, response, noise
 
 
 def response_of(
-    velocity: FloatArray, seen: _Sightings, sigma_m: FloatArray, sigma_rad: float
+    velocity: FloatArray, seen: Sightings, sigma: FloatArray, places: FloatArray
 ) -> Response:
-    """How a robot follows its commands, as the landmarks show it.
+    """How a robot follows its commands and measures depths, as the landmarks show it.
 
-    From one sighting of a landmark to the next, range and bearing change as the robot moves. The
-    most likely response predicts these changes best; where they show little, it is the usual one.
+    From one sighting of a landmark to the next, range and bearing change as the robot moves; two
+    landmarks seen in succession have a known distance. The most likely response predicts both
+    best; where they show little, it is the usual one.
 
     Parameters
     ----------
     velocity : (k, 3) float64
         Time (s), speed (m/s) and turn rate (rad/s) of each command.
-    seen : _Sightings
-        The landmarks, n times.
-    sigma_m, sigma_rad : (n,) float64, float
-        Standard deviations of ranges and bearings.
+    seen : Sightings
+        The landmarks, n times, with ranges that are too long by a factor.
+    sigma : (n, 2) float64
+        Standard deviations of ranges (m) and bearings (rad).
+    places : (n, 2) float64
+        True positions of the landmarks (m), NaN for unknown ones.
     """
-    by_landmark = np.lexsort((seen.frame, seen.ids))
-    before, after = by_landmark[:-1], by_landmark[1:]
-    apart_s = seen.times[seen.frame[after]] - seen.times[seen.frame[before]]
-    pair = (seen.ids[before] == seen.ids[after]) & (apart_s > 0.0) & (apart_s < _NEXT_SIGHTING_S)
-    before, after = before[pair], after[pair]
-    bearing, range_m = seen.bearing_rad[before], seen.range_m[after]
-    place = seen.range_m[before, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    time, every = seen.times[seen.frame], np.arange(len(seen.ids))
+    before, after = _in_succession(np.lexsort((seen.frame, seen.ids)), time)
+    one = (seen.ids[before] == seen.ids[after]) & (time[before] < time[after])
+    before, after = before[one], after[one]
+    first, second = _in_succession(every, time)
+    apart_m = np.hypot(*(places[second] - places[first]).T)
+    two = apart_m > 0.0
+    first, second, apart_m = first[two], second[two], apart_m[two]
+    spread = np.sum(sigma**2 * np.stack([np.ones(len(time)), seen.range_m**2], axis=1), axis=1)
+    direction = np.stack([np.cos(seen.bearing_rad), np.sin(seen.bearing_rad)], axis=1)
 
     def residuals(numbers: ArrayLike) -> FloatArray:
         response = Response(*np.asarray(numbers).tolist())
-        poses = _driven_by(velocity, response).poses(seen.times)
-        moved = between(poses[seen.frame[before]], poses[seen.frame[after]])
-        x, y = apply(invert(moved), place).T
+        poses = _driven_by(velocity, response).poses(seen.times)[seen.frame]
+        range_m = seen.range_m / response.depth
+        place = range_m[:, None] * direction
+
+        def later(start: IntArray, end: IntArray) -> FloatArray:
+            """Places in the robot frame of another sighting."""
+            return apply(invert(between(poses[start], poses[end])), place[start])
+
+        x, y = later(before, after).T
+        offset = later(first, second) - place[second]
         changes = np.concatenate([
-            wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / sigma_rad,
-            (np.hypot(x, y) - range_m) / sigma_m[after],
+            wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / sigma[after, 1],
+            (np.hypot(x, y) - range_m[after]) / sigma[after, 0],
+            (np.hypot(*offset.T) - apart_m) / np.sqrt(spread[first] + spread[second]),
         ])  # fmt: skip
         robust = np.copysign(np.sqrt(np.arctan(changes**2)), changes)
         return np.concatenate([robust, np.subtract(response, Response()) / _RESPONSE_SIGMA])
@@ -290,24 +283,16 @@ def response_of(
         return np.stack(changes, axis=1) / (2.0 * _STEP)
 
     starts = [Response(lag_s) for lag_s in _LAGS_S.tolist()]
-    first = min(starts, key=lambda response: float(np.sum(residuals(response) ** 2)))
-    bounds = (_LAGS_S[0] - 1e-9, 0.5, 0.5), (_LAGS_S[-1] + 1e-9, 2.0, 2.0)
-    return Response(*least_squares(residuals, first, jacobian, bounds).x.tolist())
+    begin = min(starts, key=lambda response: float(np.sum(residuals(response) ** 2)))
+    bounds = (_LAGS_S[0] - 1e-9, 0.5, 0.5, 0.5), (_LAGS_S[-1] + 1e-9, 2.0, 2.0, 2.0)
+    return Response(*least_squares(residuals, begin, jacobian, bounds).x.tolist())
 
 
-def _alike(seen: _Sightings) -> FloatArray:
-    """Number (n,) of sightings of the same landmark at about the same time.
-
-    In logs with true poses, errors of ranges hardly change while a landmark is seen: together they
-    are worth one measurement.
-    """
-    count = np.ones(len(seen.ids))
-    for number in np.unique(seen.ids):
-        chosen = seen.ids == number
-        time = seen.times[seen.frame[chosen]]
-        first, end = np.searchsorted(time, [time - _ALIKE_S / 2, time + _ALIKE_S / 2])
-        count[chosen] = end - first
-    return count
+def _in_succession(order: IntArray, time: FloatArray) -> tuple[IntArray, IntArray]:
+    """Pairs of sightings, neighbours in some order, with little time in between."""
+    apart_s = np.diff(time[order])
+    near = (apart_s >= 0.0) & (apart_s < _NEXT_SIGHTING_S)
+    return order[:-1][near], order[1:][near]
 
 
 def _run(
@@ -357,7 +342,7 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
 
 def _driven_by(velocity: FloatArray, response: Response | None = None) -> _Log:
     """The log of commands (k, 3), as the robot follows them; arcs are approximated by chords."""
-    lag_s, speed_share, turn_share = response or (0.0, 1.0, 1.0)
+    lag_s, speed_share, turn_share, _ = response or (0.0, 1.0, 1.0, 1.0)
     time, speed, turn_rate = (velocity * [1.0, speed_share, turn_share]).T
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:

@@ -1,0 +1,160 @@
+"""Landmarks measured by range and bearing, as discs; how accurate they are, learned from the run.
+
+A least-squares map of the run shows the errors of its ranges, bearings and steps, and which rows
+contradict all others, such as misread barcodes. Variances are those errors over the redundancy
+of the map (W. Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, section 4.2.4).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+from scipy.special import chdtri
+
+from redetect.array_types import FloatArray, IntArray
+from redetect.landmarks import wrap_angle
+from redetect.slam.mapping.graph_terms import Weighting
+from redetect.slam.mapping.odometry_check import check_odometry
+from redetect.slam.mapping.run_map import map_run
+from redetect.slam.models import disc_in_robot
+from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, Recording
+
+# Errors of sightings of one landmark within this time may be alike, seconds.
+_ALIKE_S = 5.0
+# Fewest redundant numbers of a run that show its noise.
+_FEWEST_NUMBERS = 100
+# Maps in which the noise is learned: a robust one, then least squares of the rows that fit.
+_ROUNDS = 6
+# How much the lengths of steps vary, and their turns per metre (rad/m).
+_LENGTH_SIGMA, _TURN_SIGMA = 0.1, 0.05
+# A row is wrong if its squared error is less probable than this; the median of squared errors.
+_WRONG, _MEDIAN = float(chdtri(2, 1e-6)), float(chdtri(2, 0.5))
+
+
+class Sightings(NamedTuple):
+    """Landmarks that a robot saw."""
+
+    times: FloatArray  # (N,): of the frames (s), ascending
+    frame: IntArray  # (n,): the frame of each measurement, ascending
+    range_m: FloatArray  # (n,): from the origin of the robot frame
+    bearing_rad: FloatArray  # (n,): 0 forward, positive to the left
+    ids: IntArray  # (n,): the landmark
+
+
+class Noise(NamedTuple):
+    """Errors of a run's ranges, bearings and steps; the usual ones of the UTIAS data set."""
+
+    ranges: float = 1.0  # their standard deviation over the stated one
+    bearings: float = 1.0
+    ranges_alike: float = 1.0  # correlation of errors of one landmark at about the same time
+    bearings_alike: float = 0.0
+    steps: float = 1.0  # their standard deviation over the stated one
+    wrong: int = 0  # number of rows that contradict the others, and have lost their identifier
+
+    def sentence(self) -> str:
+        """Description of the noise."""
+        return (
+            f"errors of ranges are {self.ranges:.2f}, of bearings {self.bearings:.2f}, of steps "
+            f"{self.steps:.2f} times the usual ones, a landmark's correlated by "
+            f"{self.ranges_alike:.2f}, {self.bearings_alike:.2f}; {self.wrong} rows are wrong"
+        )
+
+
+def discs_of_ranges(
+    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: ArrayLike, sigma_rad: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Landmarks measured by range and bearing, as positions in the robot frame.
+
+    Takes `range_m, bearing_rad` (n,) and their standard deviations, (n,) or one each; returns `xy`
+    (n, 2), `covariance` (n, 2, 2).
+    """
+    distance = np.asarray(range_m, dtype=np.float64)
+    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
+    direction = np.stack([sin, -cos], axis=-1)
+    sigma_across = np.asarray(sigma_rad, dtype=np.float64) * distance
+    across = sigma_across[..., None] * np.stack([cos, sin], axis=-1)
+    root = np.stack([np.asarray(sigma_m)[..., None] * direction, across], axis=-1)
+    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
+
+
+def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
+    """A run with covariances as large as its errors, and without identifiers that are wrong.
+
+    Steps become longer and turn more or less in each metre, as fits the rows best.
+
+    Parameters
+    ----------
+    run : Recording
+        The run; its n rows of discs are those seen, and their covariances are not used. Zero
+        covariances of steps become the assumed ones.
+    seen : Sightings
+        The landmarks, n times.
+    sigma : (n, 2) float64
+        Stated standard deviations of ranges (m) and bearings (rad), apart from factors.
+
+    Returns
+    -------
+    Recording, Noise
+        With the usual noise if the run shows too little of its own.
+    """
+    noise, usual = Noise(), ASSUMED.covariance(run.steps)
+    stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]
+    further = np.where(stated, run.step_covariance - usual, 0.0)
+    # Far apart unless they show one landmark at about the same time.
+    points = np.stack([1e3 * _ALIKE_S * seen.ids, seen.times[seen.frame]], axis=1)
+    pairs = KDTree(points).query_pairs(0.5 * _ALIKE_S, output_type="ndarray")
+    together = 1 + np.bincount(pairs.ravel(), minlength=len(points))
+    run = replace(run, step_covariance=usual + further)
+    run = _with_noise(run, seen, sigma, together, noise)
+    if 2 * (len(seen.ids) - len(np.unique(seen.ids))) < _FEWEST_NUMBERS:
+        return run, noise
+    for number in range(_ROUNDS):
+        mapped = map_run(run, weighting=Weighting(loss="none" if number else "geman-mcclure"))
+        place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
+        x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
+        off = wrap_angle(seen.bearing_rad - np.arctan2(x, -y))
+        error = np.stack([seen.range_m - np.hypot(x, y), off], axis=1) / sigma
+        squared = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1)
+        unlike = 1.0 if number else max(1.0, float(np.nanmedian(squared)) / _MEDIAN)
+        right = squared <= unlike * _WRONG
+        if number:
+            table = mapped.table
+            check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, table.expected)
+            # The share of the numbers of rows that the others check.
+            redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
+            variance = np.mean(error[right] ** 2, axis=0) / redundant
+            both = error[pairs[np.all(right[pairs], axis=1)]]
+            product = np.sum(both[:, 0] * both[:, 1], axis=0) / max(len(both), 1)
+            alike = np.clip(product / variance, 0.0, 1.0)
+            of_steps = noise.steps * math.sqrt(check.odometry_factor)
+            wrong = int(np.count_nonzero(~right))
+            noise = Noise._make([*np.sqrt(variance).tolist(), *alike.tolist(), of_steps, wrong])
+            longer = check.length / (1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2)
+            turn = check.turn_per_metre / (1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2)
+            steps = run.steps * [1.0 + longer, 1.0 + longer, 1.0]
+            steps[:, 2] += turn * np.hypot(run.steps[:, 0], run.steps[:, 1])
+            run = replace(run, steps=steps, step_covariance=noise.steps**2 * usual + further)
+        trusted = seen._replace(ids=np.where(right, seen.ids, UNKNOWN_ID))
+        run = _with_noise(run, trusted, sigma, together, noise)
+    return run, noise
+
+
+def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
+    """Places (n, 2) of landmarks (n,), of `known` (m,), ascending, at `xy` (m, 2); else NaN."""
+    index = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    return np.where((known[index] == ids)[:, None], xy[index], np.nan)
+
+
+def _with_noise(
+    run: Recording, seen: Sightings, sigma: FloatArray, alike: IntArray, noise: Noise
+) -> Recording:
+    """The run with rows of this noise: n that are alike together have the weight of one."""
+    together = 1.0 + (alike[:, None] - 1.0) * [noise.ranges_alike, noise.bearings_alike]
+    sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
+    return replace(run, circles=CircleRows(seen.frame, *rows, seen.ids))
