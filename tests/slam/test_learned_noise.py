@@ -127,3 +127,13 @@ def test_a_run_that_shows_little_has_the_usual_noise() -> None:
     found, noise = learned(part, few, _stated(few))
     assert noise == Noise()
     np.testing.assert_array_equal(found.step_covariance, ASSUMED.covariance(part.steps))
+
+
+def test_a_run_without_a_map_has_the_usual_noise() -> None:
+    rng = np.random.default_rng(6)
+    run, seen, *_ = _run(rng, 1.0, 1.0, 1.0)
+    shuffled = seen._replace(ids=rng.permutation(seen.ids))  # no map explains them
+    found, noise = learned(run, shuffled, _stated(seen))
+    assert noise == Noise()
+    assert "usual" in noise.sentence()
+    np.testing.assert_array_equal(found.circles.ids, shuffled.ids)

@@ -18,6 +18,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import wrap_angle
+from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import check_odometry
 from redetect.slam.mapping.run_map import map_run
@@ -55,9 +56,12 @@ class Noise(NamedTuple):
     bearings_alike: float = 0.0
     steps: float = 1.0  # their standard deviation over the stated one
     wrong: int = 0  # number of rows that contradict the others, and have lost their identifier
+    is_learned: bool = False
 
     def sentence(self) -> str:
         """Description of the noise."""
+        if not self.is_learned:
+            return "the run does not show how large its errors are: they are taken to be usual ones"
         return (
             f"errors of ranges are {self.ranges:.2f}, of bearings {self.bearings:.2f}, of steps "
             f"{self.steps:.2f} times the usual ones, a landmark's correlated by "
@@ -100,7 +104,7 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
     Returns
     -------
     Recording, Noise
-        With the usual noise if the run shows too little of its own.
+        With the usual noise if the run shows too little of its own, or no map of it is found.
     """
     noise, usual = Noise(), ASSUMED.covariance(run.steps)
     stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]
@@ -111,10 +115,15 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
     together = 1 + np.bincount(pairs.ravel(), minlength=len(points))
     run = replace(run, step_covariance=usual + further)
     run = _with_noise(run, seen, sigma, together, noise)
+    usually = run, noise
     if 2 * (len(seen.ids) - len(np.unique(seen.ids))) < _FEWEST_NUMBERS:
-        return run, noise
+        return usually
     for number in range(_ROUNDS):
-        mapped = map_run(run, weighting=Weighting(loss="none" if number else "geman-mcclure"))
+        robust = Weighting(loss="none" if number else "geman-mcclure")
+        try:
+            mapped = map_run(run, weighting=robust)
+        except SlamError:  # no minimum, or undetermined poses
+            return usually
         place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
         x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
         off = wrap_angle(seen.bearing_rad - np.arctan2(x, -y))
@@ -133,7 +142,8 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
             alike = np.clip(product / variance, 0.0, 1.0)
             of_steps = noise.steps * math.sqrt(check.odometry_factor)
             wrong = int(np.count_nonzero(~right))
-            noise = Noise._make([*np.sqrt(variance).tolist(), *alike.tolist(), of_steps, wrong])
+            deviations = np.sqrt(variance).tolist()
+            noise = Noise._make([*deviations, *alike.tolist(), of_steps, wrong, True])
             longer = check.length / (1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2)
             turn = check.turn_per_metre / (1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2)
             steps = run.steps * [1.0 + longer, 1.0 + longer, 1.0]
