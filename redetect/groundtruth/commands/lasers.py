@@ -116,8 +116,8 @@ def _print_differences(
     if alignment.map_sigma_m > _NOTED_M:
         warn(
             f"the walls are off the map by some {1e3 * alignment.map_sigma_m:.0f} mm, or too few "
-            "are seen to tell: the covariances include that, and the scanners' errors are common "
-            "to all"
+            "walls are seen to rule that out: the covariances include it, and the scanners' "
+            "errors are common to all"
         )
     for name in far_off:
         warn(f"scanner {name}: was measured wrong, or another place of the map is similar")

@@ -37,8 +37,8 @@ _GATE_SIGMA, _LEAST_COSINE, _LEAST_READINGS = 3.0, 0.25, 10
 # covariance where few walls determine it.
 _MAP_SIGMAS_M, _LIKELY_MAP_SIGMA_M = np.geomspace(1e-4, 0.3, 80), 0.02
 _MAP_EVIDENCE, _MOST_INFLATED = 7.0, 9.0
-# Too few walls to tell whether they are off: what is assumed then (m), and the least increase of
-# the deviance that refutes it.
+# If few walls are seen, they do not show whether they are off: what is assumed then (m), and the
+# least increase of the deviance that refutes it.
 _USUAL_MAP_SIGMA_M, _REFUTED = 0.01, 4.0
 # Steps at each gate, most steps afterwards, and the change (m, rad) that ends them.
 _STEPS_PER_GATE, _MOST_STEPS, _SETTLED = 3, 15, 1e-6
