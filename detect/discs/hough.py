@@ -33,7 +33,7 @@ from redetect.compiled import kernel
 _BACKGROUND = 0.3
 _LEAST_SCORE = np.float32(1.9)  #: Of a candidate.
 _CLEAR_SCORE = 3.0  #: Of a clear one.
-_MOST_DOUBTFUL = 150  #: Doubtful candidates of an image.
+_MOST_DOUBTFUL = 300  #: Doubtful candidates of an image, of either sign.
 _MOST_COMPARED = 600  #: Candidates that are compared with their neighbours, unless all are clear.
 _MOST_PEAKS = 4000
 #: Least distance from a better candidate, radii; less than 2, for discs may touch.
