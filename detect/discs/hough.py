@@ -112,7 +112,8 @@ def count_votes(
     """(S, M, columns) votes of each cell, shares of a rim, for S radii (negative: dark discs)."""
     rows, columns, width = len(table.ahead), table.columns, table.pixel.shape[1]
     votes = np.zeros((len(radius), rows * columns), np.float32)
-    least = np.float32((_SOBEL_GAIN * (1.0 + table.paired) * least_step) ** 2)
+    # Without a gradient there is no direction.
+    least = np.float32(max((_SOBEL_GAIN * (1.0 + table.paired) * least_step) ** 2, 1.0))
     own = np.empty((5, width), np.float32)
     edges = _Edges(own[0], own[1], own[2], own[3], own[4])
     gradient, lines = np.empty((3, width), np.float32), np.empty((3, width), np.int16)

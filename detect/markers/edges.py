@@ -66,18 +66,31 @@ def refine_quadrangle(
     of the rough ones. Three or more parts per edge give the covariance from the residuals of the
     steps. Returns the reason for rejection if there are no edges.
     """
-    found: RefinedQuadrangle | str = NO_EDGE
-    for seam in (False, True):  # If there is no edge, white may be a mere seam.
-        found = _edges_near(picture, rough, border, capture_px, settings, parts, seam)
-        if not isinstance(found, str):
-            reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
-            found = _edges_near(picture, found.corners, border, reach, settings, parts, seam)
-        if isinstance(found, str):
-            continue
-        if np.abs(found.corners - rough).max() <= _LARGEST_MOVE * capture_px:
-            return found
-        found = NO_EDGE
+    found = _refined(picture, rough, border, capture_px, settings, parts, seam=False)
+    if found == NO_EDGE and parts == 2:  # White may be a mere seam.
+        again = _refined(picture, rough, border, capture_px, settings, parts, seam=True)
+        return found if isinstance(again, str) else again
     return found
+
+
+def _refined(
+    picture: Picture,
+    rough: FloatArray,
+    border: float,
+    capture_px: float,
+    settings: MarkerSettings,
+    parts: int,
+    *,
+    seam: bool,
+) -> RefinedQuadrangle | str:
+    """The edges within `capture_px` of a rough quadrangle's, or the reason for rejection."""
+    found = _edges_near(picture, rough, border, capture_px, settings, parts, seam)
+    if not isinstance(found, str):
+        reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
+        found = _edges_near(picture, found.corners, border, reach, settings, parts, seam)
+    if isinstance(found, str) or np.abs(found.corners - rough).max() <= _LARGEST_MOVE * capture_px:
+        return found
+    return NO_EDGE
 
 
 def _edges_near(

@@ -224,8 +224,8 @@ class Import:
     # estimates; for a trajectory a path.csv; for a robot a .circles file, or the .csv of its true
     # path; for true landmarks a map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park, and learned
-    # from the run in the UTIAS data set.
+    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park. In the UTIAS
+    # data set the noise is learned from the run, unless this or that of bearings is given.
     range_sigma: float | None = None
     # Standard deviation of a data set's bearings (rad); by default 0.03, or learned.
     bearing_sigma: float | None = None

@@ -110,6 +110,19 @@ def test_the_response_of_a_robot_to_its_commands_is_found(
     assert f"# {found.sentence()}\n" in Path(target).read_text()
 
 
+def test_without_known_landmarks_depths_are_too_long_by_the_usual_factor(
+    utias: Path, tmp_path: Path
+) -> None:
+    """The scale of a map is unknown then, however long the log is."""
+    for file in utias.glob("*.dat"):
+        if "Landmark" not in file.name:
+            shutil.copy(file, tmp_path)
+    _, found, _ = read_robot(tmp_path / "Robot1_Odometry.dat")
+    assert found is not None
+    assert abs(found.depth - 1.033) < 0.005
+    assert abs(found.speed / found.depth - SPEED / DEPTH) < 0.03
+
+
 def test_a_robot_that_shows_nothing_of_its_response_has_the_usual_one(tmp_path: Path) -> None:
     for name, rows in (
         ("Robot1_Odometry", "4 0 0\n6 0 0\n"),

@@ -137,3 +137,26 @@ def test_a_run_without_a_map_has_the_usual_noise() -> None:
     assert noise == Noise()
     assert "usual" in noise.sentence()
     np.testing.assert_array_equal(found.circles.ids, shuffled.ids)
+
+
+def test_a_run_without_errors_has_the_usual_noise() -> None:
+    """Learned errors would be below the resolution of a log."""
+    run, seen, *_ = _run(np.random.default_rng(7), 0.0, 0.0, 0.0)
+    found, noise = learned(run, seen, _stated(seen))
+    assert noise == Noise()
+    assert np.isfinite(found.step_covariance).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_that_stands_still_has_finite_covariances(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    run, seen, *_ = _run(rng, 1.0, 1.0, 1.0)
+    still, count = replace(run, steps=np.zeros_like(run.steps)), len(seen.ids)
+    seen = seen._replace(
+        range_m=3.0 + STATED[0] * rng.standard_normal(count),
+        bearing_rad=0.4 * (seen.ids % 3) + STATED[1] * rng.standard_normal(count),
+        ids=6 + seen.ids % 3,
+    )
+    found, _ = learned(still, seen, _stated(seen))
+    assert np.isfinite(found.step_covariance).all()
+    assert np.isfinite(found.circles.covariance).all()

@@ -60,7 +60,9 @@ class Alignment:
     matched: IntArray  # (scanners,): number of beams that hit the map
     rms_m: FloatArray  # (scanners,): their root mean square distance from it
     covariance: FloatArray  # (3 scanners, 3 scanners): of their poses, jointly
-    map_sigma_m: float  # Standard deviation of the walls' ends from the map (m); 0 if exact
+    # Standard deviation of the walls' ends from the map (m): 0 if exact, a usual one if few walls
+    # are seen.
+    map_sigma_m: float
     undetermined: tuple[str, ...]  # Scanners whose view of the map does not determine a direction
     inconsistent: tuple[str, ...]  # Scanners whose map position contradicts the others
 

@@ -32,7 +32,14 @@ from redetect.landmarks.axes import covariance_from_dataset, to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import apply, between, chain_steps, compose, invert
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.ranges import Noise, Sightings, discs_of_ranges, learned, places_of
+from redetect.slam.formats.ranges import (
+    Noise,
+    Sightings,
+    discs_of_ranges,
+    learned,
+    places_of,
+    usual,
+)
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
 
@@ -166,7 +173,7 @@ class Response(NamedTuple):
         return (
             f"the robot is taken to move {self.lag_s:.2f} s after its commands, {self.speed:.3f} "
             f"times as fast, and to turn {self.turn:.3f} times; depths are taken to be "
-            f"{self.depth:.3f} times too long"
+            f"too long by a factor of {self.depth:.3f}"
         )
 
 
@@ -187,9 +194,9 @@ def read_robot(
     ----------
     odometry : Path
     sigma_m, sigma_rad : float, optional
-        Standard deviations of independent ranges and bearings; by default, those of calibrated ones
-        are learned, and so are covariances of steps (`redetect.slam.formats.ranges`); otherwise
-        most steps have none.
+        Standard deviations of independent ranges and bearings. By default, those of calibrated ones
+        are learned, and so are covariances of steps (`redetect.slam.formats.ranges`); if only that
+        of bearings is given, ranges have the usual errors. Otherwise most steps have none.
     calibrated : bool
         Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
         ranges are computed from the depths that the log has.
@@ -220,8 +227,8 @@ def read_robot(
     steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
     run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
-    if calibrated and sigma_m is None and sigma_rad is None:
-        run, noise = learned(run, seen, sigma)
+    if calibrated and sigma_m is None:
+        run, noise = learned(run, seen, sigma) if sigma_rad is None else usual(run, seen, sigma)
     return run, response, noise
 
 
@@ -254,6 +261,7 @@ def response_of(
     two = apart_m > 0.0
     first, second, apart_m = first[two], second[two], apart_m[two]
     spread = np.sum(sigma**2 * np.stack([np.ones(len(time)), seen.range_m**2], axis=1), axis=1)
+    spread_of_pair = np.sqrt(spread[first] + spread[second])
     direction = np.stack([np.cos(seen.bearing_rad), np.sin(seen.bearing_rad)], axis=1)
 
     def residuals(numbers: ArrayLike) -> FloatArray:
@@ -268,10 +276,11 @@ def response_of(
 
         x, y = later(before, after).T
         offset = later(first, second) - place[second]
+        # Lengths are compared in the units of the log, whose errors are known.
         changes = np.concatenate([
             wrap_angle(np.arctan2(y, x) - seen.bearing_rad[after]) / sigma[after, 1],
-            (np.hypot(x, y) - range_m[after]) / sigma[after, 0],
-            (np.hypot(*offset.T) - apart_m) / np.sqrt(spread[first] + spread[second]),
+            (np.hypot(x, y) - range_m[after]) * response.depth / sigma[after, 0],
+            (np.hypot(*offset.T) - apart_m) * response.depth / spread_of_pair,
         ])  # fmt: skip
         robust = np.copysign(np.sqrt(np.arctan(changes**2)), changes)
         return np.concatenate([robust, np.subtract(response, Response()) / _RESPONSE_SIGMA])

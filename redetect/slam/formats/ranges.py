@@ -26,7 +26,9 @@ from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, Recording
 
 # Errors of sightings of one landmark within this time may be alike, seconds.
-_ALIKE_S = 5.0
+_ALIKE_S = 2.5
+# Largest factor by which errors may differ from usual ones, and smallest.
+_MOST_FACTOR = 20.0
 # Fewest redundant numbers of a run that show its noise.
 _FEWEST_NUMBERS = 100
 # Maps in which the noise is learned: a robust one, then least squares of the rows that fit.
@@ -86,10 +88,15 @@ def discs_of_ranges(
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
+def usual(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
+    """A run with the usual noise; parameters and results as for `learned`."""
+    return _with_noise(run, seen, sigma, _number_alike(seen, _alike(seen)), Noise()), Noise()
+
+
 def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
     """A run with covariances as large as its errors, and without identifiers that are wrong.
 
-    Steps become longer and turn more or less in each metre, as fits the rows best.
+    Steps become longer or shorter, and turn more or less in each metre, as fits the rows best.
 
     Parameters
     ----------
@@ -106,23 +113,21 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
     Recording, Noise
         With the usual noise if the run shows too little of its own, or no map of it is found.
     """
-    noise, usual = Noise(), ASSUMED.covariance(run.steps)
+    noise, assumed = Noise(), ASSUMED.covariance(run.steps)
     stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]
-    further = np.where(stated, run.step_covariance - usual, 0.0)
-    # Far apart unless they show one landmark at about the same time.
-    points = np.stack([1e3 * _ALIKE_S * seen.ids, seen.times[seen.frame]], axis=1)
-    pairs = KDTree(points).query_pairs(0.5 * _ALIKE_S, output_type="ndarray")
-    together = 1 + np.bincount(pairs.ravel(), minlength=len(points))
-    run = replace(run, step_covariance=usual + further)
+    further = np.where(stated, run.step_covariance - assumed, 0.0)
+    pairs = _alike(seen)
+    together = _number_alike(seen, pairs)
+    run = replace(run, step_covariance=assumed + further)
     run = _with_noise(run, seen, sigma, together, noise)
-    usually = run, noise
+    usually, steps, longer, turn = (run, noise), run.steps, 0.0, 0.0
     if 2 * (len(seen.ids) - len(np.unique(seen.ids))) < _FEWEST_NUMBERS:
         return usually
     for number in range(_ROUNDS):
         robust = Weighting(loss="none" if number else "geman-mcclure")
         try:
             mapped = map_run(run, weighting=robust)
-        except SlamError:  # no minimum, or undetermined poses
+        except SlamError:  # no minimum, undetermined poses, or no row with an identifier
             return usually
         place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
         x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
@@ -131,27 +136,48 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
         squared = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1)
         unlike = 1.0 if number else max(1.0, float(np.nanmedian(squared)) / _MEDIAN)
         right = squared <= unlike * _WRONG
+        if not right.any():
+            return usually
         if number:
             table = mapped.table
             check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, table.expected)
+            if not (check.rows_factor > 0.0 and check.odometry_factor > 0.0):  # NaN if too few
+                return usually
             # The share of the numbers of rows that the others check.
             redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
             variance = np.mean(error[right] ** 2, axis=0) / redundant
+            of_steps = noise.steps * math.sqrt(check.odometry_factor)
+            factors = np.append(np.sqrt(variance), of_steps)
+            if not np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)):
+                return usually
             both = error[pairs[np.all(right[pairs], axis=1)]]
             product = np.sum(both[:, 0] * both[:, 1], axis=0) / max(len(both), 1)
             alike = np.clip(product / variance, 0.0, 1.0)
-            of_steps = noise.steps * math.sqrt(check.odometry_factor)
             wrong = int(np.count_nonzero(~right))
-            deviations = np.sqrt(variance).tolist()
-            noise = Noise._make([*deviations, *alike.tolist(), of_steps, wrong, True])
-            longer = check.length / (1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2)
-            turn = check.turn_per_metre / (1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2)
-            steps = run.steps * [1.0 + longer, 1.0 + longer, 1.0]
-            steps[:, 2] += turn * np.hypot(run.steps[:, 0], run.steps[:, 1])
-            run = replace(run, steps=steps, step_covariance=noise.steps**2 * usual + further)
+            noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, wrong, True])
+            longer = (1.0 + longer) * (1.0 + check.length) - 1.0
+            longer /= 1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2
+            turn += check.turn_per_metre
+            turn /= 1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2
+            corrected = steps * [1.0 + longer, 1.0 + longer, 1.0]
+            corrected[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
+            step_covariance = noise.steps**2 * assumed + further
+            run = replace(run, steps=corrected, step_covariance=step_covariance)
         trusted = seen._replace(ids=np.where(right, seen.ids, UNKNOWN_ID))
         run = _with_noise(run, trusted, sigma, together, noise)
     return run, noise
+
+
+def _alike(seen: Sightings) -> IntArray:
+    """(p, 2) pairs of sightings of one landmark at about the same time."""
+    # Sightings of different landmarks are far apart.
+    points = np.stack([1e3 * _ALIKE_S * seen.ids, seen.times[seen.frame]], axis=1)
+    return np.asarray(KDTree(points).query_pairs(_ALIKE_S, output_type="ndarray"), np.int64)
+
+
+def _number_alike(seen: Sightings, pairs: IntArray) -> IntArray:
+    """(n,) number of sightings that are alike, each one included."""
+    return 1 + np.bincount(pairs.ravel(), minlength=len(seen.ids))
 
 
 def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
@@ -163,7 +189,9 @@ def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
 def _with_noise(
     run: Recording, seen: Sightings, sigma: FloatArray, alike: IntArray, noise: Noise
 ) -> Recording:
-    """The run with rows of this noise: n that are alike together have the weight of one."""
+    """The run with rows of this noise: n with a correlation c have n / (1 + (n - 1) c) times the
+    weight of one.
+    """
     together = 1.0 + (alike[:, None] - 1.0) * [noise.ranges_alike, noise.bearings_alike]
     sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
