@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
@@ -25,8 +24,8 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, Recording
 
-# Errors of sightings of one landmark within this time may be alike, seconds.
-_ALIKE_S = 2.5
+# A landmark that is not seen for this time is out of view, seconds.
+_OUT_OF_VIEW_S = 2.5
 # Largest factor by which errors may differ from usual ones, and smallest.
 _MOST_FACTOR = 20.0
 # Fewest redundant numbers of a run that show its noise.
@@ -54,7 +53,7 @@ class Noise(NamedTuple):
 
     ranges: float = 1.0  # their standard deviation over the stated one
     bearings: float = 1.0
-    ranges_alike: float = 1.0  # correlation of errors of one landmark at about the same time
+    ranges_alike: float = 1.0  # correlation of errors while a landmark is in view
     bearings_alike: float = 0.0
     steps: float = 1.0  # their standard deviation over the stated one
     wrong: int = 0  # number of rows that contradict the others, and have lost their identifier
@@ -90,7 +89,7 @@ def discs_of_ranges(
 
 def usual(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
     """A run with the usual noise; parameters and results as for `learned`."""
-    return _with_noise(run, seen, sigma, _number_alike(seen, _alike(seen)), Noise()), Noise()
+    return _with_noise(run, seen, sigma, _visits(seen), Noise()), Noise()
 
 
 def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
@@ -116,10 +115,9 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
     noise, assumed = Noise(), ASSUMED.covariance(run.steps)
     stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]
     further = np.where(stated, run.step_covariance - assumed, 0.0)
-    pairs = _alike(seen)
-    together = _number_alike(seen, pairs)
+    visits = _visits(seen)
     run = replace(run, step_covariance=assumed + further)
-    run = _with_noise(run, seen, sigma, together, noise)
+    run = _with_noise(run, seen, sigma, visits, noise)
     usually, steps, longer, turn = (run, noise), run.steps, 0.0, 0.0
     if 2 * (len(seen.ids) - len(np.unique(seen.ids))) < _FEWEST_NUMBERS:
         return usually
@@ -150,9 +148,7 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
             factors = np.append(np.sqrt(variance), of_steps)
             if not np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)):
                 return usually
-            both = error[pairs[np.all(right[pairs], axis=1)]]
-            product = np.sum(both[:, 0] * both[:, 1], axis=0) / max(len(both), 1)
-            alike = np.clip(product / variance, 0.0, 1.0)
+            alike = np.clip(_products(error[right], visits[right]) / variance, 0.0, 1.0)
             wrong = int(np.count_nonzero(~right))
             noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, wrong, True])
             longer = (1.0 + longer) * (1.0 + check.length) - 1.0
@@ -164,20 +160,27 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
             step_covariance = noise.steps**2 * assumed + further
             run = replace(run, steps=corrected, step_covariance=step_covariance)
         trusted = seen._replace(ids=np.where(right, seen.ids, UNKNOWN_ID))
-        run = _with_noise(run, trusted, sigma, together, noise)
+        run = _with_noise(run, trusted, sigma, visits, noise)
     return run, noise
 
 
-def _alike(seen: Sightings) -> IntArray:
-    """(p, 2) pairs of sightings of one landmark at about the same time."""
-    # Sightings of different landmarks are far apart.
-    points = np.stack([1e3 * _ALIKE_S * seen.ids, seen.times[seen.frame]], axis=1)
-    return np.asarray(KDTree(points).query_pairs(_ALIKE_S, output_type="ndarray"), np.int64)
+def _visits(seen: Sightings) -> IntArray:
+    """(n,) the visit that each sighting belongs to: a landmark stays in view during it."""
+    time = seen.times[seen.frame]
+    order = np.lexsort((time, seen.ids))
+    begins = (np.diff(seen.ids[order]) != 0) | (np.diff(time[order]) > _OUT_OF_VIEW_S)
+    visits = np.empty(len(order), np.int64)
+    visits[order] = np.append(0, np.cumsum(begins))
+    return visits
 
 
-def _number_alike(seen: Sightings, pairs: IntArray) -> IntArray:
-    """(n,) number of sightings that are alike, each one included."""
-    return 1 + np.bincount(pairs.ravel(), minlength=len(seen.ids))
+def _products(error: FloatArray, visits: IntArray) -> FloatArray:
+    """(k,) mean product of two of (n, k) errors in one visit (n,)."""
+    sums, squares = np.zeros((2, visits.max() + 1, error.shape[1]))
+    np.add.at(sums, visits, error)
+    np.add.at(squares, visits, error**2)
+    count = np.bincount(visits)
+    return np.asarray(np.sum(sums**2 - squares, axis=0) / max(np.sum(count * (count - 1.0)), 1.0))
 
 
 def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
@@ -187,12 +190,13 @@ def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
 
 
 def _with_noise(
-    run: Recording, seen: Sightings, sigma: FloatArray, alike: IntArray, noise: Noise
+    run: Recording, seen: Sightings, sigma: FloatArray, visits: IntArray, noise: Noise
 ) -> Recording:
-    """The run with rows of this noise: n with a correlation c have n / (1 + (n - 1) c) times the
-    weight of one.
+    """The run with rows of this noise: the n of a visit, with a correlation c, have the weight of
+    n / (1 + (n - 1) c).
     """
-    together = 1.0 + (alike[:, None] - 1.0) * [noise.ranges_alike, noise.bearings_alike]
+    others = np.bincount(visits)[visits, None] - 1.0
+    together = 1.0 + others * [noise.ranges_alike, noise.bearings_alike]
     sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
     return replace(run, circles=CircleRows(seen.frame, *rows, seen.ids))
