@@ -67,7 +67,7 @@ def refine_quadrangle(
     steps. Returns the reason for rejection if there are no edges.
     """
     found = _refined(picture, rough, border, capture_px, settings, parts, seam=False)
-    if found == NO_EDGE and parts == 2:  # White may be a mere seam.
+    if isinstance(found, str) and parts == 2:  # White may be a mere seam.
         again = _refined(picture, rough, border, capture_px, settings, parts, seam=True)
         return found if isinstance(again, str) else again
     return found
