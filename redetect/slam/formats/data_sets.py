@@ -38,7 +38,7 @@ from redetect.slam.formats.ranges import (
     discs_of_ranges,
     learned,
     places_of,
-    usual,
+    with_usual_noise,
 )
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import rows_of_numbers
@@ -188,7 +188,7 @@ def read_robot(
     *,
     calibrated: bool = True,
 ) -> tuple[Recording, Response | None, Noise | None]:
-    """A robot's log, with landmarks as discs; its response and noise, None without calibration.
+    """A robot's log, with landmarks as discs.
 
     Parameters
     ----------
@@ -200,6 +200,14 @@ def read_robot(
     calibrated : bool
         Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
         ranges are computed from the depths that the log has.
+
+    Returns
+    -------
+    Recording
+    Response or None
+        None without calibration.
+    Noise or None
+        None if it was not learned.
 
     Raises
     ------
@@ -227,8 +235,10 @@ def read_robot(
     steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
     run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
-    if calibrated and sigma_m is None:
-        run, noise = learned(run, seen, sigma) if sigma_rad is None else usual(run, seen, sigma)
+    if calibrated and sigma_m is None and sigma_rad is None:
+        run, noise = learned(run, seen, sigma)
+    elif calibrated and sigma_m is None:
+        run = with_usual_noise(run, seen, sigma)
     return run, response, noise
 
 

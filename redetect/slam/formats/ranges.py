@@ -87,9 +87,9 @@ def discs_of_ranges(
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
-def usual(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
-    """A run with the usual noise; parameters and results as for `learned`."""
-    return _with_noise(run, seen, sigma, _visits(seen), Noise()), Noise()
+def with_usual_noise(run: Recording, seen: Sightings, sigma: FloatArray) -> Recording:
+    """A run with rows of the usual noise; parameters as for `learned`."""
+    return _with_noise(run, seen, sigma, _visits(seen), Noise())
 
 
 def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
