@@ -27,7 +27,7 @@ from detect.circles import (
     within_margins,
 )
 from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, Fate, JudgedCandidates
-from detect.discs.radius import FACTOR, find_radius
+from detect.discs.radius import find_radius
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
@@ -42,6 +42,7 @@ Stage = Literal[
 _STAGES: dict[Fate, Stage] = {Fate.FEW_STEPS: "steps", Fate.GLANCE: "glance", Fate.NO_RIM: "rim"}
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
+_FACTOR = 1.1  #: From one of these to the next.
 _NEAR = 1.5  #: Largest distance of a candidate from the given position, radii.
 #: Relative deviation of the rims' median radius from the expected one that causes a suggestion.
 _OTHER_RADIUS = 0.04
@@ -296,7 +297,7 @@ def _suggestions(scene: _Examined, at: tuple[float, float] | None) -> Iterator[s
         estimate = find_radius([scene.image], scene.camera, replace(settings, polarity="any"))
         if estimate is not None:
             radius_m, gain = estimate.radius_m, counted(estimate.discs, "disc")
-    if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(FACTOR):
+    if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(_FACTOR):
         yield f"--radius-m {radius_m:.3f} finds {gain}."
     rims = scene.judgement[1]
     discs = (rims.fate == Fate.JUDGED) & (rims.log_odds > settings.evidence)
@@ -320,9 +321,9 @@ def _radius_at(scene: _Examined, at: tuple[float, float]) -> float | None:
     here = camera.floor_from_pixel(at)
     if not np.isfinite(here).all():
         return None
-    count = round(math.log(_OTHER_RADII) / math.log(FACTOR))
+    count = round(math.log(_OTHER_RADII) / math.log(_FACTOR))
     best, of_best = -math.inf, None
-    for radius_m in (settings.radius_m * FACTOR ** np.arange(-count, count + 1)).tolist():
+    for radius_m in (settings.radius_m * _FACTOR ** np.arange(-count, count + 1)).tolist():
         tried = replace(settings, radius_m=radius_m, polarity="any")
         table = build_vote_table(camera, vote_shape(tried))
         found = detect_circles(scene.image, camera, table, tried)

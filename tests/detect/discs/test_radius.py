@@ -14,7 +14,7 @@ import pytest
 
 from camera import Camera, read_camera, write_camera
 from detect.cli import main, parsed
-from detect.discs.radius import FACTOR, SMALLEST_M, find_radius
+from detect.discs.radius import find_radius
 from detect.options import All, Circles
 from detect.projection import leaning_camera
 from detect.settings import CircleSettings
@@ -33,16 +33,6 @@ def image(camera: Camera, radius_m: float, seed: int) -> np.ndarray:
     for place in PLACES:
         floor.disc(place, radius_m=radius_m)
     return floor.image(seed=seed)
-
-
-class Discs:
-    """Discs of which only the evidence matters."""
-
-    def __init__(self, evidence: list[float]) -> None:
-        self.evidence = np.array(evidence)
-
-    def __len__(self) -> int:
-        return len(self.evidence)
 
 
 @pytest.fixture(autouse=True)
@@ -64,23 +54,27 @@ def test_an_empty_floor_has_no_radius(published_camera: Camera) -> None:
     assert find_radius([bare], published_camera, CircleSettings()) is None
 
 
-@pytest.mark.parametrize("beside", [1.9, 2.0, 5.0])
-def test_a_radius_with_few_discs_beside_the_best(
-    published_camera: Camera, monkeypatch: pytest.MonkeyPatch, beside: float
-) -> None:
-    """Too few discs to count have as much evidence as those of the best radius."""
-    best_m = SMALLEST_M * FACTOR**10
+def test_no_images_have_no_radius(published_camera: Camera) -> None:
+    assert find_radius([], published_camera, CircleSettings()) is None
 
-    def found(image: object, camera: object, table: object, settings: CircleSettings) -> Discs:
-        steps = round(math.log(settings.radius_m / best_m) / math.log(FACTOR))
-        return Discs({0: [0.4, 0.3, 0.3], 1: [beside / 2.0] * 2}.get(steps, []))
 
-    monkeypatch.setattr("detect.discs.radius.detect_circles", found)
-    monkeypatch.setattr("detect.discs.radius.ratio_of_radii", lambda *_: None)
-    blank = np.zeros((4, 4), np.uint8)
-    estimate = find_radius([blank], published_camera, CircleSettings())
-    assert estimate is not None
-    assert estimate.radius_m == pytest.approx(best_m)
+@pytest.mark.parametrize("radius_m", [0.06, 0.1])
+def test_grains_of_the_floor_are_no_discs(published_camera: Camera, radius_m: float) -> None:
+    """There are more grains of any size than discs, and the more the smaller they are."""
+    rng = np.random.default_rng(0)
+    floor = PaintedFloor(published_camera)
+    for place in PLACES:
+        floor.disc(place, radius_m=radius_m)
+    places, sizes = rng.uniform((-1.5, -3.0), (1.5, -0.9), (400, 2)), rng.random(400)
+    for place, share in zip(places, sizes, strict=True):
+        grain_m = 0.01 * (1.0 - 0.95 * share) ** (-1.0 / 2.5)
+        if np.hypot(*(np.array(PLACES) - place).T).min() > radius_m + grain_m + 0.02:
+            floor.disc(place, rng.choice([50.0, 150.0, 190.0]), grain_m)
+
+    found = find_radius([floor.image(seed=0)], published_camera, CircleSettings())
+
+    assert found is not None
+    assert found.radius_m == pytest.approx(radius_m, rel=0.03)
 
 
 @pytest.mark.parametrize(
