@@ -109,6 +109,15 @@ def test_rows_of_a_moving_thing_are_no_landmark() -> None:
     assert {group.kind for group in audit.groups} == {"drop"}
 
 
+def test_a_lost_step_is_not_expected_to_have_an_error() -> None:
+    run = discs_only(1).recording
+    spread = run.step_covariance.copy()
+    spread[100] = np.diag([1e6, 1e6, 100.0])
+    audit = audit_run(replace(run, step_covariance=spread))
+    assert audit.before.expected == audit.dropped.expected == audit.mended.expected
+    assert audit.before.expected == audit_run(run).before.expected - 3
+
+
 @pytest.fixture(scope="module")
 def spoilt_demo(tmp_path_factory: pytest.TempPathFactory, project_root: Path) -> Path:
     """The demo run, an identifier exchanged in five of its frames, with odd blanks and comments."""

@@ -97,7 +97,7 @@ def audit_run(
     before = map_run(recording, camera, plain, name=name).table
     robust = map_run(recording, camera, loss, name=name)
     ids = recording.circles.ids.copy()
-    known = np.flatnonzero(ids >= 0)
+    known = np.flatnonzero(recording.circles.identified)
     squared = np.sum(errors(robust.graph, robust.estimate, plain).discs ** 2, axis=1)
     suspects = known[squared > _SUSPECT_SHARE * gate]
     if len(suspects) == len(known):
@@ -142,7 +142,8 @@ def _fit(
     first = replace(start, disc_xy=np.array([np.median(part, axis=0) for part in parts]))
     estimate = solve(graph, first, weighting, tolerance=1e-7).at
     information = factor(equations_at(graph, estimate, weighting).matrix)
-    return _Fit(graph, estimate, weighting, information, chi_squared(graph, estimate, weighting))
+    table = chi_squared(graph, estimate, weighting, len(recording.lost))
+    return _Fit(graph, estimate, weighting, information, table)
 
 
 def _misfit(
