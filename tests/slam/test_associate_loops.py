@@ -105,12 +105,12 @@ def test_random_constellations_do_not_match_and_one_place_seen_twice_does() -> N
     stretches = [
         _stretch(100 * k, range(20 * k, 20 * k + 20), rng.uniform(0, 5, (20, 2))) for k in range(30)
     ]
-    assert find_matches(stretches, Search(earlier_step=1)) == []
+    assert find_matches(stretches, Search()) == []
     place = stretches[4].xy[:14]
     again = np.concatenate([place + rng.normal(0, 0.02, place.shape), rng.uniform(0, 5, (6, 2))])
     again = again @ rotation(0.3).T + [1.0, 2.0]
     stretches.append(_stretch(3000, range(600, 620), again))
-    (match,) = find_matches(stretches, Search(earlier_step=1))
+    (match,) = find_matches(stretches, Search())
     assert (match.earlier_frame, match.later_frame) == (400, 3000)
     right = [(80 + k, 600 + k) for k in range(14)]
     assert set(map(tuple, match.pairs.tolist())) >= set(right[2:4])
@@ -212,18 +212,18 @@ def test_labels_at_one_spot_are_paired_only_in_stretches_known_to_be_one_place()
     xy = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     spread = np.tile(0.01**2 * np.eye(2), (10, 1, 1))
     known = [Stretch(0, np.array([0, 1, 2, 3]), xy), Stretch(90, np.array([0, 1, 2, 9]), xy + 0.01)]
-    assert pairs_by_position(known, spread, 0.999) == [(3, 9)]
-    assert pairs_by_position(known, 0.01 * spread, 0.999) == []
+    assert pairs_by_position(known, spread) == [(3, 9)]
+    assert pairs_by_position(known, 0.01 * spread) == []
     strangers = [known[0], Stretch(90, np.array([6, 7, 2, 9]), xy)]
-    assert pairs_by_position(strangers, spread, 0.999) == []
-    assert pairs_by_position(known[:0], spread, 0.999) == []
+    assert pairs_by_position(strangers, spread) == []
+    assert pairs_by_position(known[:0], spread) == []
 
 
 def test_labels_of_one_stretch_are_paired_by_their_covariances() -> None:
     """The nearest need not be the likeliest: positions are uncertain along the line of sight."""
     xy = np.array([[0.0, 0.0], [0.0, 0.2], [0.1, 0.0]])
     spread = np.tile(np.diag([0.01**2, 0.1**2]), (3, 1, 1))
-    assert pairs_by_position([Stretch(0, np.arange(3), xy)], spread, 0.999) == [(0, 1)]
+    assert pairs_by_position([Stretch(0, np.arange(3), xy)], spread) == [(0, 1)]
 
 
 def test_mutual_pairs_are_each_others_nearest() -> None:
@@ -287,13 +287,11 @@ def test_least_squares_finds_the_truth_from_a_wrong_start() -> None:
     upright = np.array([ids[0] for ids in recording.lines.ids])
     start = path + np.random.default_rng(6).normal(0.0, 0.03, path.shape)
     start[0] = path[0]
-    found = solve_path(
-        recording, label, upright, start, lines + 0.05, camera_xy=(0.02, -0.08), tolerance=1e-12
-    )
+    found = solve_path(recording, label, upright, start, lines + 0.05, camera_xy=(0.02, -0.08))
     # The lines' start pulls a little: by 0.05 m with 3 m of standard deviation.
     assert found.path == pytest.approx(path, abs=2e-3)
     assert found.circle_xy == pytest.approx(places, abs=2e-3)
-    alone = solve_path(recording, label, upright, start, tolerance=1e-12)
+    alone = solve_path(recording, label, upright, start)
     assert alone.path == pytest.approx(path, abs=1e-5)
     assert np.all(np.isnan(alone.line_xy))
 

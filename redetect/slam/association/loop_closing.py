@@ -34,8 +34,8 @@ from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.solve import solve
 from redetect.slam.recording import Recording
 
-# Lines with a less certain position have none.
-_LEAST_SIGMA_M = 0.5
+#: Share of the labels of one landmark that are compatible by position.
+SAME_PLACE = 0.999
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
@@ -45,6 +45,8 @@ _MOST_SQUARED = float(chdtri(3, 1e-6))
 _SYSTEMATIC_SIGMAS = 2.0
 # Weight of a lost step: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
+# Tolerance of least squares.
+_TOLERANCE = 1e-4
 # Labels farther apart than this are not compared.
 _FARTHEST_M = 0.35
 
@@ -66,9 +68,7 @@ def intersect_bearings(
     """
     lines, count = recording.lines, int(labels.max(initial=-1)) + 1
     poses = path[lines.frame + 1]
-    met = triangulate(
-        poses, lines.bearing_rad, lines.sigma_rad, labels, count, camera_xy, _LEAST_SIGMA_M**-2
-    )
+    met = triangulate(poses, lines.bearing_rad, lines.sigma_rad, labels, count, camera_xy)
     behind = np.bincount(labels, met.ahead_m < 0.0, minlength=count) > 0
     return np.where(behind[:, None], np.nan, met.xy)
 
@@ -82,7 +82,6 @@ def solve_path(
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
     sigma_scale: float = 1.0,
-    tolerance: float = 1e-4,
 ) -> LabelledMap:
     """Least squares over all poses and landmarks, from a path (by default odometry) on.
 
@@ -107,7 +106,7 @@ def solve_path(
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
     start = Estimate(poses, disc_xy, places[known])
-    minimum = solve(graph, start, Weighting(loss="huber"), tolerance=tolerance)
+    minimum = solve(graph, start, Weighting(loss="huber"), tolerance=_TOLERANCE)
     found = minimum.at
     places[known] = found.line_xy
     return LabelledMap(found.poses, found.disc_xy, places, minimum.costs[-1])
@@ -151,7 +150,7 @@ def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
 
 
 def pairs_by_position(
-    stretches: Sequence[Stretch], covariance: FloatArray, gate_probability: float
+    stretches: Sequence[Stretch], covariance: FloatArray
 ) -> list[tuple[int, int]]:
     """Pairs of labels at the same position, with some `covariance` (M, 2, 2), in stretches known to
     be the same place.
@@ -168,7 +167,7 @@ def pairs_by_position(
     linked = csr_array(shared_landmarks(stretches) >= SHARED_BY_ONE_PLACE)
     one_place = np.asarray((linked @ seen[:, first]).multiply(seen[:, second]).sum(axis=0)) > 0
     squared = squared_mahalanobis(xy[first] - xy[second], covariance[first] + covariance[second])
-    usable = np.flatnonzero(one_place & (squared <= chdtri(2, 1.0 - gate_probability)))
+    usable = np.flatnonzero(one_place & (squared <= chdtri(2, 1.0 - SAME_PLACE)))
     ordered = usable[np.lexsort((second[usable], first[usable], squared[usable]))]
     return [(int(first[k]), int(second[k])) for k in ordered]
 

@@ -17,14 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.plane import apply, fitted, rotation
 
-# Width of the cells in which the nearest landmark is looked up.
-_CELL_M = 0.05
 # Landmarks are in order of first sight, so neighbours in this order are near each other.
 _NEIGHBOURS = 5
 # Largest difference of the lengths of two pairs of landmarks that vote, and least length (m).
@@ -33,14 +32,14 @@ _LENGTH_TOLERANCE_M, _LEAST_LENGTH_M = 0.08, 0.8
 _OTHER_SHIFT_M, _OTHER_TURN_RAD = 0.5, 0.3
 #: Largest distance of landmarks that agree (m).
 REACH_M = 0.12
-# Landmarks within this distance of the middle of a cell may be within reach of a point in it.
-_MARGIN_M = REACH_M + _CELL_M
 # A constellation covers the area within this distance of its landmarks.
 _COVER_M = 0.6
 # Spacing at which the area is measured.
 _GRID_M = 0.15
 #: Least number of frames whose landmarks form a constellation, and constellations in their length.
 STRETCH_FRAMES, _OVERLAPPING = 50, 5
+# A stretch that shares landmarks with one this many lengths earlier is part of the map already.
+_LONG_AGO = 4
 #: Most landmarks of a constellation that is compared with others, at the cost of their number to
 #: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
 MOST_COMPARED = 80
@@ -55,49 +54,47 @@ class Search(NamedTuple):
     most_shift_m: float = 8.0
     least_agreeing: int = 7  # of landmarks, whatever the number of false alarms
     false_alarms: float = 1e-3  # largest expected number of them in the whole search
-    # Stretches overlap: only every `later_step`-th is matched to earlier ones, and only to every
-    # `earlier_step`-th of these.
-    later_step: int = 1
-    earlier_step: int = 2
-    # A stretch that shares landmarks with one at least this many frames earlier is part of the map
-    # already and not matched again; 0 to match all.
-    attached_frames: int = 0
-    stretch_frames: int = STRETCH_FRAMES  # Length of the stretches.
+    stretch_frames: int = STRETCH_FRAMES  # length of the stretches
+    # Whether most of the map is in its place already: then only every second stretch is matched,
+    # unless it shares landmarks with one long before it.
+    mostly_closed: bool = False
 
 
-class _Alike(NamedTuple):
-    """Landmarks in the order of x; pairs of others', with those of these of the same length."""
+class _EqualPairs(NamedTuple):
+    """Landmarks in the order of x, and their pairs that are as long as pairs of others."""
 
     fixed: FloatArray  # (m, 2)
-    low: FloatArray  # (2,): the low corner of the area within reach of them (m)
-    bins: IntArray  # (b + 1,): where each bin of x, as wide as the margin, begins
-    first: IntArray  # (k,): a pair's landmarks
+    bins: IntArray  # (b,): where each bin of x begins, of the width of the reach
+    first: IntArray  # (k,): landmarks of each pair of the others
     second: IntArray
-    starts: IntArray  # (k,): where the others of its length begin and end in:
+    starts: IntArray  # (k,): where the pairs of its length begin and end in:
     ends: IntArray
-    pairs: IntArray  # (m^2,): m times the first landmark of each other pair, plus the second
+    pairs: IntArray  # (p, 2)
 
 
-def _alike(moved: FloatArray, unsorted: FloatArray) -> _Alike:
-    """Landmarks (n, 2) and (m, 2) compared."""
+def _pairs_of_equal_length(moved: FloatArray, unsorted: FloatArray) -> _EqualPairs:
+    """Pairs of landmarks (m, 2), `unsorted`, that are as long as pairs of others (n, 2)."""
     fixed = unsorted[np.argsort(unsorted[:, 0], kind="stable")]
-    low = fixed.min(axis=0) - _MARGIN_M
     first, second = np.triu_indices(len(moved), 1)
     length = np.hypot(*(moved[second] - moved[first]).T)
     used = (second - first <= _NEIGHBOURS) & (length >= _LEAST_LENGTH_M)
-    squared = (fixed[:, 0] - fixed[:, :1]) ** 2 + (fixed[:, 1] - fixed[:, 1:]) ** 2
-    pairs = np.argsort(squared, axis=None, kind="stable")
-    limits = (length[used] + [[-_LENGTH_TOLERANCE_M], [_LENGTH_TOLERANCE_M]]) ** 2
-    starts, ends = np.searchsorted(squared.ravel()[pairs], limits)
-    bins = np.searchsorted(fixed[:, 0], np.arange(low[0], fixed[-1, 0] + 0.5, _MARGIN_M))
-    return _Alike(fixed, low, bins, first[used], second[used], starts, ends, pairs)
+    first, second, length = first[used], second[used], length[used]
+    tree, longest = KDTree(fixed), length.max(initial=0.0) + _LENGTH_TOLERANCE_M
+    near = tree.sparse_distance_matrix(tree, longest, output_type="ndarray")
+    near = near[np.lexsort((near["j"], near["i"], near["v"]))]
+    limits = np.add(length, [[-_LENGTH_TOLERANCE_M], [_LENGTH_TOLERANCE_M]])
+    starts, ends = np.searchsorted(near["v"], limits)
+    edges = np.arange(fixed[0, 0] - REACH_M, fixed[-1, 0] + 4.0 * REACH_M, REACH_M)
+    bins = np.searchsorted(fixed[:, 0], edges)
+    pairs = np.stack([near["i"], near["j"]], axis=1)
+    return _EqualPairs(fixed, bins, first, second, starts, ends, pairs)
 
 
 @kernel()
 def _agreement(
     moved: FloatArray,
     motion: tuple[float, float, float, float],
-    alike: _Alike,
+    equal: _EqualPairs,
     enough: int,
 ) -> tuple[int, float]:
     """Number of landmarks that a motion puts on others, and their squared distances' sum (m^2).
@@ -106,38 +103,30 @@ def _agreement(
     `enough`.
     """
     cos, sin, shift_x, shift_y = motion
-    fixed, bins = alike.fixed, alike.bins
-    low_x, low_y = alike.low
+    fixed, bins = equal.fixed, equal.bins
+    low = fixed[0, 0] - REACH_M
     count, squared, n = 0, 0.0, len(moved)
     for i in range(n):
         if count + n - i < enough:
             break
         x, y = moved[i, 0], moved[i, 1]
         at_x, at_y = shift_x + cos * x - sin * y, shift_y + sin * x + cos * y
-        # The landmark nearest to the middle of a cell.
-        middle_x = low_x + (int((at_x - low_x) / _CELL_M) + 0.5) * _CELL_M
-        middle_y = low_y + (int((at_y - low_y) / _CELL_M) + 0.5) * _CELL_M
-        k = int((middle_x - low_x) / _MARGIN_M)
-        if at_x < low_x or at_y < low_y or k + 1 >= len(bins):
+        k = int((at_x - low) / REACH_M)
+        if at_x < low or k + 2 >= len(bins):
             continue
-        nearest, least = -1, _MARGIN_M * _MARGIN_M
-        for j in range(bins[max(k - 1, 0)], bins[min(k + 2, len(bins) - 1)]):
-            off_x, off_y = middle_x - fixed[j, 0], middle_y - fixed[j, 1]
-            distance = off_x * off_x + off_y * off_y
-            if distance < least:
-                nearest, least = j, distance
-        if nearest >= 0:
-            off_x, off_y = fixed[nearest, 0] - at_x, fixed[nearest, 1] - at_y
-            distance = off_x * off_x + off_y * off_y
-            if distance <= REACH_M * REACH_M:
-                count += 1
-                squared += distance
+        nearest = np.inf
+        for j in range(bins[max(k - 1, 0)], bins[k + 2]):
+            off_x, off_y = fixed[j, 0] - at_x, fixed[j, 1] - at_y
+            nearest = min(nearest, off_x * off_x + off_y * off_y)
+        if nearest <= REACH_M * REACH_M:
+            count += 1
+            squared += nearest
     return count, squared
 
 
 @kernel()
 def _best_motion(
-    moved: FloatArray, alike: _Alike, search: Search, besides: FloatArray
+    moved: FloatArray, equal: _EqualPairs, search: Search, besides: FloatArray
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
@@ -148,12 +137,12 @@ def _best_motion(
     """
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
-    fixed = alike.fixed
-    for k in range(len(alike.first)):
-        a, b = alike.first[k], alike.second[k]
+    fixed = equal.fixed
+    for k in range(len(equal.first)):
+        a, b = equal.first[k], equal.second[k]
         ab_x, ab_y = moved[b, 0] - moved[a, 0], moved[b, 1] - moved[a, 1]
-        for place in range(alike.starts[k], alike.ends[k]):
-            c, d = alike.pairs[place] // len(fixed), alike.pairs[place] % len(fixed)
+        for place in range(equal.starts[k], equal.ends[k]):
+            c, d = equal.pairs[place]
             cd_x, cd_y = fixed[d, 0] - fixed[c, 0], fixed[d, 1] - fixed[c, 1]
             turn = math.atan2(ab_x * cd_y - ab_y * cd_x, ab_x * cd_x + ab_y * cd_y)
             if abs(turn) > search.most_turn_rad:
@@ -172,7 +161,7 @@ def _best_motion(
                 continue
             tried += 1
             motion = (cos, sin, shift_x, shift_y)
-            count, squared = _agreement(moved, motion, alike, best_count)
+            count, squared = _agreement(moved, motion, equal, best_count)
             if count > best_count or (count == best_count and squared < best_squared):
                 best_turn, best_x, best_y = turn, shift_x, shift_y
                 best_count, best_squared = count, squared
@@ -213,17 +202,17 @@ def stretches_of(
     count: int,
     *,
     length: int = STRETCH_FRAMES,
-    stride: int | None = None,
+    overlapping: bool = True,
     least: int = Search().least_agreeing,
     most: int | None = None,
 ) -> list[Stretch]:
     """The constellations with enough landmarks along a run of `count` frames.
 
-    They consist of `length` frames, and begin every `stride` frames, by default a fifth of it. Of
-    more landmarks than `most`, those with most rows count. `frames, labels` (n,), `xy` (M, 2).
+    They consist of `length` frames; if overlapping, one begins each fifth of it. Of more landmarks
+    than `most`, those with most rows count. `frames, labels` (n,), `xy` (M, 2).
     """
-    found = []
-    for start in range(0, max(count - length // 2, 1), stride or length // _OVERLAPPING):
+    found, stride = [], length // _OVERLAPPING if overlapping else length
+    for start in range(0, max(count - length // 2, 1), stride):
         first, last = np.searchsorted(frames, [start, start + length])
         seen, rows = np.unique(labels[first:last], return_counts=True)
         known = np.isfinite(xy[seen, 0])
@@ -257,16 +246,18 @@ def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
     centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
     extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in stretches])
     together = shared_landmarks(stretches)
-    for k in range(0, len(stretches), search.later_step):
+    later_step, earlier_step = (2, 3) if search.mostly_closed else (1, 2)
+    for k in range(0, len(stretches), later_step):
         later = stretches[k]
         shared = together[[k], :k].toarray()[0]
         gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
         apart = (gap >= search.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
-        if search.attached_frames and np.any(~apart & (gap >= search.attached_frames)):
+        long_ago = gap >= _LONG_AGO * search.stretch_frames
+        if search.mostly_closed and np.any(~apart & long_ago):
             continue
         reach = search.most_shift_m + extents[:k] + extents[k]
         near = np.linalg.norm(centres[:k] - centres[k], axis=1) < reach
-        near[np.arange(k) % search.earlier_step != 0] = False
+        near[np.arange(k) % earlier_step != 0] = False
         for i in np.flatnonzero(near & apart):
             fixed, moved = stretches[i].without(later), later.without(stretches[i])
             if min(len(fixed.labels), len(moved.labels)) >= search.least_agreeing:
@@ -301,8 +292,8 @@ def motion_onto(
     if besides is not None:
         known = np.array([besides[2], *(apply(besides, centre) - centre)])
     moved = moved - centre
-    alike = _alike(moved, fixed - centre)
-    turn, x, y, agreeing, tried = _best_motion(moved, alike, search, known)
+    equal = _pairs_of_equal_length(moved, fixed - centre)
+    turn, x, y, agreeing, tried = _best_motion(moved, equal, search, known)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
 
@@ -369,7 +360,7 @@ def _refined(
     if found is None:
         return None
     pose, pairs = found
-    nearest = np.linalg.norm(apply(pose, later.xy)[:, None] - earlier.xy, axis=2).min(axis=1)
+    nearest, _ = KDTree(earlier.xy).query(apply(pose, later.xy))
     present = max(int(np.sum(nearest <= _COVER_M)), len(pairs))
     return Match(
         earlier.middle_frame,

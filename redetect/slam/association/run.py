@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,7 @@ from redetect.slam.association import loops
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
+    SAME_PLACE,
     closed_path,
     consistent_matches,
     in_order,
@@ -48,8 +49,6 @@ from redetect.slam.settings import AssociateSettings
 
 Progress = Callable[[str], None]
 
-# Share of the labels of one landmark that are compatible by position.
-_SAME_PLACE = 0.999
 # Edges of one door frame may be 0.1 m apart.
 _LINE_REACH_M = 0.05
 # Covariance of a step that leads nowhere (m^2, rad^2).
@@ -67,8 +66,6 @@ _MOST_PARTS = 16
 _LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
-# Least gap between frames, longer than a landmark stays visible or is waited for locally.
-_EVERYWHERE = loops.Search(math.pi, math.inf, later_step=2, earlier_step=3, attached_frames=200)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +102,12 @@ def associate_run(
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
     local = _associated_locally(recording, settings, camera_xy, report)
+    swayed = _with_sway(recording, settings)
     circle_labels, line_labels = local
     matches: tuple[loops.Match, ...] = ()
     path = None
     if settings.map_level and len(recording.circles):
-        run = _Run(_without_lines(recording), settings, camera_xy, report)
+        run = _Run(_without_lines(swayed), settings, camera_xy, report)
         closed = _closed_by_parts(run, circle_labels)
         labels, path, matches = closed.at.labels, closed.at.path, closed.matches
         circle_labels = without_clutter(recording, labels, path, settings)
@@ -121,7 +119,7 @@ def associate_run(
             )
             line_labels = _merged_lines(recording, path_of_both, line_labels, settings, camera_xy)
     elif settings.map_level:
-        run = _Run(recording, settings, camera_xy, report)
+        run = _Run(swayed, settings, camera_xy, report)
         closed = _closed_by_parts(run, line_labels)
         line_labels, path, matches = closed.at.labels, closed.at.path, closed.matches
     circle_labels, line_labels = in_order(circle_labels), in_order(line_labels)
@@ -167,7 +165,7 @@ class _Closed(NamedTuple):
 class _Run(NamedTuple):
     """A run to be associated by its discs, whose rows give positions, or else by its lines."""
 
-    recording: Recording
+    recording: Recording  # with the robot's sway
     settings: AssociateSettings
     camera_xy: ArrayLike
     report: Progress
@@ -184,7 +182,7 @@ class _Run(NamedTuple):
     def merged(self, labels: IntArray, pairs: Sequence[tuple[int, int]]) -> tuple[IntArray, int]:
         return merge_labels(self.frames, labels, pairs, _MOST_TOGETHER if self.by_discs else 0.0)
 
-    def stretches(self, at: _Solved, length: int, **limits: int) -> list[loops.Stretch]:
+    def stretches(self, at: _Solved, length: int, **limits: Any) -> list[loops.Stretch]:
         """Stretches of the run; `limits` as in `redetect.slam.association.loops.stretches_of`."""
         count = len(self.recording)
         return loops.stretches_of(self.frames, at.labels, at.xy, count, length=length, **limits)
@@ -194,10 +192,10 @@ class _Run(NamedTuple):
         if not self.by_discs:
             start = chain_steps(recording.steps) if path is None else path
             line_xy = intersect_bearings(recording, start, labels, camera_xy=self.camera_xy)
-        swayed, scale = _with_sway(recording, self.settings), self.settings.sigma_scale
         discs, lines = (labels, none) if self.by_discs else (none, labels)
+        scale, camera_xy = self.settings.sigma_scale, self.camera_xy
         found = solve_path(
-            swayed, discs, lines, path, line_xy, camera_xy=self.camera_xy, sigma_scale=scale
+            recording, discs, lines, path, line_xy, camera_xy=camera_xy, sigma_scale=scale
         )
         xy = found.circle_xy if self.by_discs else found.line_xy
         return _Solved(labels, found.path, xy, found.cost)
@@ -221,7 +219,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
         length, least = closed.stretch_frames, ANYWHERE.least_agreeing
-        stretches.append(own.stretches(closed.at, length, stride=length, least=least))
+        stretches.append(own.stretches(closed.at, length, overlapping=False, least=least))
     if len(parts) == 1:
         return parts[0]
     run.report("registering the parts")
@@ -242,38 +240,32 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
 
 def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Closed:
     """Close all loops, starting from a path (by default odometry)."""
-    recording, search = run.recording, loops.Search()
-    if path is not None:  # most of it is in its place already
-        search = _EVERYWHERE._replace(
-            most_turn_rad=search.most_turn_rad, most_shift_m=search.most_shift_m
-        )
+    # With a path, most of the map is in its place already.
+    search = loops.Search(mostly_closed=path is not None)
     at = run.solved(labels, path)
     matches: list[loops.Match] = []
-    length = search.stretch_frames
     while True:
+        length = search.stretch_frames
         for number in range(1, _MOST_ROUNDS + 1):
             run.report(f"loops, stretches of {length} frames, round {number}")
             before = len(at.xy)
             found = loops.find_matches(run.stretches(at, length, most=loops.MOST_COMPARED), search)
-            found = consistent_matches(found, matches, at.path, recording.step_covariance)
+            found = consistent_matches(found, matches, at.path, run.recording.step_covariance)
             at, found = _with_matches(run, at, found)
             spread = _isotropic(len(at.xy), loops.REACH_M)
             if run.by_discs:
-                swayed = _with_sway(recording, run.settings)
-                spread = _spread(swayed, at.path, at.labels, run.settings.sigma_scale)
-            pairs = pairs_by_position(run.stretches(at, length), spread, _SAME_PLACE)
+                spread = _spread(run.recording, at.path, at.labels, run.settings.sigma_scale)
+            pairs = pairs_by_position(run.stretches(at, length), spread)
             labels, by_position = run.merged(at.labels, pairs)
             if by_position:
                 at = run.solved(labels, at.path)
             matches += found
             if len(at.xy) == before and search.most_shift_m == math.inf:
                 break
-            attached = _EVERYWHERE.attached_frames * length // loops.STRETCH_FRAMES
-            search = _EVERYWHERE._replace(stretch_frames=length, attached_frames=attached)
+            search = loops.Search(math.inf, math.inf, stretch_frames=length, mostly_closed=True)
         if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
             return _Closed(at, tuple(matches), length)
-        length = min(2 * length, _LONGEST)
-        search = loops.Search(stretch_frames=length)
+        search = loops.Search(stretch_frames=min(2 * length, _LONGEST))
 
 
 def _sparse(run: _Run, at: _Solved, length: int) -> bool:
@@ -281,7 +273,7 @@ def _sparse(run: _Run, at: _Solved, length: int) -> bool:
     often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
     frames, labels, count = run.frames[often], at.labels[often], len(run.recording)
     stretches = loops.stretches_of(
-        frames, labels, at.xy, count, length=length, stride=length, least=0
+        frames, labels, at.xy, count, length=length, overlapping=False, least=0
     )
     return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
 
@@ -356,7 +348,7 @@ def without_clutter(
             rows = replace(swayed, circles=swayed.circles.only(kept))
             stretches = loops.stretches_of(frames[kept], numbers, places[known], len(recording))
             spread = _spread(rows, path, numbers, settings.sigma_scale)
-            pairs = pairs_by_position(stretches, spread, _SAME_PLACE)
+            pairs = pairs_by_position(stretches, spread)
             merged, _ = merge_labels(frames[kept], numbers, pairs)
             of_merged = known[numbers[np.unique(merged, return_index=True)[1]]]
             renamed = np.arange(len(places))
@@ -393,7 +385,7 @@ def _spread(
 
 def _isotropic(count: int, reach_m: float) -> FloatArray:
     """(count, 2, 2) covariances with which positions are compatible up to a distance."""
-    return np.tile(0.5 * reach_m**2 / chdtri(2, 1.0 - _SAME_PLACE) * np.eye(2), (count, 1, 1))
+    return np.tile(0.5 * reach_m**2 / chdtri(2, 1.0 - SAME_PLACE) * np.eye(2), (count, 1, 1))
 
 
 def _merged_lines(
@@ -409,7 +401,7 @@ def _merged_lines(
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
         stretches = loops.stretches_of(recording.lines.frame, labels, xy, len(recording))
-        pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M), _SAME_PLACE)
+        pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M))
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:
             break

@@ -89,7 +89,7 @@ class Estimate:
 def graph_of_recording(recording: Recording, camera: Camera | None = None) -> Graph:
     """The problem of odometry and identified discs; `with_lines` adds lines."""
     circles = recording.circles
-    known = circles.ids >= 0
+    known = circles.identified
     ids, index = np.unique(circles.ids[known], return_inverse=True)
     none = np.zeros(0, dtype=np.int64)
     return Graph(
@@ -175,7 +175,7 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
         use = some & np.isnan(xy[label, 0])
         own = rows.only(seen[use])
         views = (poses[pose[use]], own.bearing_rad, own.sigma_rad, label[use], len(every))
-        met = triangulate(*views, camera_xy, MOST_SIGMA_M**-2)
+        met = triangulate(*views, camera_xy)
         agrees = (met.ahead_m > 0.0) & (met.miss_sigmas <= MOST_MISS)
         count, right = (np.bincount(label[use], w, len(every)) for w in (None, agrees))
         xy = np.where((right > 0.5 * count)[:, None], met.xy, xy)
@@ -214,12 +214,11 @@ def triangulate(
     labels: IntArray,
     count: int,
     camera_xy: ArrayLike,
-    least_information: float,
 ) -> Triangulation:
     """Triangulate `count` lines: the points nearest to the rays of each, by angular distance.
 
     Takes `poses` (n, 3), `bearing_rad, sigma_rad, labels` (n,), `camera_xy` (2,). A point is
-    determined if its information (m^-2) is more than the least in every direction.
+    determined if its standard deviation is below `MOST_SIGMA_M` in every direction.
     """
     centre = apply(poses, np.broadcast_to(np.asarray(camera_xy), (len(poses), 2)))
     # A bearing b in the robot frame is the direction (sin b, -cos b).
@@ -234,7 +233,7 @@ def triangulate(
         np.add.at(information, labels, weight[:, None, None] * normal[:, :, None] * normal[:, None])
         vector = np.zeros((count, 2))
         np.add.at(vector, labels, (weight * offset)[:, None] * normal)
-        certain = np.linalg.eigvalsh(information)[:, 0] > least_information
+        certain = np.linalg.eigvalsh(information)[:, 0] > MOST_SIGMA_M**-2
         places = np.full((count, 2), np.nan)
         places[certain] = np.linalg.solve(information[certain], vector[certain][..., None])[..., 0]
         ahead = np.sum(along * (places[labels] - centre), axis=1)
