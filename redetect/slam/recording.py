@@ -56,7 +56,7 @@ class CircleRows:
     @property
     def identified(self) -> BoolArray:
         """(n,) mask of rows with an identifier."""
-        return np.asarray(self.ids != UNKNOWN_ID)
+        return np.asarray(self.ids >= 0)
 
     def only(self, chosen: BoolArray | Sequence[int] | slice) -> CircleRows:
         """The chosen rows."""

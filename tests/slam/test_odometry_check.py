@@ -10,7 +10,6 @@ import pytest
 
 from redetect.landmarks import write_frames
 from redetect.slam.cli import main
-from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.recording import LineRows, Recording, frames_of_discs
@@ -22,8 +21,7 @@ def _run(seed: int) -> Recording:
 
 
 def _check(recording: Recording) -> OdometryCheck:
-    mapped = map_run(recording)
-    return check_odometry(mapped.graph, mapped.estimate, Weighting(), mapped.table.expected)
+    return check_odometry(map_run(recording))
 
 
 def test_factors_of_odometry_and_of_rows_are_one_if_covariances_are_right() -> None:

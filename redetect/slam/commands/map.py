@@ -60,7 +60,7 @@ def perform(command: Map) -> int:
         (output / joint_name).unlink(missing_ok=True)
     for (first, end), own in zip(pairwise(first_poses(runs)), paths):
         map_file.write_path(output / own, path.part(first, end), head, overwrite=command.force)
-    check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, mapped.table.expected)
+    check = check_odometry(mapped)
     files.write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)

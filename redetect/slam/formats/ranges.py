@@ -138,7 +138,7 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
             return usually
         if number:
             table = mapped.table
-            check = check_odometry(mapped.graph, mapped.estimate, mapped.weighting, table.expected)
+            check = check_odometry(mapped)
             if not (check.rows_factor > 0.0 and check.odometry_factor > 0.0):  # NaN if too few
                 return usually
             # The share of the numbers of rows that the others check.

@@ -17,8 +17,8 @@ from scipy.special import chdtri
 
 from redetect.least_squares.covariance import by_shared, diagonal_blocks
 from redetect.least_squares.solver import normal_equations
-from redetect.slam.mapping.graph import Estimate, Graph
-from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
+from redetect.slam.mapping.graph_terms import errors, linearise
+from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.models import between_jacobians
 
 #: Fewest redundant numbers from which a factor is meaningful.
@@ -47,13 +47,12 @@ class OdometryCheck:
     worst_step: int  # the one with the largest error
 
 
-def check_odometry(
-    graph: Graph, estimate: Estimate, weighting: Weighting, expected: int
-) -> OdometryCheck:
-    """Check a minimum of `solve`; `expected` is the expectation of chi-squared of the map.
+def check_odometry(mapped: MappedRun) -> OdometryCheck:
+    """Check the odometry of a map.
 
     Raises `numpy.linalg.LinAlgError` if the measurements do not determine the unknowns.
     """
+    graph, estimate, weighting = mapped.graph, mapped.estimate, mapped.weighting
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
     border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
@@ -72,7 +71,8 @@ def check_odometry(
     first, others = by_poses[:1, :, 3:], by_poses[1:]
     parts = ((others, found[0]), (first, found[1]))
     estimated = sum(float(np.einsum("nij,njk,nik->", by, c, by)) for by, c in parts)
-    odometry, rows = 3.0 * count - estimated, expected - 3.0 * count + estimated
+    odometry = 3.0 * count - estimated
+    rows = mapped.table.expected - odometry
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     of_steps = np.sum(error.odometry**2, axis=1)

@@ -396,7 +396,7 @@ def _check_usable(
             f"{name}: no landmark in it: expected rows of discs or, with --lines, of verticals, as "
             "`detect circles` and `detect lines` write them"
         )
-    if not np.any(recording.circles.ids >= 0) and not any(recording.lines.ids):
+    if not np.any(recording.circles.identified) and not np.any(recording.lines.identified):
         raise SlamError(
             f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
         )
@@ -412,13 +412,12 @@ def _check_usable(
 
 
 def _left_out(recording: Recording, graph: Graph, placed: InitialLines) -> LeftOut:
-    lines = recording.lines
-    identified = sum(map(bool, lines.ids))
+    discs, lines = recording.circles.identified, recording.lines.identified
     unused = np.setdiff1d(np.append(placed.ids, placed.unplaced), graph.line_ids)
     return LeftOut(
-        rows_without_id=int(np.sum(recording.circles.ids < 0)) + len(lines) - identified,
+        rows_without_id=int(np.sum(~discs) + np.sum(~lines)),
         discs_seen_once=int(np.sum(graph.disc_row_counts == 1)),
         lines_without_parallax=len(unused),
-        line_rows=identified - len(graph.line_pose),
+        line_rows=int(np.sum(lines)) - len(graph.line_pose),
         line_ids=tuple(unused.tolist()),
     )
