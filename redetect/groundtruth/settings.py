@@ -22,6 +22,7 @@ from redetect.groundtruth.errors import GroundTruthError
 Solver = Literal["sqpnp", "epnp", "iterative", "ippe", "pycolmap"]
 
 _ODDS = Bounds("more than 1", lambda x: 1.0 < x < inf)
+_UP_TO_A_DAY = Bounds("above 0, at most 100000", lambda x: 0.0 < x <= 1e5)
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,8 @@ class LaserSettings(Bounded, error=GroundTruthError):
 class SyncSettings(Bounded, error=GroundTruthError):
     """Settings of the synchronisation of clocks."""
 
-    largest_offset_s: Positive = 60.0  # Bound of the time offset, either way (s).
+    # Bound of the time offset, either way (s).
+    largest_offset_s: Annotated[float, _UP_TO_A_DAY] = 60.0
     # Bound of the drift, the relative difference of the clocks' rates.
     largest_drift: Annotated[float, inside(0.0, 0.5)] = 0.01
     segment_gap_s: Positive = 5.0  # A longer pause in the ground truth begins a new segment (s).

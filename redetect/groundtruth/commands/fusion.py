@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from redetect.command_line import EXIT_ERROR
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
@@ -22,6 +24,7 @@ from redetect.groundtruth.trajectories.streams import (
     read_planar_poses,
     write_planar_poses,
 )
+from redetect.messages import counted
 
 _CONFIDENCE = 1.959964
 #: Share of a stream's poses above which rejections are warned of.
@@ -38,8 +41,8 @@ def perform_sync(options: Sync) -> int:
     for segment in segments:
         print(_line(segment))
     if not any(segment.is_determined for segment in segments):
-        print("no segment could be synchronised: no clock file is written")
-        return 1
+        print("error: no segment could be synchronised: no clock file is written", file=sys.stderr)
+        return EXIT_ERROR
     document: dict[str, Any] = {
         **provenance(options.settings, [options.odometry, options.groundtruth]),
         "segments": segments,
@@ -94,11 +97,11 @@ def perform_fuse(options: Fuse) -> int:
     if options.laser is not None:
         known = stream_errors.read_common_covariance(options.laser)
         streams["laser"], common = stream_errors.without_common(streams["laser"], known)
+    left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     fusion = fuse(odometry, streams, settings)
     paths = (fusion.poses, fusion.filtered)
     poses, filtered = (stream_errors.with_common(path, common) for path in paths)
     fusion = replace(fusion, poses=poses, filtered=filtered)
-    left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
         **provenance(settings, inputs),
@@ -129,7 +132,7 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
     used = ", ".join(f"{count} from {name}" for name, count in fusion.used.items())
     print(
         f"{options.output}: {len(fusion.poses)} poses out of {used}; "
-        f"{len(fusion.rejected)} rejected, {len(fusion.restarts_s)} restarts; "
+        f"{len(fusion.rejected)} rejected, {counted(len(fusion.restarts_s), 'restart')}; "
         f"median sigma {sigma:.1f} mm"
     )
     _print_contradictions(options, fusion)
@@ -149,8 +152,9 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
         )
     if fusion.pauses_s:
         warn(
-            f"{options.odometry}: {len(fusion.pauses_s)} pauses, {_longest(fusion.pauses_s)}: the "
-            "robot's path there is unknown, and covariances are increased"
+            f"{options.odometry}: {counted(len(fusion.pauses_s), 'pause')}, "
+            f"{_longest(fusion.pauses_s)}: the robot's path there is unknown, and covariances are "
+            "increased"
         )
 
 
@@ -171,8 +175,9 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
             )
     if fusion.slips_s:
         warn(
-            f"{options.odometry}: contradicts the measured poses {len(fusion.slips_s)} times, as "
-            f"after a slip of the wheels, {_longest(fusion.slips_s)}"
+            f"{options.odometry}: contradicts the measured poses "
+            f"{counted(len(fusion.slips_s), 'time')}, as after a slip of the wheels, "
+            f"{_longest(fusion.slips_s)}"
         )
 
 

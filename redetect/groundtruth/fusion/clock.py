@@ -49,6 +49,8 @@ _CALENDAR = (
 )
 _OFFSET = "offset from master"
 _PARTS_PER_BILLION = 1e-9
+# Segments of a single pose are this long, so that their ends differ in doubles since 1970, too.
+_LEAST_LENGTH_S = 1e-6
 # Least step of a clock between segments that is looked for in a gap of its times.
 _LEAST_STEP_S = 0.5
 
@@ -91,10 +93,6 @@ class ClockModel:
     """The robot's clock against the ground truth's over a session."""
 
     segments: tuple[ClockSegment, ...]  # In order; at least one whose offset is determined.
-
-    def __post_init__(self) -> None:
-        if not self.segments:
-            raise GroundTruthError("a clock without segments: expected at least one")
 
     def robot_times(self, times_s: ArrayLike) -> FloatArray:
         """Convert times on the ground truth's clock to robot times."""
@@ -147,7 +145,7 @@ def knots_of(segments: Sequence[ClockSegment]) -> tuple[FloatArray, FloatArray]:
     ends = [
         (time, segment.offset_s + (segment.rate - 1.0) * (time - segment.reference_s))
         for segment in segments
-        for time in (segment.from_s, max(segment.to_s, segment.from_s + 1e-9))
+        for time in (segment.from_s, max(segment.to_s, segment.from_s + _LEAST_LENGTH_S))
     ]
     times, offsets = np.array(ends).T
     return times, offsets

@@ -7,13 +7,14 @@ offset far from the expected one is only taken if it explains them much better t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.fusion.stream_errors import roughness
+from redetect.groundtruth.fusion.stream_errors import white_noise_sigmas
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 
 #: Offsets this near the expected one are left to the refinement of the clock.
@@ -37,6 +38,39 @@ _MUCH_BETTER, _ALONE, _OWN_WIDTH_S = 0.25, 0.5, 3.0
 # Movements do not match if their squared errors are larger than this share of those of unrelated
 # ones, in segments with much movement.
 _UNRELATED, _MUCH_MOVEMENT = 0.5, 10.0
+# Number of errors that are in memory at once.
+_AT_ONCE = 1_000_000
+
+
+class Split(NamedTuple):
+    """The best split of a series into two parts, each of which may have its own alternative."""
+
+    at: int  # Index of the last one in the first part
+    cost: float  # Of both parts; infinite if none is long enough
+    before: int  # The best alternatives of the parts
+    after: int
+    unsplit: float  # Cost of the best alternative without a split
+
+
+def best_split(costs: Iterable[FloatArray], times_s: FloatArray, least_s: float) -> Split:
+    """Split a series with times (N,) into two parts of a least duration.
+
+    `costs`: blocks (K, N) of the series' costs by alternatives.
+    """
+    columns, first, unsplit = np.arange(len(times_s)), 0, np.inf
+    least, best = np.full((2, len(times_s)), np.inf), np.zeros((2, len(times_s)), dtype=np.int64)
+    for block in costs:
+        before = np.cumsum(block, axis=1)
+        for side, total in enumerate((before, before[:, -1:] - before)):
+            own = np.argmin(total, axis=0)
+            best[side] = np.where(total[own, columns] < least[side], first + own, best[side])
+            least[side] = np.minimum(total[own, columns], least[side])
+        unsplit = min(unsplit, float(before[:, -1].min()))
+        first += len(block)
+    parted = least.sum(axis=0)
+    parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < least_s] = np.inf
+    at = int(np.argmin(parted))
+    return Split(at, float(parted[at]), int(best[0, at]), int(best[1, at]), unsplit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +95,7 @@ class Movements:
             known &= (times >= poses.times_s[0]) & (times <= poses.times_s[-1])
             ends.append([np.interp(times, poses.times_s, values) for values in poses.continuous.T])
         dx, dy, turn = np.array(ends[1]) - np.array(ends[0])
-        x, y, heading = roughness(poses)
+        x, y, heading = white_noise_sigmas(poses)
         noise = 2.0 * np.array([heading**2, 0.5 * (x**2 + y**2)])
         return cls(first, np.column_stack([turn, np.hypot(dx, dy)]), known, noise)
 
@@ -91,8 +125,10 @@ class OffsetSearch:
         compared = self._compared(parts)
         if compared is None:
             return around_s
-        steps = self._steps
+        steps = compared.overlapping(self._steps)
         errors = compared.errors(steps)
+        if not len(steps):
+            return around_s
         near = np.abs(_STEP_S * steps - around_s) <= NEAR_S
         best = int(np.argmin(errors))
         beside = np.abs(steps - steps[best]) > _OWN_WIDTH_S / _STEP_S
@@ -111,17 +147,13 @@ class OffsetSearch:
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return None
-        own = np.minimum(compared.single_errors(self._steps), compared.unrelated)
-        before = np.cumsum(own, axis=1)
-        after = before[:, -1:] - before
-        parted = before.min(axis=0) + after.min(axis=0)
-        times = _STEP_S * (compared.at + compared.own.first)
-        parted[np.minimum(times - times[0], times[-1] - times) < _LEAST_PART_S] = np.inf
-        at = int(np.argmin(parted))
-        jump = abs(int(np.argmin(before[:, at])) - int(np.argmin(after[:, at])))
-        if parted[at] < _MUCH_BETTER * before[:, -1].min() and jump * _STEP_S > _LEAST_JUMP_S:
-            return float(times[at])
-        return None
+        blocks = compared.single_errors(compared.overlapping(self._steps))
+        costs = (np.minimum(block, compared.unrelated) for block in blocks)
+        times_s = np.asarray(_STEP_S * (compared.at + compared.own.first))
+        found = best_split(costs, times_s, _LEAST_PART_S)
+        jump_s = _STEP_S * abs(found.before - found.after)
+        is_set = found.cost < _MUCH_BETTER * found.unsplit and jump_s > _LEAST_JUMP_S
+        return float(times_s[found.at]) if is_set else None
 
     def nearest_s(self, part: PlanarPoses, around_s: float) -> float:
         """The best offset near the expected one."""
@@ -175,22 +207,32 @@ class _Compared:
         apart = np.var(self.values, axis=0) + np.var(own, axis=0)
         return float((apart + (self.values.mean(axis=0) - own.mean(axis=0)) ** 2) @ self.weights)
 
-    def single_errors(self, steps: IntArray) -> FloatArray:
-        """(K, M) squared normalised errors of all movements, infinite where odometry is unknown."""
-        at = self.at + steps[:, None]
-        inside = (at >= 0) & (at < len(self.own.known))
-        at = np.where(inside, at, 0)
-        apart = self.values - self.own.values[at]
-        known = inside & self.own.known[at]
-        return np.asarray(np.where(known, np.square(apart) @ self.weights, np.inf))
+    def overlapping(self, steps: IntArray) -> IntArray:
+        """Those of some steps of the grid at which any movement is within odometry's time."""
+        last = len(self.own.known) - 1
+        return np.asarray(steps[(steps >= -self.at.max()) & (steps <= last - self.at.min())])
+
+    def single_errors(self, steps: IntArray) -> Iterator[FloatArray]:
+        """Squared normalised errors of all movements at steps (K,), infinite where odometry is
+        unknown, in blocks (k, M).
+        """
+        for own in np.array_split(steps, 1 + len(steps) * len(self.at) // _AT_ONCE):
+            at = self.at + own[:, None]
+            inside = (at >= 0) & (at < len(self.own.known))
+            at = np.where(inside, at, 0)
+            apart = self.values - self.own.values[at]
+            known = inside & self.own.known[at]
+            yield np.asarray(np.where(known, np.square(apart) @ self.weights, np.inf))
 
     def errors(self, steps: IntArray) -> FloatArray:
         """(K,) mean squared normalised errors at offsets `steps` (K,) of the grid; infinite where
         too few movements are compared.
         """
-        single = self.single_errors(steps)
-        known = np.isfinite(single)
-        compared = known.sum(axis=1)
-        errors = np.where(known, single, 0.0).sum(axis=1) / np.maximum(compared, 1)
+        sums = []
+        for block in self.single_errors(steps):
+            known = np.isfinite(block)
+            sums.append([known.sum(axis=1), np.where(known, block, 0.0).sum(axis=1)])
+        compared, total = np.concatenate(sums, axis=1)
+        errors = total / np.maximum(compared, 1)
         enough = compared >= max(_FEWEST_SAMPLES, _COVERED * compared.max(initial=0))
         return np.asarray(np.where(enough, errors, np.inf))

@@ -37,6 +37,7 @@ from redetect.groundtruth.trajectories.streams import (
     segments_between_gaps,
 )
 from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.messages import counted
 
 # Factors on odometry's deviations that are tried, and the number of nodes used.
 _NOISE_FACTORS = (0.01, 20.0)
@@ -58,6 +59,7 @@ _LARGEST_GAP_S = 2.0
 # Odometry that moves less than the first, while measured poses move more than the second, has
 # headings alone (m).
 _STANDS_M, _MOVES_M = 0.01, 1.0
+_DEFAULT = FuseSettings()
 
 
 def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
@@ -186,7 +188,7 @@ class Fusion:
 
 
 def fuse(
-    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings = _DEFAULT
 ) -> Fusion:
     """Fuse odometry with poses measured by other means.
 
@@ -204,10 +206,9 @@ def fuse(
         first measurement and the last; if a stream has no covariances, or one of them cannot be
         repaired; if odometry has no distances.
     """
-    chosen = settings or FuseSettings()
     covered = {name: with_jitter_covered(last_of_each_time(one)) for name, one in streams.items()}
     streams = {name: stream for name, (stream, _) in covered.items()}
-    problem = movement_problem(odometry, streams, chosen)
+    problem = movement_problem(odometry, streams, settings)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
     if not len(inside):
@@ -222,8 +223,8 @@ def fuse(
             "expected distances, too, not headings alone"
         )
     # Odometry's random errors, and its systematic errors as part of the state.
-    noise = maximum_likelihood_noise(problem) if chosen.learn_noise else noise_of(chosen)
-    inflation = variance_inflation(problem, noise) if chosen.learn_noise else 1.0
+    noise = maximum_likelihood_noise(problem) if settings.learn_noise else noise_of(settings)
+    inflation = variance_inflation(problem, noise) if settings.learn_noise else 1.0
     smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
@@ -231,7 +232,7 @@ def fuse(
     if not np.all(kept):
         names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
         fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
-        problem = replace(problem, settings=replace(chosen, **fewer))
+        problem = replace(problem, settings=replace(settings, **fewer))
         smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.
@@ -241,7 +242,7 @@ def fuse(
     restarted = innovations.restarted > 0
     # The errors of a localisation are stationary.
     localisation = None
-    if chosen.learn_noise:
+    if settings.learn_noise:
         found = as_localisation(last_of_each_time(odometry), problem, over_seconds, path)
         if found is not None:
             path, localisation = found
@@ -295,7 +296,7 @@ class LeftOut:
 
 
 def leave_out(
-    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings | None = None
+    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings = _DEFAULT
 ) -> tuple[LeftOut, ...]:
     """Leave out each segment of the ground truth between two others, and predict it.
 
@@ -309,8 +310,8 @@ def leave_out(
     parts = [truth.times_s[s] for s in segments_between_gaps(truth.times_s, _SEGMENT_GAP_S)]
     if len(parts) < 3:
         raise GroundTruthError(
-            f"{len(parts)} segments of ground truth within the odometry's time: expected 3 or "
-            "more, to leave one out between two others"
+            f"{counted(len(parts), 'segment')} of ground truth within the odometry's time: "
+            "expected 3 or more, to leave one out between two others"
         )
     found = []
     for times in parts[1:-1]:

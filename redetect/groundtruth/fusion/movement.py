@@ -79,13 +79,13 @@ class Smoothed(NamedTuple):
 
 
 def _follow_from_end(
-    smoothed: Smoothed, odometry: kernels.Odometry, begin: int, carried: bool
+    smoothed: Smoothed, odometry: kernels.Odometry, begin: int, kidnapped: bool
 ) -> None:
     """In the second half of a gap that was cut, follow odometry from the measurements after it.
 
-    In place; `odometry` is that of the gap's nodes from `begin` on. A robot that was `carried` in
-    the gap may have been anywhere along its path then, so covariances include the other end's path
-    as a possibility.
+    In place; `odometry` is that of the gap's nodes from `begin` on. A robot that was `kidnapped`
+    in the gap may have been anywhere along its path then, so covariances include the other end's
+    path as a possibility.
     """
     count = len(odometry.controls)
     states, covariances = (v[begin : begin + count] for v in smoothed[:2])
@@ -95,7 +95,7 @@ def _follow_from_end(
     half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
     apart = pose_differences(back[1:-1, : kernels.POSE], states[1:-1, : kernels.POSE])
     states[half:-1], covariances[half:-1] = back[half:-1], spreads[half:-1]
-    if carried:
+    if kidnapped:
         share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
         other = share[:, None, None] * apart[:, :, None] * apart[:, None]
         covariances[1:-1, : kernels.POSE, : kernels.POSE] += other
@@ -198,7 +198,7 @@ class MovementProblem:
         slips = slip_variances(self, variances)
         variances += slips
         history = kernels.empty_history(len(self.times_s))
-        innovations, carried = self._filtered_with_cuts(variances, history)
+        innovations, kidnapped = self._filtered_with_cuts(variances, history)
         states, covariances = kernels.smooth_backward(history)
         good = nodes[innovations.accepted]
         # The nodes of the last measurement before and the first one after each gap that was cut.
@@ -206,7 +206,7 @@ class MovementProblem:
             (int(good[np.searchsorted(good, end) - 1]), int(end))
             for end in np.flatnonzero(innovations.restarted == kernels.WHERE_LOST)
         ]
-        cuts = carried.copy()
+        cuts = kidnapped.copy()
         cuts[[end for _, end in gaps]] = True
         for _ in range(_MOST_STEPS):
             before = states
@@ -217,20 +217,20 @@ class MovementProblem:
         smoothed = Smoothed(states, covariances, innovations, slips)
         for begin, end in gaps:
             odometry = kernels.Odometry(self.controls[begin : end + 1], variances[begin : end + 1])
-            _follow_from_end(smoothed, odometry, begin, bool(carried[end]))
+            _follow_from_end(smoothed, odometry, begin, bool(kidnapped[end]))
         return smoothed
 
     def _filtered_with_cuts(
         self, variances: FloatArray, history: kernels.FilterHistory
     ) -> tuple[kernels.Innovations, BoolArray]:
-        """Filter forward, and at which nodes (N,) the robot was carried: the path is cut there."""
-        carried = np.zeros(len(self.times_s), dtype=np.bool_)
+        """Filter forward, and where (N,) the robot was kidnapped: the path is cut there."""
+        kidnapped = np.zeros(len(self.times_s), dtype=np.bool_)
         while True:
-            innovations = self.forward(variances, cuts=carried, history=history)
+            innovations = self.forward(variances, cuts=kidnapped, history=history)
             unfit = self._ends_that_did_not_fit(innovations)
             if not unfit:
-                return innovations, carried
-            carried[unfit] = True
+                return innovations, kidnapped
+            kidnapped[unfit] = True
 
     def _ends_that_did_not_fit(self, innovations: kernels.Innovations) -> list[int]:
         """Nodes after gaps at which the rejections began that made the filter restart."""

@@ -36,7 +36,7 @@ _NEGLIGIBLE = 0.05
 _LEAST_OWN = 0.02
 
 
-def roughness(poses: PlanarPoses) -> FloatArray:
+def white_noise_sigmas(poses: PlanarPoses) -> FloatArray:
     """(3,) standard deviations of the noise of x, y and the heading, from third differences."""
     third = np.diff(poses.continuous, 3, axis=0)
     if not len(third):

@@ -23,10 +23,14 @@ from scipy.optimize import Bounds, minimize, minimize_scalar
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion.clock import ClockSegment, ClockStatus, knots_of, on_one_line
-from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch
+from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, best_split
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
-from redetect.groundtruth.fusion.stream_errors import roughness, with_common, with_jitter_covered
+from redetect.groundtruth.fusion.stream_errors import (
+    white_noise_sigmas,
+    with_common,
+    with_jitter_covered,
+)
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -65,10 +69,11 @@ _LEAST_JUMP_S = 0.004
 _LEAST_PART_S = 5.0
 _LARGEST_DRIFT_OF_A_QUARTZ = 2e-4
 _NO_ODOMETRY = "no odometry"
+_DEFAULT = SyncSettings()
 
 
 def synchronise(
-    odometry: PlanarPoses, groundtruth: PlanarPoses, settings: SyncSettings | None = None
+    odometry: PlanarPoses, groundtruth: PlanarPoses, settings: SyncSettings = _DEFAULT
 ) -> tuple[ClockSegment, ...]:
     """Align the odometry's clock with the ground truth's, per segment of the ground truth.
 
@@ -93,7 +98,6 @@ def synchronise(
     GroundTruthError
         If a stream has fewer than 20 poses, or they do not overlap.
     """
-    bounds = settings or SyncSettings()
     odometry, groundtruth = last_of_each_time(odometry), last_of_each_time(groundtruth)
     for name, poses in (("odometry", odometry), ("ground truth", groundtruth)):
         if len(poses) < _FEWEST_SAMPLES:
@@ -101,13 +105,13 @@ def synchronise(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
     groundtruth, _ = with_jitter_covered(groundtruth)
-    slices = segments_between_gaps(groundtruth.times_s, bounds.segment_gap_s)
+    slices = segments_between_gaps(groundtruth.times_s, settings.segment_gap_s)
     parts = [groundtruth.only(part) for part in slices]
-    search = OffsetSearch(_smoothed(odometry), parts, bounds.largest_offset_s)
+    search = OffsetSearch(_smoothed(odometry), parts, settings.largest_offset_s)
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
-    near = replace(bounds, largest_offset_s=min(bounds.largest_offset_s, NEAR_S))
-    no_match = f"no offset within {bounds.largest_offset_s:g} s makes odometry's movements agree"
+    near = replace(settings, largest_offset_s=min(settings.largest_offset_s, NEAR_S))
+    no_match = f"no offset within {settings.largest_offset_s:g} s makes odometry's movements agree"
     found: list[ClockSegment] = []
     parts, set_at_s = _parted_where_set(parts, search)
     for part in parts:
@@ -125,7 +129,7 @@ def synchronise(
         raise GroundTruthError(
             f"odometry from {odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s and ground "
             f"truth from {groundtruth.times_s[0]:.3f} s to {groundtruth.times_s[-1]:.3f} s do not "
-            f"overlap within {bounds.largest_offset_s:g} s"
+            f"overlap within {settings.largest_offset_s:g} s"
         )
     return tuple(_interpolated(on_one_line(found)))
 
@@ -359,10 +363,10 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
     """
     covariances = measured.covariances
     if covariances is None:
-        covariances = np.diag([0.0, 0.0, roughness(measured)[2] ** 2])
+        covariances = np.diag([0.0, 0.0, white_noise_sigmas(measured)[2] ** 2])
     # Between two samples odometry's path is unknown by the sag of what it bends.
     sag = np.sqrt(np.mean(np.square(np.diff(odometry.continuous, 2, axis=0)), axis=0)) / 8.0
-    variances = roughness(odometry) ** 2 + sag**2 + rounding**2
+    variances = white_noise_sigmas(odometry) ** 2 + sag**2 + rounding**2
     own = np.tile(np.diag(variances), (len(measured), 1, 1))
     return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 
@@ -391,14 +395,10 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     offsets = fit.clock[0] + max(float(fit.sigmas[0]), _JUMP_SPACING_S) * _JUMP_OFFSETS
     offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
-    before = np.cumsum(squared, axis=1)
-    after = before[:, -1:] - before
     times_s = fit.problem_at(fit.clock).measured_s
-    parted = before.min(axis=0) + after.min(axis=0)
-    parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < _LEAST_PART_S] = np.inf
-    if np.sum(fit.squared(fit.clock)) - parted.min() < _JUMP_GAIN:
-        return None
-    return float(times_s[np.argmin(parted)])
+    found = best_split([squared], times_s, _LEAST_PART_S)
+    gain = float(np.sum(fit.squared(fit.clock))) - found.cost
+    return float(times_s[found.at]) if gain >= _JUMP_GAIN else None
 
 
 def _differ(parts: list[ClockSegment]) -> bool:

@@ -309,3 +309,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "give --force" in capsys.readouterr().err
     assert main(["fuse", str(tmp_path / "odometry.csv")]) == 1
     assert "expected at least one ground truth" in capsys.readouterr().err
+    # Refused before the fusion, which takes minutes.
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("redetect.groundtruth.commands.fusion.fuse", None)
+        assert main([*command, "--leave-out", "--force"]) == 1
+    assert "1 segment of ground truth within" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from redetect.groundtruth.fusion.clock import (
     read_clock,
     read_ptpd,
 )
-from redetect.groundtruth.fusion.stream_errors import roughness
+from redetect.groundtruth.fusion.coarse_offset import OffsetSearch
+from redetect.groundtruth.fusion.stream_errors import white_noise_sigmas
 from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import SyncSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -164,6 +166,8 @@ def test_streams_that_never_meet_are_refused() -> None:
 def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
     with pytest.raises(GroundTruthError, match=name):
         SyncSettings(**dict[str, Any]({name: value}))
+    with pytest.raises(GroundTruthError, match=r"largest_offset_s is 2e\+12: expected above 0"):
+        SyncSettings(largest_offset_s=2e12)
 
 
 @given(
@@ -198,11 +202,34 @@ def test_a_clock_that_was_set_back_has_no_inverse() -> None:
         model.groundtruth_times([5.0])
 
 
+def test_a_segment_of_one_pose_has_times_since_1970() -> None:
+    at_s = 1.7e9
+    lone = replace(SEGMENT, from_s=at_s + 60.0, to_s=at_s + 60.0, reference_s=at_s + 60.0)
+    model = ClockModel((replace(SEGMENT, from_s=at_s, to_s=at_s + 9.0, reference_s=at_s), lone))
+    times = at_s + np.array([1.0, 30.0, 60.0, 90.0])
+    again = model.groundtruth_times(model.robot_times(times))
+    np.testing.assert_allclose(again, times, rtol=0.0, atol=1e-5)
+
+
+def test_an_hour_of_offsets_does_not_fill_the_memory() -> None:
+    rng = np.random.default_rng(35)
+    times = np.arange(0.0, 7200.0, 0.5)
+    odometry = headings_only(times, np.cumsum(rng.normal(0.0, 0.1, len(times))))
+    part = odometry.only(odometry.during(500.0, 600.0))
+    part = PlanarPoses(part.times_s - 400.0, part.poses)
+    tracemalloc.start()
+    found = OffsetSearch(odometry, [part], 3600.0).offset_s([part], 0.0)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found == pytest.approx(400.0)
+    assert most < 2e8
+
+
 def test_noise_of_headings_is_told_from_turning() -> None:
     rng = np.random.default_rng(2)
     times = np.arange(0, 100, 0.02)
     turning = 3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times))
-    noise = roughness(headings_only(times, turning))
+    noise = white_noise_sigmas(headings_only(times, turning))
     assert noise == pytest.approx([0.0, 0.0, 0.01], rel=0.05)
 
 
@@ -291,6 +318,14 @@ def test_the_command_writes_a_clock(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert clock.segments[0].status == "ok"
     assert main(command) == 1
     assert "give --force" in capsys.readouterr().err
+    straight = PlanarPoses(truth.times_s, 0.0 * truth.poses)
+    write_planar_poses(tmp_path / "straight.csv", straight)
+    command[2], command[4] = str(tmp_path / "straight.csv"), str(tmp_path / "none.json")
+    assert main(command) == 1
+    shown = capsys.readouterr()
+    assert "cannot be synchronised" in shown.out
+    assert shown.err == "error: no segment could be synchronised: no clock file is written\n"
+    assert not (tmp_path / "none.json").exists()
 
 
 @pytest.mark.parametrize("offset_s", [5.3, -29.1])
