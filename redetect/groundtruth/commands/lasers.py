@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from redetect.array_types import FloatArray
 from redetect.bounds import demand, whole
+from redetect.command_line import EXIT_ERROR
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
@@ -17,10 +19,10 @@ from redetect.groundtruth.lasers import scanners, tracking
 from redetect.groundtruth.lasers.acquisition import ScanSets, load_session
 from redetect.groundtruth.lasers.alignment import Alignment, align_scanners, icp_by_step
 from redetect.groundtruth.lasers.building import find_building, read_building
-from redetect.groundtruth.lasers.scanners import Robot, Scanner, noise_warnings, read_scanners
+from redetect.groundtruth.lasers.scanners import Robot, Scanner
 from redetect.groundtruth.lasers.tracking import SetStatus
 from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
-from redetect.groundtruth.lasers.walls import still_scan
+from redetect.groundtruth.lasers.walls import averaged_scan
 from redetect.groundtruth.options import Laser, Lasers
 from redetect.groundtruth.report.pictures import draw_alignment
 from redetect.groundtruth.trajectories.streams import pose_differences, write_planar_poses
@@ -57,8 +59,8 @@ def perform_lasers(options: Lasers) -> int:
         scanners.read_scans(scanners.find_scans(session / "empty", s.name), s.readings)
         for s in stated
     ]
-    measured = scanners.with_measured_noise(stated, empties)
-    for text in scanners.noise_warnings(stated, measured, by_hand):
+    measured, texts = scanners.with_measured_noise(stated, empties, by_hand)
+    for text in texts:
         warn(text)
     alignment = align_scanners(measured, empties, building, options.settings)
 
@@ -84,7 +86,7 @@ def perform_lasers(options: Lasers) -> int:
     }
     del extra["version"]  # that of the file's form is there
     scanners.write_scanners(output, alignment.scanners, extra, overwrite=options.force)
-    points = [still_scan(a, b.ranges_mm).points for a, b in zip(measured, empties)]
+    points = [averaged_scan(a, b.ranges_mm).points for a, b in zip(measured, empties)]
     by_step = [
         icp_by_step(cloud, building, scanner.pose, options.settings, _ICP_STEPS)
         for cloud, scanner in zip(points, measured)
@@ -150,16 +152,15 @@ def perform_laser(options: Laser) -> int:
             f"{calibration}; their errors are common to all poses, and do not average out in a "
             "fusion"
         )
-    scanners, robot, fixed, sets = load_session(options.session, calibration)
-    for text in noise_warnings(read_scanners(calibration), scanners, calibration):
-        warn(text)
-    print_sweeps(scanners, sets, robot)
+    scanners, robot, fixed, sets = load_session(options.session, calibration, warn)
+    warn_of_sweeps(scanners, sets, robot)
     settings = options.settings
     track, left_out = tracking.track_without_suspects(sets, fixed, robot, scanners, settings)
 
     average = options.average or tracking.usual_sets_per_pose(track)
     poses = tracking.combined_poses(track, average)
-    write_planar_poses(output, poses, overwrite=options.force)
+    if len(poses):
+        write_planar_poses(output, poses, overwrite=options.force)
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
@@ -201,10 +202,12 @@ def perform_laser(options: Laser) -> int:
                 f"{np.degrees(shift[2]):.2f} deg; "
                 + ("it was excluded" if scanner["left_out"] else "it was used nevertheless")
             )
-    return 0 if len(poses) else 1
+    if not len(poses):
+        print(f"error: no pose: {per_set} has the status of every set", file=sys.stderr)
+    return 0 if len(poses) else EXIT_ERROR
 
 
-def print_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) -> None:
+def warn_of_sweeps(scanners: tuple[Scanner, ...], sets: ScanSets, robot: Robot) -> None:
     """Warn of scans that seem to be of one moment, although the robot moves during them."""
     if any(scanner.sweep_s for scanner in scanners) or len(sets) < 2:
         return
@@ -229,7 +232,7 @@ def set_lines(track: tracking.LaserTrack) -> list[str]:
             beams = {name: int(n) for name, n in zip(BeamCounts._fields, track.beams[i])}
             line["readings"] = int(track.readings[i])
             line["rms_m"] = round(float(track.rms_m[i]), 5)
-            line["chi2_per_freedom"] = round(float(track.chi2[i]), 3)
+            line["chi2_per_freedom"] = round(float(track.chi2_per_dof[i]), 3)
             line["beams"] = beams
             line["disturbed"] = beams["hidden"] + beams["beside"] >= _DISTURBED
         if status == SetStatus.UNDETERMINED_DIRECTION:

@@ -7,7 +7,7 @@ from every heading.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -18,17 +18,16 @@ from scipy.cluster.hierarchy import fclusterdata
 from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.files import JsonObject
 from redetect.groundtruth.lasers.icp import fit_outline
 from redetect.groundtruth.lasers.scanners import (
     Robot,
     Scanner,
     Scans,
     find_scans,
-    read_joint_covariance,
     read_robot,
-    read_scanners,
     read_scans,
+    scanners_in,
     with_measured_noise,
 )
 from redetect.groundtruth.lasers.tracking_kernels import (
@@ -68,16 +67,14 @@ class Background(NamedTuple):
     quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
 
 
-def learn_background(ranges_mm: NDArray[np.uint16], max_range_m: float) -> Background:
-    """Learn the background of the beams from scans (N, readings) of the empty area.
+def learn_background(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> Background:
+    """Learn the background of a scanner's beams from scans (N, readings) of the empty area.
 
-    Readings without a return are 0, or `max_range_m` and more. The nearest object of a beam is at a
-    low quantile of its readings: beams along an edge jump, and nearer ones are of passing objects.
+    The nearest object of a beam is at a low quantile of its readings: beams along an edge jump, and
+    nearer ones are of passing objects.
     """
-    if ranges_mm.ndim != 2 or len(ranges_mm) == 0:
-        raise GroundTruthError(f"empty scans of shape {ranges_mm.shape}: expected (N, readings)")
-    metres = ranges_mm * 1e-3
-    hit = (ranges_mm > 0) & (metres < max_range_m)
+    metres = scanner.metres(ranges_mm)
+    hit = np.isfinite(metres)
     ordered = np.sort(np.where(hit, metres, np.inf), axis=0)
     count = hit.sum(axis=0)
     beams = np.arange(ranges_mm.shape[1])
@@ -123,9 +120,7 @@ def fixed_scanners(
     """
     if covariance is None:
         covariance = block_diag(*(scanner.covariance for scanner in scanners))
-    if not scanners:
-        raise GroundTruthError("no scanners: expected some")
-    backgrounds = [learn_background(e.ranges_mm, s.max_range_m) for s, e in zip(scanners, empties)]
+    backgrounds = [learn_background(s, e.ranges_mm) for s, e in zip(scanners, empties)]
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
     direction, beam_times = np.zeros((len(scanners), width, 2)), np.zeros((len(scanners), width))
@@ -153,8 +148,6 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
     scanners that run slightly faster than others occasionally have a set of their own.
     """
     total = sum(len(one) for one in scans)
-    if total == 0:
-        raise GroundTruthError("no scans of any scanner")
     ranges = np.zeros((total, max(one.ranges_mm.shape[1] for one in scans)), dtype=np.uint16)
     first = np.cumsum([0, *(len(one) for one in scans)])
     for begin, one in zip(first, scans):
@@ -179,22 +172,26 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
 
 
 def load_session(
-    folder: Path, calibration: Path
+    folder: Path, calibration: Path, warn: Callable[[str], object] = str
 ) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
     """Read fixed scanners, robot and scans, and learn the background.
 
-    Scanners whose readings of the empty area scatter far more than stated get that noise. Raises
-    `GroundTruthError` if a file is missing or does not fit the others.
+    Scanners whose readings of the empty area scatter far more than stated get that noise, and are
+    warned of. Raises `GroundTruthError` if a file is missing or does not fit the others.
     """
-    scanners = read_scanners(calibration)
+    content = JsonObject.read(calibration)
+    scanners, joint = scanners_in(content), None
+    if "covariance" in content:
+        joint = content.joint_covariance("scanners", [s.name for s in scanners], 3)
     robot = read_robot(folder / "robot.json")
     empties, scans = (
         [read_scans(find_scans(place, s.name), s.readings) for s in scanners]
         for place in (folder / "empty", folder)
     )
-    scanners = with_measured_noise(scanners, empties)
-    fixed = fixed_scanners(scanners, empties, read_joint_covariance(calibration, scanners))
-    return scanners, robot, fixed, sets_of_scans(scans)
+    scanners, texts = with_measured_noise(scanners, empties, calibration)
+    for text in texts:
+        warn(text)
+    return scanners, robot, fixed_scanners(scanners, empties, joint), sets_of_scans(scans)
 
 
 def acquire(

@@ -48,6 +48,7 @@ _MOST_BULGE_M = 0.1
 _COARSE_M = 0.02
 # Standard deviations of measured poses (m, rad): without a covariance, and the least.
 _UNKNOWN_SIGMA, _LEAST_SIGMA = 0.5, 1e-4
+_DEFAULT = AlignmentSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ def align_scanners(
     scanners: Sequence[Scanner],
     empties: Sequence[Scans],
     building: FloatArray,
-    settings: AlignmentSettings | None = None,
+    s: AlignmentSettings = _DEFAULT,
 ) -> Alignment:
     """Align fixed scanners with each other and with the building.
 
@@ -87,14 +88,11 @@ def align_scanners(
     Raises
     ------
     GroundTruthError
-        If there are no scanners, or one has too few readings.
+        If a scanner has too few readings.
     GeometryError
         If too few of a scanner's readings are within the gate of the map.
     """
-    s = AlignmentSettings() if settings is None else settings
-    if not scanners:
-        raise GroundTruthError("no scanners: expected some")
-    stills = [walls.still_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
+    stills = [walls.averaged_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
     for scanner, still in zip(scanners, stills):
         if len(still.range_m) < 10:
             raise GroundTruthError(
@@ -263,7 +261,7 @@ def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatA
 
 
 def _whole_to_map(
-    stills: list[walls.StillScan],
+    stills: list[walls.AveragedScan],
     poses: FloatArray,
     measured: FloatArray,
     building: FloatArray,

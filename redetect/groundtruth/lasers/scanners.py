@@ -25,7 +25,7 @@ from typing import Annotated, Any, BinaryIO, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from redetect.array_types import BoolArray, FloatArray
+from redetect.array_types import FloatArray
 from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike, parse_numbers, read_rows, write_json
@@ -81,15 +81,15 @@ class Scanner:
         share = np.arange(self.readings) / max(self.readings - 1, 1) - 0.5
         return np.asarray(self.sweep_s * share)
 
-    def has_return(self, ranges_mm: ArrayLike) -> BoolArray:
-        """Which of (..., readings) readings in millimetres hit something within range."""
+    def metres(self, ranges_mm: ArrayLike) -> FloatArray:
+        """Readings (...) in millimetres in metres; NaN if they hit nothing within range."""
         ranges = np.asarray(ranges_mm)
-        return np.asarray((ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE))
+        hit = (ranges > 0) & (ranges < self.max_range_m / _MILLIMETRE)
+        return np.where(hit, ranges * _MILLIMETRE, np.nan)
 
     def points(self, ranges_mm: ArrayLike) -> FloatArray:
         """Points (..., readings, 2) (m) in its frame of readings in mm; NaN if nothing was hit."""
-        ranges = np.where(self.has_return(ranges_mm), np.asarray(ranges_mm) * _MILLIMETRE, np.nan)
-        angles = self.angles_rad
+        ranges, angles = self.metres(ranges_mm), self.angles_rad
         return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
 
 
@@ -103,43 +103,29 @@ class Robot:
     scanners: tuple[Scanner, ...] = ()  # Those on board, with their poses in the robot's frame
 
 
-def read_joint_covariance(path: PathLike, scanners: Sequence[Scanner]) -> FloatArray | None:
-    """(3 scanners, 3 scanners) covariance of a ``scanners.json``; None if it has none of all.
-
-    Raises `GroundTruthError` if it is not one of these scanners.
-    """
-    content = JsonObject.read(path)
-    if "covariance" not in content:
-        return None
-    return content.joint_covariance("scanners", [scanner.name for scanner in scanners], 3)
-
-
 def with_measured_noise(
-    scanners: Sequence[Scanner], empties: Sequence[Scans]
-) -> tuple[Scanner, ...]:
-    """The scanners; those whose readings of the empty area scatter far more than stated get that
-    noise: of a usual beam, which neither jumps along an edge nor is crossed.
+    scanners: Sequence[Scanner], empties: Sequence[Scans], path: PathLike
+) -> tuple[tuple[Scanner, ...], list[str]]:
+    """The scanners of a file; those whose readings of the empty area scatter far more than stated
+    get that noise: of a usual beam, which neither jumps along an edge nor is crossed.
+
+    Also returns what to say about these.
     """
-    found = []
+    found, texts = [], []
     for scanner, empty in zip(scanners, empties):
-        hit = scanner.has_return(empty.ranges_mm)
-        beams = hit.sum(axis=0) >= max(_FEWEST_FOR_NOISE, 0.5 * len(hit))
-        readings = np.where(hit[:, beams], empty.ranges_mm[:, beams] * _MILLIMETRE, np.nan)
-        measured = float(np.median(np.nanstd(readings, axis=0))) if np.any(beams) else 0.0
+        metres = scanner.metres(empty.ranges_mm)
+        beams = np.isfinite(metres).sum(axis=0) >= max(_FEWEST_FOR_NOISE, 0.5 * len(metres))
+        scatter = np.nanstd(metres[:, beams], axis=0)
+        measured = float(np.median(scatter)) if np.any(beams) else 0.0
         if measured > _BELIEVED_NOISE * max(scanner.sigma_m, _MILLIMETRE):
+            texts.append(
+                f"scanner {scanner.name}: readings of the empty area scatter by "
+                f"{1e3 * measured:.1f} mm, not by {1e3 * scanner.sigma_m:.1f} mm as in {path}: the "
+                "larger value is used"
+            )
             scanner = replace(scanner, sigma_m=measured)
         found.append(scanner)
-    return tuple(found)
-
-
-def noise_warnings(stated: Sequence[Scanner], used: Sequence[Scanner], path: Path) -> list[str]:
-    """What to say about scanners that are used with another noise than stated in a file."""
-    return [
-        f"scanner {b.name}: readings of the empty area scatter by {1e3 * b.sigma_m:.1f} "
-        f"mm, not by {1e3 * a.sigma_m:.1f} mm as in {path}: the larger value is used"
-        for a, b in zip(stated, used)
-        if b.sigma_m > a.sigma_m
-    ]
+    return tuple(found), texts
 
 
 def read_scanners(path: PathLike) -> tuple[Scanner, ...]:
@@ -148,7 +134,7 @@ def read_scanners(path: PathLike) -> tuple[Scanner, ...]:
     Raises `GroundTruthError` if the file cannot be read, an entry is missing or impossible, or two
     scanners have the same name.
     """
-    return _scanners(JsonObject.read(path))
+    return scanners_in(JsonObject.read(path))
 
 
 def write_scanners(
@@ -173,7 +159,7 @@ def read_robot(path: PathLike) -> Robot:
         outline,
         content.number("largest_speed_m_s", ABOVE_0),
         content.number("largest_turn_rad_s", ABOVE_0),
-        _scanners(content) if content.values.get("scanners") else (),
+        scanners_in(content) if content.values.get("scanners") else (),
     )
 
 
@@ -185,7 +171,8 @@ def scanner_entry(scanner: Scanner) -> dict[str, Any]:
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
-def _scanners(content: JsonObject) -> tuple[Scanner, ...]:
+def scanners_in(content: JsonObject) -> tuple[Scanner, ...]:
+    """The scanners of a file's object (see `read_scanners`)."""
     content.demand_version()
     scanners = tuple(_scanner(entry) for entry in content.rows("scanners"))
     names = [scanner.name for scanner in scanners]
@@ -278,6 +265,8 @@ def read_scans(path: PathLike, readings: int | None = None, *, ordered: bool = T
         scans = Scans(times, ranges)
     except GroundTruthError as error:
         raise GroundTruthError(f"{path}: {error}") from None
+    if not len(scans):
+        raise GroundTruthError(f"{path}: no scans in it")
     width = scans.ranges_mm.shape[1]
     if readings not in (None, width):
         raise GroundTruthError(f"{path}: {width} readings per scan: expected {readings}")
@@ -336,9 +325,7 @@ def _read_rows(path: PathLike, readings: int | None) -> tuple[FloatArray, NDArra
         if np.any(values[1:] < 0.0):
             raise GroundTruthError(f"{path}:{line}: a reading below 0: expected metres")
         rows.append(values)
-    if not rows:
-        raise GroundTruthError(f"{path}: no scans in it")
-    table = np.stack(rows)
+    table = np.stack(rows) if rows else np.zeros((0, columns or 2))
     millimetres = np.rint(np.minimum(table[:, 1:], _FARTHEST_M) / _MILLIMETRE)
     ranges = np.where(millimetres < 65536.0, millimetres, 0.0).astype(np.uint16)
     return table[:, 0].copy(), ranges

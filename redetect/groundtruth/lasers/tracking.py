@@ -17,7 +17,7 @@ from scipy.ndimage import convolve1d
 from scipy.stats import trim_mean
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.groundtruth.errors import GeometryError, GroundTruthError
+from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.acquisition import (
     LEAST_READINGS,
     MOST_STEPS,
@@ -67,11 +67,12 @@ _SAMPLE = 60
 # A scanner is suspect if the others contradict its pose by more, in standard deviations and in m
 # and rad.
 _SUSPECT_SIGMA, _SUSPECT_M, _SUSPECT_RAD = 5.0, 0.005, 0.002
-#: Sets farther apart than this are not of one block (s).
-LARGEST_GAP_S = 0.05
+# Sets farther apart than both, in seconds and in usual intervals, are not of one block.
+_LARGEST_GAP_S, _GAP_INTERVALS = 0.05, 1.5
 _AVERAGED_S = 0.08
 # Velocities over a shorter time are unknown: the robot counts as at rest.
 _LEAST_SPAN_S = 0.05
+_DEFAULT = LaserSettings()
 
 
 class SetStatus(IntEnum):
@@ -103,7 +104,7 @@ class LaserTrack:
     motion: FloatArray  # (N, 3): velocity (m/s) and turn (rad/s) in the world
     readings: IntArray  # (N,): number of readings used for the pose
     rms_m: FloatArray  # (N,): their root mean square distance from the outline
-    chi2: FloatArray  # (N,): their squared normalised residuals per degree of freedom
+    chi2_per_dof: FloatArray  # (N,): their squared normalised residuals per degree of freedom
     beams: FloatArray  # (N, 6): as in `BeamCounts`
     weak: FloatArray  # (N, 3): least determined direction of x, y, theta times the radius
     reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
@@ -142,7 +143,8 @@ class Tracker:
             poses=np.full((n, 3), np.nan), covariances=np.full((n, 3, 3), np.nan),
             noise=np.full((n, 3, 3), np.nan), motion=np.zeros((n, 3)),
             readings=np.zeros(n, dtype=np.int64), rms_m=np.full(n, np.nan),
-            chi2=np.full(n, np.nan), beams=np.zeros((n, 6)), weak=np.zeros((n, 3)), reasons={},
+            chi2_per_dof=np.full(n, np.nan), beams=np.zeros((n, 6)), weak=np.zeros((n, 3)),
+            reasons={},
             corrections=np.full((scanners, 3), np.nan),
             correction_sigma=np.full((scanners, 3), np.nan), fronts={},
         )  # fmt: skip
@@ -249,7 +251,7 @@ class Tracker:
         self.track.poses[i] = found.pose
         self.track.poses[i, 2] = wrap_angle(found.pose[2])
         self.track.readings[i], self.track.rms_m[i] = found.used, found.rms_m
-        self.track.chi2[i] = found.chi2 / max(found.used - 3.0, 1.0)
+        self.track.chi2_per_dof[i] = found.chi2 / max(found.used - 3.0, 1.0)
         self.track.beams[i] = beams
         is_open = found.open_directions
         self.track.status[i] = SetStatus.UNDETERMINED_DIRECTION if is_open else SetStatus.OK
@@ -388,7 +390,7 @@ class Tracker:
         sets = 2 * round(0.5 * _RESIDUALS_S / max(_interval_s(self.sets.times_s), 1e-3)) + 1
         total, squared = (
             convolve1d(values, np.ones(sets), mode="constant")
-            for values in (freedom, self.track.chi2[good] * freedom)
+            for values in (freedom, self.track.chi2_per_dof[good] * freedom)
         )
         # A ratio above 1 within its own scatter is not significant.
         ratio = squared / total
@@ -415,14 +417,13 @@ def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
 
 
 def track_by_lasers(
-    sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings | None = None
+    sets: ScanSets, fixed: FixedScanners, robot: Robot, settings: LaserSettings = _DEFAULT
 ) -> LaserTrack:
     """Follow the robot through sets of scans (see `redetect.groundtruth.lasers.tracking`).
 
     If the readings are outside or inside of the outline on all sides, it was drawn too small or too
     large: then its faces are moved, as `outline_moved_m` says.
     """
-    settings = LaserSettings() if settings is None else settings
     allowed_m, moved_m = max(_OUTLINE_M, 0.3 * float(np.max(fixed.sigmas_m))), 0.0
     for _ in range(_OUTLINE_ROUNDS):
         body = robot_body(robot.outline, moved_m)
@@ -442,7 +443,7 @@ def track_by_lasers(
 
 def track_without_suspects(
     sets: ScanSets, fixed: FixedScanners, robot: Robot, scanners: tuple[Scanner, ...],
-    settings: LaserSettings | None = None,
+    settings: LaserSettings = _DEFAULT,
 ) -> tuple[LaserTrack, dict[str, FloatArray]]:  # fmt: skip
     """Follow the robot, excluding scanners whose readings disagree with the others'.
 
@@ -489,10 +490,8 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     of a visit, and if sets have no determined pose.
 
     Sets with an undetermined direction become poses of their own, with a matching covariance; those
-    with an unknown front are dropped. Raises `GroundTruthError` if `sets_per_pose` is not positive.
+    with an unknown front are dropped.
     """
-    if sets_per_pose < 1:
-        raise GroundTruthError(f"sets per pose is {sets_per_pose}: expected 1 or more")
     determined = track.is_determined
     rows = np.flatnonzero(determined | (track.status == SetStatus.UNDETERMINED_DIRECTION))
     if not len(rows):
@@ -502,7 +501,7 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     parted = np.ones(len(rows), dtype=np.bool_)
     parted[1:] = (
         (track.segment[rows[1:]] != track.segment[rows[:-1]])
-        | (np.diff(times) > LARGEST_GAP_S)
+        | (np.diff(times) > max(_LARGEST_GAP_S, _GAP_INTERVALS * _interval_s(track.times_s)))
         | ~determined[rows[1:]]
         | ~determined[rows[:-1]]
     )

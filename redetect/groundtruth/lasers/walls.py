@@ -61,7 +61,7 @@ _WIDE_M, _HELD = 0.3, 1e-3
 _TURN_ARM_M = 3.0
 
 
-class StillScan(NamedTuple):
+class AveragedScan(NamedTuple):
     """Readings of a scanner while nothing moves, averaged beam by beam."""
 
     range_m: FloatArray  # (n,)
@@ -74,26 +74,25 @@ class StillScan(NamedTuple):
         return self.range_m[:, None] * self.direction
 
 
-def still_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> StillScan:
+def averaged_scan(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> AveragedScan:
     """Average scans (N, readings) in which nothing moves.
 
     Without beams that have no reading in half of the scans or jump along an edge, and readings far
     from a beam's median, of passing objects.
     """
-    metres = ranges_mm * 1e-3
-    hit = scanner.has_return(ranges_mm)
-    masked = np.where(hit, metres, np.nan)
-    usable = hit.sum(axis=0) >= max(1.0, 0.5 * len(ranges_mm))
+    metres = scanner.metres(ranges_mm)
+    readings = np.isfinite(metres).sum(axis=0)
+    usable = readings >= max(1.0, 0.5 * len(ranges_mm))
     median = np.full(scanner.readings, np.nan)
-    median[usable] = np.nanmedian(masked[:, usable], axis=0)
-    close = np.abs(masked - median) < 4.0 * max(scanner.sigma_m, 0.005)
+    median[usable] = np.nanmedian(metres[:, usable], axis=0)
+    close = np.abs(metres - median) < 4.0 * max(scanner.sigma_m, 0.005)
     count = close.sum(axis=0)
-    usable &= count >= 0.8 * hit.sum(axis=0)
+    usable &= count >= 0.8 * readings
     mean = np.where(close, metres, 0.0).sum(axis=0)[usable] / count[usable]
     angle = scanner.angles_rad[usable]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    readings = float(np.median(count[usable])) if usable.any() else 1.0
-    return StillScan(mean, direction, max(scanner.sigma_m, 0.003) / math.sqrt(readings))
+    averaged = float(np.median(count[usable])) if usable.any() else 1.0
+    return AveragedScan(mean, direction, max(scanner.sigma_m, 0.003) / math.sqrt(averaged))
 
 
 def first_walls(
@@ -189,7 +188,7 @@ class MapProblem(NamedTuple):
     scanners are fitted together, since they see the same walls.
     """
 
-    scans: Sequence[StillScan]  # One of each scanner
+    scans: Sequence[AveragedScan]  # One of each scanner
     measured: FloatArray  # (poses, 3): measured by hand
     prior: FloatArray  # (3 poses, 3 poses): information of the measured poses
     walls: FloatArray  # (S, 4): pieces of wall, seen from both sides (m)
@@ -281,7 +280,7 @@ class MapProblem(NamedTuple):
         """
         scan, measured = self.scans[0], self.measured[0]
         every = max(1, len(scan.range_m) // _COARSE_READINGS)
-        thin = StillScan(scan.range_m[::every], scan.direction[::every], scan.sigma_m)
+        thin = AveragedScan(scan.range_m[::every], scan.direction[::every], scan.sigma_m)
         coarse = self._replace(scans=[thin])
         wide = _START_SIGMAS / np.sqrt(np.diag(self.prior))
         grid = [measured + wide * shift for shift in product((0.0, -1.0, 1.0), repeat=3)]

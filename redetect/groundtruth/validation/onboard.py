@@ -23,10 +23,10 @@ from redetect.groundtruth.fusion.clock import ClockModel
 from redetect.groundtruth.lasers.icp import nearest_on_segments
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.walls import (
+    AveragedScan,
     MapProblem,
-    StillScan,
+    averaged_scan,
     first_walls,
-    still_scan,
     wall_curves,
 )
 from redetect.groundtruth.trajectories.streams import pose_differences
@@ -63,11 +63,11 @@ class Onboard:
     scans: Scans
 
 
-class StillScans(NamedTuple):
+class AveragedScans(NamedTuple):
     """Averaged scans of the scanners on board while the robot is at rest."""
 
     scanners: tuple[Scanner, ...]
-    scans: tuple[StillScan, ...]
+    scans: tuple[AveragedScan, ...]
 
     @property
     def mounts(self) -> FloatArray:
@@ -100,7 +100,7 @@ class ReferencePose:
     note: str  # Why the scans are not used
     points: int = 0  # Number of points of the scans that are matched to walls
     rms_m: float = math.nan  # Of their distances from the walls; NaN without points
-    still: StillScans | None = None  # The averaged scans of the scanners on board
+    still: AveragedScans | None = None  # The averaged scans of the scanners on board
 
     @property
     def index(self) -> int:
@@ -154,30 +154,30 @@ def reference_poses(
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
         elif onboard and segments is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            references.append(refined_by_walls(d, still_scans(onboard, time), segments))
+            references.append(refined_by_walls(d, averaged_scans(onboard, time), segments))
         else:
             references.append(_unrefined(d, ScanUse.NOT_ASKED))
     return references, refused
 
 
 def _unrefined(
-    d: DistancePose, scans: ScanUse, reason: str = "", still: StillScans | None = None
+    d: DistancePose, scans: ScanUse, reason: str = "", still: AveragedScans | None = None
 ) -> ReferencePose:
     """The pose from distances alone."""
     return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
 
 
-def still_scans(onboard: Sequence[Onboard], time_s: float) -> StillScans:
+def averaged_scans(onboard: Sequence[Onboard], time_s: float) -> AveragedScans:
     """Average the readings of the scanners on board around a time on the robot's clock."""
     scans = []
     for board in onboard:
         during = np.abs(board.scans.times_s - time_s) <= _STILL_S
-        scans.append(still_scan(board.scanner, board.scans.ranges_mm[during]))
-    return StillScans(tuple(board.scanner for board in onboard), tuple(scans))
+        scans.append(averaged_scan(board.scanner, board.scans.ranges_mm[during]))
+    return AveragedScans(tuple(board.scanner for board in onboard), tuple(scans))
 
 
 def refined_by_walls(
-    distances: DistancePose, still: StillScans, segments: FloatArray
+    distances: DistancePose, still: AveragedScans, segments: FloatArray
 ) -> ReferencePose:
     """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
     prior, covariance = distances.pose, distances.covariance

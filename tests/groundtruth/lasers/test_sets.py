@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.lasers.acquisition import (
     fixed_scanners,
     learn_background,
@@ -14,7 +13,7 @@ from redetect.groundtruth.lasers.acquisition import (
 )
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.tracking_kernels import FixedScanners
-from tests.groundtruth.lasers.scene import empty_scans, four_scanners
+from tests.groundtruth.lasers.scene import empty_scans, four_scanners, scanner
 
 FloatArray = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ def test_background_is_learned() -> None:
     ranges[:, 1] = 0  # sees nothing
     ranges[rng.random(500) < 0.3, 2] = 0  # drops out
     ranges[:5, 3] = 1000  # somebody passed
-    near_m, quantum_m = learn_background(ranges, 20.0)
+    near_m, quantum_m = learn_background(scanner("a", np.zeros(3)), ranges)
     assert np.isinf(near_m[1])
     assert quantum_m == pytest.approx(0.01)
     assert np.all((near_m[[0, 2, 3]] > 2.85) & (near_m[[0, 2, 3]] < 2.97))
@@ -49,7 +48,8 @@ def test_codes_of_beams_without_return_hide_no_rounding() -> None:
     """Scanners write 8191, for example, where nothing is in reach."""
     ranges = np.full((10, 2), 3010, dtype=np.uint16)
     ranges[:, 1] = 8191
-    _, quantum_m = learn_background(ranges + np.arange(0, 100, 10, dtype=np.uint16)[:, None], 8.0)
+    ranges += np.arange(0, 100, 10, dtype=np.uint16)[:, None]
+    _, quantum_m = learn_background(scanner("a", np.zeros(3), max_range_m=8.0), ranges)
     assert quantum_m == pytest.approx(0.01)
 
 
@@ -60,11 +60,6 @@ def test_background_raises_no_false_alarm(
     for k, scans in enumerate(fresh):
         new = (scans.ranges_mm > 0) & (scans.ranges_mm < tables.near_mm[k])
         assert new.mean() < 1e-4
-
-
-def test_background_of_no_scans() -> None:
-    with pytest.raises(GroundTruthError, match="empty scans"):
-        learn_background(np.zeros((0, 5), dtype=np.uint16), 8.0)
 
 
 def test_sets_use_every_scan_once() -> None:
@@ -84,8 +79,3 @@ def test_sets_use_every_scan_once() -> None:
     at = np.where(seen, times[sets.rows], 0.0)
     assert (sets.times_s[:, None] - at)[seen] == pytest.approx(sets.ages_s[seen])
     assert np.all(np.where(seen, sets.ages_s, 0.0).sum(axis=1) == pytest.approx(0.0, abs=1e-9))
-
-
-def test_no_scans_at_all() -> None:
-    with pytest.raises(GroundTruthError, match="no scans"):
-        sets_of_scans([Scans(np.zeros(0), np.zeros((0, 5), dtype=np.uint16))])
