@@ -208,7 +208,7 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
     assert main(["import", str(odd / "Robot1_Measurement.dat"), "-o", target]) == 1
     assert "expected a RobotN_Odometry.dat" in capsys.readouterr().err
     assert main(["import", str(odd / "aa3_dr.mat"), "-o", target]) == 1
-    assert "aa3_dr.mat: cannot be read ([Errno 2] No such" in capsys.readouterr().err
+    assert "aa3_dr.mat: no such MATLAB file" in capsys.readouterr().err
     (odd / "aa3_dr.mat").write_text("no matrix")
     assert main(["import", str(odd / "aa3_dr.mat"), "-o", target]) == 1
     assert "aa3_dr.mat: cannot be read" in capsys.readouterr().err
@@ -255,7 +255,12 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         ),
         ("Robot1_Groundtruth", "5 1 0 0\n5.5 1 0 0\n", None),
         ("Landmark_Groundtruth", "6 1 0 0 0\n6 1 0 0 0\n", "expected landmarks, each once"),
-        ("Landmark_Groundtruth", "6.5 1 0 0 0\n", "expected landmarks, each once, with whole"),
+        ("Landmark_Groundtruth", "6.5 1 0 0 0\n", "subject 6.5: expected a whole number"),
+        ("Landmark_Groundtruth", "1e20 1 0 0 0\n", "subject 1e+20: expected a whole number"),
+        ("Landmark_Groundtruth", "6 1 0 -1 0\n", "and sigmas of 0 or more"),
+        ("Barcodes", "6 1e20\n", "Barcodes.dat: barcode 1e+20: expected a whole number"),
+        ("Barcodes", "6 5.2\n7 5.1\n", "Barcodes.dat: barcode 5.2: expected a whole number"),
+        ("Robot1_Measurement", "5 5.6 1 0\n", "Measurement.dat: barcode 5.6: expected a whole"),
         ("Landmark_Groundtruth", "", "expected landmarks"),
     ],
 )
@@ -384,6 +389,26 @@ def test_a_car_out_of_time_is_refused(
     target = str(tmp_path / "run.circles")
     assert main(["import", str(tmp_path / "aa3_dr.mat"), "-o", target]) == 1
     assert told in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("compressed", "place", "junk"),
+    [(False, 177, b"\xff"), (False, 136, None), (True, 150, b"\xff"), (True, 150, None)],
+)
+def test_a_damaged_file_of_the_car_is_refused(
+    compressed: bool,
+    place: int,
+    junk: bytes | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The first one ends SciPy's process."""
+    file = tmp_path / "aa3_dr.mat"
+    savemat(file, {"time": [0, 1], "speed": [1, 1], "steering": [0, 0]}, do_compression=compressed)
+    whole = file.read_bytes()
+    file.write_bytes(whole[:place] + (b"" if junk is None else junk + whole[place + 1 :]))
+    assert main(["import", str(file), "-o", str(tmp_path / "run.circles")]) == 1
+    assert "aa3_dr.mat: cannot be read" in capsys.readouterr().err
 
 
 def test_trunks_are_found_where_nothing_hides_them() -> None:

@@ -11,7 +11,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.plane import between
 from redetect.slam.filters.localizer import localize_run
-from redetect.slam.formats.ranges import Noise, Sightings, learned
+from redetect.slam.formats.ranges import Noise, Sightings, estimate_noise
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 
@@ -61,7 +61,7 @@ def test_the_noise_of_ranges_bearings_and_steps_is_learned(
     ranges: float, bearings: float, steps: float
 ) -> None:
     run, seen, *_ = _run(np.random.default_rng(1), ranges, bearings, steps)
-    _, noise = learned(run, seen, _stated(seen))
+    _, noise = estimate_noise(run, seen, _stated(seen))
     assert noise.ranges == pytest.approx(ranges, rel=0.1)
     assert noise.bearings == pytest.approx(bearings, rel=0.1)
     assert noise.steps == pytest.approx(steps, rel=0.15)
@@ -73,7 +73,7 @@ def test_the_noise_of_ranges_bearings_and_steps_is_learned(
 def test_errors_of_a_landmark_that_are_alike_are_found() -> None:
     """Ten sightings of a landmark with one error are worth hardly more than one."""
     run, seen, *_ = _run(np.random.default_rng(2), 1.0, 1.0, 1.0, alike=0.8)
-    found, noise = learned(run, seen, _stated(seen))
+    found, noise = estimate_noise(run, seen, _stated(seen))
     assert noise.ranges_alike == pytest.approx(0.8, abs=0.2)
     assert noise.bearings_alike < 0.1
     xy = found.circles.xy
@@ -86,7 +86,7 @@ def test_poses_in_a_map_have_the_errors_that_are_stated_despite_misread_landmark
     run, seen, poses, places = _run(rng, 0.6, 1.7, 1.3)
     misread = rng.random(len(seen.ids)) < 0.02
     ids = np.where(misread, 6 + (seen.ids - 6 + rng.integers(1, 12, len(misread))) % 12, seen.ids)
-    found, noise = learned(run, seen._replace(ids=ids), _stated(seen))
+    found, noise = estimate_noise(run, seen._replace(ids=ids), _stated(seen))
     lost = found.circles.ids == UNKNOWN_ID
     assert noise.wrong == np.count_nonzero(lost)
     assert np.mean(lost[misread]) > 0.8
@@ -105,7 +105,7 @@ def test_steps_that_are_too_long_and_turn_too_little_are_corrected() -> None:
     run, seen, poses, _ = _run(np.random.default_rng(4), 1.0, 1.0, 0.5)
     way = np.hypot(run.steps[:, 0], run.steps[:, 1])
     wrong = run.steps * [1.05, 1.05, 1.0] - way[:, None] * [0.0, 0.0, 0.05]
-    found, _ = learned(replace(run, steps=wrong), seen, _stated(seen))
+    found, _ = estimate_noise(replace(run, steps=wrong), seen, _stated(seen))
     exact = between(poses[:-1], poses[1:])
     drift = [abs(np.sum((steps - exact)[:, 2])) for steps in (wrong, found.steps)]
     assert drift[1] < 0.2 * drift[0]
@@ -124,7 +124,7 @@ def test_a_run_that_shows_little_has_the_usual_noise() -> None:
         seen.bearing_rad[first],
         seen.ids[first],
     )
-    found, noise = learned(part, few, _stated(few))
+    found, noise = estimate_noise(part, few, _stated(few))
     assert noise == Noise()
     np.testing.assert_array_equal(found.step_covariance, ASSUMED.covariance(part.steps))
 
@@ -133,7 +133,7 @@ def test_a_run_without_a_map_has_the_usual_noise() -> None:
     rng = np.random.default_rng(6)
     run, seen, *_ = _run(rng, 1.0, 1.0, 1.0)
     shuffled = seen._replace(ids=rng.permutation(seen.ids))  # no map explains them
-    found, noise = learned(run, shuffled, _stated(seen))
+    found, noise = estimate_noise(run, shuffled, _stated(seen))
     assert noise == Noise()
     assert "usual" in noise.sentence()
     np.testing.assert_array_equal(found.circles.ids, shuffled.ids)
@@ -142,7 +142,7 @@ def test_a_run_without_a_map_has_the_usual_noise() -> None:
 def test_a_run_without_errors_has_the_usual_noise() -> None:
     """Learned errors would be below the resolution of a log."""
     run, seen, *_ = _run(np.random.default_rng(7), 0.0, 0.0, 0.0)
-    found, noise = learned(run, seen, _stated(seen))
+    found, noise = estimate_noise(run, seen, _stated(seen))
     assert noise == Noise()
     assert np.isfinite(found.step_covariance).all()
 
@@ -157,6 +157,6 @@ def test_a_robot_that_stands_still_has_finite_covariances(seed: int) -> None:
         bearing_rad=0.4 * (seen.ids % 3) + STATED[1] * rng.standard_normal(count),
         ids=6 + seen.ids % 3,
     )
-    found, _ = learned(still, seen, _stated(seen))
+    found, _ = estimate_noise(still, seen, _stated(seen))
     assert np.isfinite(found.step_covariance).all()
     assert np.isfinite(found.circles.covariance).all()

@@ -14,15 +14,17 @@ algorithm for real-time implementation", IEEE Transactions on Robotics and Autom
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 from scipy.optimize import least_squares
 
 from redetect.array_types import FloatArray, IntArray
@@ -36,17 +38,18 @@ from redetect.slam.formats.ranges import (
     Noise,
     Sightings,
     discs_of_ranges,
-    learned,
+    estimate_noise,
     places_of,
-    with_usual_noise,
+    with_noise,
 )
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
-from redetect.storage.bounded import rows_of_numbers
+from redetect.storage.bounded import read_content, rows_of_numbers
 
 #: Suffixes of the names of a robot's odometry and of the files beside it.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
 LANDMARKS, BARCODES = "Landmark_Groundtruth.dat", "Barcodes.dat"
 _ROBOTS = 5
+_LARGEST_ID = 2**31 - 1
 #: Most that the clock of a robot's log may go back, seconds.
 _SET_BACK_S = 1.0
 # A log has a gap if nothing is logged for this many of its usual intervals, and this time.
@@ -69,6 +72,7 @@ _LATE_S = 0.08
 
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
+_LARGEST_BYTES = 1 << 28
 # The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
 _AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
 _MOST_STEERING_RAD = 1.2
@@ -135,8 +139,10 @@ def _seen_by_robot(odometry: Path, *, calibrated: bool) -> Sightings:
     measurements, listed = _beside(odometry, MEASUREMENTS), odometry.with_name(BARCODES)
     seen = _table(measurements, "time barcode range bearing")
     barcodes = _table(listed, "subject barcode")
-    subject = {int(barcode): int(number) for number, barcode in barcodes}
-    ids = np.array([subject.get(int(barcode), 0) for barcode in seen[:, 1]], dtype=np.int64)
+    numbers = (_whole(listed, "barcode", barcodes[:, 1]), _whole(listed, "subject", barcodes[:, 0]))
+    subject = dict(zip(*(each.tolist() for each in numbers)))
+    shown = _whole(measurements, "barcode", seen[:, 1]).tolist()
+    ids = np.array([subject.get(barcode, 0) for barcode in shown], dtype=np.int64)
     seen, ids = seen[ids > _ROBOTS], ids[ids > _ROBOTS]
     for k in np.flatnonzero(seen[:, 2] <= 0.0)[:1]:
         raise SlamError(
@@ -236,9 +242,9 @@ def read_robot(
     rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
     run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
     if calibrated and sigma_m is None and sigma_rad is None:
-        run, noise = learned(run, seen, sigma)
+        run, noise = estimate_noise(run, seen, sigma)
     elif calibrated and sigma_m is None:
-        run = with_usual_noise(run, seen, sigma)
+        run = with_noise(run, seen, sigma)
     return run, response, noise
 
 
@@ -340,12 +346,13 @@ def read_landmarks(path: Path) -> LandmarkMap:
     """`Landmark_Groundtruth.dat` (subject, x, y and their standard deviations) as a map."""
     table = _table(path, "subject x y x_sigma y_sigma")
     table = table[np.argsort(table[:, 0])]
-    if not len(table) or np.any(table[:, 0] % 1.0) or not np.all(np.diff(table[:, 0]) > 0.0):
-        raise SlamError(f"{path}: expected landmarks, each once, with whole numbers as subjects")
+    ids = _whole(path, "subject", table[:, 0])
+    if not len(ids) or not np.all(np.diff(ids) > 0) or np.any(table[:, 3:] < 0.0):
+        raise SlamError(f"{path}: expected landmarks, each once, and sigmas of 0 or more")
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    discs = Landmarks(table[:, 0].astype(np.int64), to_dataset(table[:, 1:3]), covariance, count)
+    discs = Landmarks(ids, to_dataset(table[:, 1:3]), covariance, count)
     return LandmarkMap(discs, no_landmarks())
 
 
@@ -402,6 +409,13 @@ def _table(path: Path, names: str) -> FloatArray:
     if np.any(np.abs(np.array(rows)) > LARGEST_NUMBER):
         raise SlamError(f"{path}: expected numbers within +-{LARGEST_NUMBER:g}")
     return np.array(rows, dtype=np.float64).reshape(-1, len(names.split()))
+
+
+def _whole(path: Path, name: str, numbers: FloatArray) -> IntArray:
+    """A column of identifiers (n,)."""
+    for number in numbers[(numbers % 1.0 != 0.0) | (numbers < 0.0) | (numbers > _LARGEST_ID)][:1]:
+        raise SlamError(f"{path}: {name} {number:g}: expected a whole number, 0 to {_LARGEST_ID}")
+    return numbers.astype(np.int64)
 
 
 def read_drive(
@@ -465,10 +479,13 @@ def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
+    content = read_content(path, _LARGEST_BYTES, "MATLAB file", SlamError)
     try:
-        content = loadmat(str(path))
-        arrays = [np.asarray(np.real_if_close(content[name]), np.float64) for name in names]
-    except (OSError, TypeError, ValueError, KeyError, NotImplementedError, MatReadError) as error:
+        # In a process of its own, which a damaged file may crash.
+        with ProcessPoolExecutor(1, get_context("spawn")) as reader:
+            found = reader.submit(loadmat, io.BytesIO(content)).result()
+        arrays = [np.asarray(np.real_if_close(found[name]), np.float64) for name in names]
+    except Exception as error:  # damage can raise almost any
         raise SlamError(
             f"{path}: cannot be read ({error}): expected a MATLAB file with {', '.join(names)}"
         ) from None

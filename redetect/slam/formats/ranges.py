@@ -20,7 +20,7 @@ from redetect.landmarks import wrap_angle
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
 from redetect.slam.mapping.odometry_check import check_odometry
-from redetect.slam.mapping.run_map import map_run
+from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, Recording
 
@@ -30,8 +30,8 @@ _OUT_OF_VIEW_S = 2.5
 _MOST_FACTOR = 20.0
 # Fewest redundant numbers of a run that show its noise.
 _FEWEST_NUMBERS = 100
-# Maps in which the noise is learned: a robust one, then least squares of the rows that fit.
-_ROUNDS = 6
+# Maps in which the noise is learned: least squares of the rows that fit a robust map.
+_ROUNDS = 5
 # How much the lengths of steps vary, and their turns per metre (rad/m).
 _LENGTH_SIGMA, _TURN_SIGMA = 0.1, 0.05
 # A row is wrong if its squared error is less probable than this; the median of squared errors.
@@ -57,17 +57,19 @@ class Noise(NamedTuple):
     bearings_alike: float = 0.0
     steps: float = 1.0  # their standard deviation over the stated one
     wrong: int = 0  # number of rows that contradict the others, and have lost their identifier
-    is_learned: bool = False
 
     def sentence(self) -> str:
         """Description of the noise."""
-        if not self.is_learned:
+        if self == USUAL:
             return "the run does not show how large its errors are: they are taken to be usual ones"
         return (
             f"errors of ranges are {self.ranges:.2f}, of bearings {self.bearings:.2f}, of steps "
             f"{self.steps:.2f} times the usual ones, a landmark's correlated by "
             f"{self.ranges_alike:.2f}, {self.bearings_alike:.2f}; {self.wrong} rows are wrong"
         )
+
+
+USUAL = Noise()
 
 
 def discs_of_ranges(
@@ -87,12 +89,27 @@ def discs_of_ranges(
     return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
 
 
-def with_usual_noise(run: Recording, seen: Sightings, sigma: FloatArray) -> Recording:
-    """A run with rows of the usual noise; parameters as for `learned`."""
-    return _with_noise(run, seen, sigma, _visits(seen), Noise())
+def with_noise(
+    run: Recording,
+    seen: Sightings,
+    sigma: FloatArray,
+    noise: Noise = USUAL,
+    ids: IntArray | None = None,
+) -> Recording:
+    """A run with rows of some noise, by default the usual one; parameters as in `estimate_noise`.
+
+    The n rows of a visit, with a correlation c, have the weight of n / (1 + (n - 1) c). Some may
+    have lost their identifiers: `ids` (n,).
+    """
+    visits = _visits(seen)
+    others = np.bincount(visits)[visits, None] - 1.0
+    together = 1.0 + others * [noise.ranges_alike, noise.bearings_alike]
+    sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
+    return replace(run, circles=CircleRows(seen.frame, *rows, seen.ids if ids is None else ids))
 
 
-def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
+def estimate_noise(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
     """A run with covariances as large as its errors, and without identifiers that are wrong.
 
     Steps become longer or shorter, and turn more or less in each metre, as fits the rows best.
@@ -112,56 +129,67 @@ def learned(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recordi
     Recording, Noise
         With the usual noise if the run shows too little of its own, or no map of it is found.
     """
-    noise, assumed = Noise(), ASSUMED.covariance(run.steps)
+    assumed = ASSUMED.covariance(run.steps)
     stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]
     further = np.where(stated, run.step_covariance - assumed, 0.0)
-    visits = _visits(seen)
-    run = replace(run, step_covariance=assumed + further)
-    run = _with_noise(run, seen, sigma, visits, noise)
-    usually, steps, longer, turn = (run, noise), run.steps, 0.0, 0.0
-    if 2 * (len(seen.ids) - len(np.unique(seen.ids))) < _FEWEST_NUMBERS:
-        return usually
-    for number in range(_ROUNDS):
-        robust = Weighting(loss="none" if number else "geman-mcclure")
-        try:
-            mapped = map_run(run, weighting=robust)
-        except SlamError:  # no minimum, undetermined poses, or no row with an identifier
-            return usually
-        place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
-        x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
-        off = wrap_angle(seen.bearing_rad - np.arctan2(x, -y))
-        error = np.stack([seen.range_m - np.hypot(x, y), off], axis=1) / sigma
-        squared = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1)
-        unlike = 1.0 if number else max(1.0, float(np.nanmedian(squared)) / _MEDIAN)
-        right = squared <= unlike * _WRONG
-        if not right.any():
-            return usually
-        if number:
-            table = mapped.table
-            check = check_odometry(mapped)
-            if not (check.rows_factor > 0.0 and check.odometry_factor > 0.0):  # NaN if too few
-                return usually
-            # The share of the numbers of rows that the others check.
-            redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
-            variance = np.mean(error[right] ** 2, axis=0) / redundant
-            of_steps = noise.steps * math.sqrt(check.odometry_factor)
-            factors = np.append(np.sqrt(variance), of_steps)
-            if not np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)):
-                return usually
-            alike = np.clip(_products(error[right], visits[right]) / variance, 0.0, 1.0)
-            wrong = int(np.count_nonzero(~right))
-            noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, wrong, True])
-            longer = (1.0 + longer) * (1.0 + check.length) - 1.0
-            longer /= 1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2
-            turn += check.turn_per_metre
-            turn /= 1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2
-            corrected = steps * [1.0 + longer, 1.0 + longer, 1.0]
-            corrected[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
-            step_covariance = noise.steps**2 * assumed + further
-            run = replace(run, steps=corrected, step_covariance=step_covariance)
-        trusted = seen._replace(ids=np.where(right, seen.ids, UNKNOWN_ID))
-        run = _with_noise(run, trusted, sigma, visits, noise)
+    run = with_noise(replace(run, step_covariance=assumed + further), seen, sigma)
+    try:
+        return _with_own_noise(run, seen, sigma, further)
+    except SlamError:  # also: no minimum, undetermined poses, or no row with an identifier
+        return run, USUAL
+
+
+def _with_own_noise(
+    run: Recording, seen: Sightings, sigma: FloatArray, further: FloatArray
+) -> tuple[Recording, Noise]:
+    """`estimate_noise` of a run with the usual noise, and `further` covariances (N, 3, 3) of steps;
+    `SlamError` if it does not show its own.
+    """
+    _demand_shown(2 * (len(seen.ids) - len(np.unique(seen.ids))) >= _FEWEST_NUMBERS)
+    noise, visits, steps, longer, turn = USUAL, _visits(seen), run.steps, 0.0, 0.0
+    error = _errors(map_run(run, weighting=Weighting(loss="geman-mcclure")), seen) / sigma
+    squared = np.sum(error**2, axis=1)
+    right = squared <= max(1.0, float(np.nanmedian(squared)) / _MEDIAN) * _WRONG
+    run = with_noise(run, seen, sigma, noise, np.where(right, seen.ids, UNKNOWN_ID))
+    for _ in range(_ROUNDS):
+        mapped = map_run(run)
+        error = _errors(mapped, seen) / sigma
+        right = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1) <= _WRONG
+        table, check = mapped.table, check_odometry(mapped)
+        # Factors are NaN if there are too few numbers.
+        _demand_shown(right.any() and check.rows_factor > 0.0 and check.odometry_factor > 0.0)
+        # The share of the numbers of rows that the others check.
+        redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
+        variance = np.mean(error[right] ** 2, axis=0) / redundant
+        of_steps = noise.steps * math.sqrt(check.odometry_factor)
+        factors = np.append(np.sqrt(variance), of_steps)
+        _demand_shown(np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)))
+        alike = np.clip(_products(error[right], visits[right]) / variance, 0.0, 1.0)
+        wrong = int(np.count_nonzero(~right))
+        noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, wrong])
+        longer = (1.0 + longer) * (1.0 + check.length) - 1.0
+        longer /= 1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2
+        turn += check.turn_per_metre
+        turn /= 1.0 + (check.turn_per_metre_sigma / _TURN_SIGMA) ** 2
+        corrected = steps * [1.0 + longer, 1.0 + longer, 1.0]
+        corrected[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
+        spread = noise.steps**2 * ASSUMED.covariance(steps) + further
+        run = replace(run, steps=corrected, step_covariance=spread)
+        run = with_noise(run, seen, sigma, noise, np.where(right, seen.ids, UNKNOWN_ID))
     return run, noise
+
+
+def _demand_shown(shown: bool | np.bool_) -> None:
+    if not shown:
+        raise SlamError("the run does not show its noise")
+
+
+def _errors(mapped: MappedRun, seen: Sightings) -> FloatArray:
+    """(n, 2) errors of ranges (m) and bearings (rad) in a map; NaN if a landmark is not in it."""
+    place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
+    x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
+    off = wrap_angle(seen.bearing_rad - np.arctan2(x, -y))
+    return np.stack([seen.range_m - np.hypot(x, y), off], axis=1)
 
 
 def _visits(seen: Sightings) -> IntArray:
@@ -187,16 +215,3 @@ def places_of(ids: IntArray, known: IntArray, xy: FloatArray) -> FloatArray:
     """Places (n, 2) of landmarks (n,), of `known` (m,), ascending, at `xy` (m, 2); else NaN."""
     index = np.minimum(np.searchsorted(known, ids), len(known) - 1)
     return np.where((known[index] == ids)[:, None], xy[index], np.nan)
-
-
-def _with_noise(
-    run: Recording, seen: Sightings, sigma: FloatArray, visits: IntArray, noise: Noise
-) -> Recording:
-    """The run with rows of this noise: the n of a visit, with a correlation c, have the weight of
-    n / (1 + (n - 1) c).
-    """
-    others = np.bincount(visits)[visits, None] - 1.0
-    together = 1.0 + others * [noise.ranges_alike, noise.bearings_alike]
-    sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
-    return replace(run, circles=CircleRows(seen.frame, *rows, seen.ids))
