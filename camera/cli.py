@@ -1,6 +1,7 @@
 """The command ``camera``.
 
-Exit codes: 0 success; 1 the command failed; 2 wrong command line; 130 interrupted, without output.
+Exit codes: 0 success; 1 the command failed; 2 wrong command line; 3 some frames of `camera level`
+could not be processed (the others were); 130 interrupted, without output.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ BearingConvention = Literal["level", "published"]
 Joining = Literal["evidence", "equal"]
 
 #: Widths of filters: wider ones see no line, and take memory without bound.
+WIDEST_FILTER_PX = 100.0
 FilterWidth = Annotated[float, Bounds("above 0, at most 100", lambda x: 0.0 < x <= 100.0)]
 _WIDTH = Bounds("a number above 1, at most 10", lambda x: 1.0 < x <= 10.0)
 

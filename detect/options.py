@@ -280,7 +280,7 @@ class Draw(SomeFramesFlags):
     """
 
     video: MaybePath = None  #: Write an MP4 file as well, or instead.
-    fps: Positive = 10.0  #: Frames per second of the video.
+    fps: Annotated[MaybeFloat, ABOVE_0] = None  #: Frames per second of the video, by default 10.
     files: OmitArgPrefixes[RowFiles] = field(default_factory=RowFiles)
 
 
@@ -391,7 +391,7 @@ class Tune(SomeFramesFlags):
 
 
 @dataclass(frozen=True)
-class Export:
+class Export(Bounded, error=DetectError):
     """Write the rows of a file in another format, with named columns and units.
 
     Example: detect export images/e/map.circles --to csv -o /tmp/discs.csv, or:
@@ -411,5 +411,5 @@ class Export:
     #: detected together (detected.times).
     times: MaybePath = None
     #: Frame rate to use without times, the first frame at 0 s. MCAP needs one or the other.
-    rate_hz: MaybeFloat = None
+    rate_hz: Annotated[MaybeFloat, ABOVE_0] = None
     force: bool = False  #: Replace existing files.

@@ -104,6 +104,8 @@ def open_rows(run: ImageRun, options: RowFiles) -> RunRows:
         path = named or run.folder / f"map.{kind}"
         if named is not None and not named.is_file():
             raise DetectError(f"{named}: no such file: expected reference rows")
+        if named is not None and kind not in detected:
+            raise DetectError(f"{named}: nothing to compare: expected {usual[kind]} as well")
         if kind in detected and path.is_file():
             reference[kind] = path
     return RunRows(detected, reference)

@@ -51,9 +51,13 @@ def read_settings(path: Path) -> SettingsFile:
     given = document.get("settings") if isinstance(document, dict) else None
     if not isinstance(given, dict):
         raise DetectError(f'{path}: no "settings": expected those of circles, lines or markers')
-    kinds = get_type_hints(SettingsFile).items()
+    kinds = get_type_hints(SettingsFile)
+    unknown = sorted(given.keys() - kinds.keys())
+    if unknown or not given:
+        wrong = excerpt(unknown[0]) if unknown else "no settings"
+        raise DetectError(f"{path}: {wrong}: expected those of {', '.join(kinds)}")
     try:
-        return SettingsFile(**{n: checked_settings(n, given.get(n, {}), k) for n, k in kinds})
+        return SettingsFile(**{n: checked_settings(n, v, kinds[n]) for n, v in given.items()})
     except DetectError as error:
         raise DetectError(f"{path}: {error}") from None
 

@@ -91,7 +91,9 @@ class TuningSession:
         if frame.image is None or frame.discs is None:
             raise DetectError(str(frame.error))
         found = frame.discs
-        explained = explain_discs(frame.image, self.run.camera, settings)
+        explained = None
+        if settings.refine:  # otherwise, centres are rejected for their quality only
+            explained = explain_discs(frame.image, self.run.camera, settings)
         rows = zip(found.floor_xy, found.covariance, found.quality, found.evidence, strict=True)
         discs = [
             {
@@ -107,10 +109,11 @@ class TuningSession:
         ]
         rejected = [
             {**row, "outline": self._outline((row["x_m"], row["y_m"]), settings.radius_m)}
-            for row in explained.records()
+            for row in (explained.records() if explained else ())
             if row["stage"] != "disc"
         ]
-        return {"discs": discs, "rejected": rejected, "suggestions": list(explained.suggestions)}
+        suggestions = list(explained.suggestions) if explained else []
+        return {"discs": discs, "rejected": rejected, "suggestions": suggestions}
 
     def _outline(self, centre_xy: Any, radius_m: float) -> list[list[float]]:
         places = self.run.camera.project_floor(circle_on_floor(centre_xy, radius_m, _OUTLINE))

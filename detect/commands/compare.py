@@ -9,6 +9,7 @@ from rich.console import Console
 from detect.comparison.compare import compare_run
 from detect.comparison.report import comparison_tables
 from detect.comparison.result import DiscComparison
+from detect.errors import CompareError
 from detect.options import Compare
 from redetect.command_line import EXIT_ERROR
 from redetect.storage import write_bytes
@@ -16,6 +17,8 @@ from redetect.storage import write_bytes
 
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
+    if command.lines and (command.camera or command.matching.gate_m):
+        raise CompareError("--camera, --gate-m: expected discs, not --lines: for them, bearings")
     result = compare_run(
         command.run,
         "lines" if command.lines else "circles",

@@ -35,6 +35,8 @@ def perform(options: Draw) -> int:
     """Execute the command; returns the exit code."""
     if options.output is None and options.video is None:
         raise DetectError("no output: expected a folder (-o) or a file (--video)")
+    if options.video is None and options.fps is not None:
+        raise DetectError("--fps: expected a video beside it: --video FILE")
     demand_recording(options.run)
     run = open_source(options.run, options.camera, options.source)
     run = replace(run, frames=SomeFrames(run.frames, every=options.every))
@@ -49,7 +51,9 @@ def perform(options: Draw) -> int:
     if options.output is not None:
         demand_pictures(run.frames, options.output, overwrite=options.force)
     force, path = options.force, options.video
-    with nullcontext() if path is None else mp4(path, options.fps, overwrite=force) as video:
+    with (
+        nullcontext() if path is None else mp4(path, options.fps or 10.0, overwrite=force) as video
+    ):
         drawn, blank, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:
@@ -72,6 +76,7 @@ def draw_run(
     With the plan of their detection, verticals are drawn as tracks, and markers with the rejected
     candidates. Returns the numbers of pictures and of those without rows, and why frames have none.
     """
+    written = set[Path]()
     drawn, blank, failures = 0, 0, list[str]()
     projection = rows.projection(run.camera) if isinstance(run, Run) else None
     with progress_bar("pictures", run.frames.expected) as advance:
@@ -88,7 +93,10 @@ def draw_run(
                 if plan is not None:
                     picture = _with_rejected(picture, image, frame, plan)
                 if folder is not None:
-                    write_bytes(folder / f"{name}.png", png_of(picture), overwrite=overwrite)
+                    place = folder / f"{name}.png"
+                    # Several steps may name one image.
+                    write_bytes(place, png_of(picture), overwrite=overwrite or place in written)
+                    written.add(place)
                 if video is not None:
                     video(picture)
                 drawn, blank = drawn + 1, blank + (not processed(image_rows))

@@ -24,11 +24,15 @@ def perform(command: Explain) -> int:
     for path in (command.output, command.json):
         if path is not None:
             demand_place(path, overwrite=command.force)
+    if not command.detector.refine:
+        raise DetectError(
+            "--no-refine: centres are rejected for their quality only: nothing else to explain"
+        )
     if not command.image.is_file():
         raise DetectError(f"{command.image}: no such image: expected one image of a run")
     folders = command.image.absolute().parents[:2]
-    beside = next(filter(None, map(camera_in, folders)), None)
-    camera = beside if command.camera is None else read_camera(command.camera)
+    named = command.camera and read_camera(command.camera)
+    camera = named or next(filter(None, map(camera_in, folders)), None)
     if camera is None:
         raise DetectError(
             f"{command.image}: no calibration: expected a .cam file in its folder or the one "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import codecs
 import csv
-import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -60,8 +59,6 @@ def perform(command: Export) -> int:
             f"{file}: is a calibration, not rows: camera convert {file} "
             "cameras.txt writes it for COLMAP (or for OpenCV, ROS, Kalibr)"
         )
-    if rate_hz is not None and not 0.0 < rate_hz < math.inf:
-        raise DetectError(f"rate_hz is {rate_hz:g}: expected above 0")
     if rate_hz is not None and command.times is not None:
         raise DetectError("both --times and --rate-hz say when frames are: expected one of them")
     if to == "parquet":

@@ -33,24 +33,24 @@ def perform(options: Level) -> int:
     """Execute the command; returns the exit code."""
     demand_place(options.output, overwrite=options.force)
     run = open_run(options.run, options.camera)
-    mounting = _mounting(run, run.camera, options.radius_m)
+    mounting, failures = _mounting(run, run.camera, options.radius_m)
     if abs(mounting.raised_m) > HEIGHT_STEPS[-1] * run.camera.centre[2]:
         # Far from the right height, only things of another size are taken for discs.
-        again = _mounting(run, remounted(run.camera, mounting), options.radius_m)
+        again, _ = _mounting(run, remounted(run.camera, mounting), options.radius_m)
         near = abs(again.raised_m) < _MOST_SIGMAS * again.raised_sigma_m
         if not near or again.frames_with_discs < _STILL_SEEN * mounting.frames_with_discs:
             mounting = replace(mounting, raised_m=math.nan, raised_sigma_m=math.nan)
     print("\n".join(mounting.sentences()))
     write_camera(remounted(run.camera, mounting), options.output, overwrite=options.force)
     print(f"written: {options.output}")
-    return 0
+    return report_failures(len(failures), failures)
 
 
-def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
-    """The mounting of a run's camera, compared with the given one."""
+def _mounting(run: Run, camera: Camera, radius_m: float) -> tuple[Mounting, list[str]]:
+    """The mounting of a run's camera, compared with the given one, and why frames failed."""
     height_m = float(camera.centre[2])
     plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
-    tilts, relative_pitch_rad, failures = [], [], []
+    tilts, relative_pitch_rad, failures = [], [], list[str]()
     pitch_weights = camera_pitch_weights(camera)
     with progress_bar("verticals and outlines", run.frames.expected) as advance:
         for frame in run.frames:
@@ -64,8 +64,8 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
             tilts.append(found.tilt)
             level = [frame_tilts([one]).tilt[0] for one in (found.tilt, *outlines)]
             relative_pitch_rad.append(np.dot(np.subtract(level[1:], level[0]), pitch_weights))
-    report_failures(len(failures), failures)
     if not tilts:
+        report_failures(len(failures), failures)
         raise DetectError(f"{run.folder}: none of its images could be processed")
     mounting = mounting_of_run(height_m, frame_tilts(tilts), np.array(relative_pitch_rad))
     if mounting is None:
@@ -73,4 +73,4 @@ def _mounting(run: Run, camera: Camera, radius_m: float) -> Mounting:
             f"{run.folder}: too few frames with a tilt from verticals: expected {LEAST_FRAMES}; "
             "drive where doors, shelves or walls are visible"
         )
-    return mounting
+    return mounting, failures

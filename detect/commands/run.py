@@ -34,6 +34,9 @@ from redetect.messages import counted
 
 def perform(command: DetectorFlags) -> int:
     """Carry a command out; returns the exit code."""
+    pictures, rejected = getattr(command, "draw", None), getattr(command, "rejected", False)
+    if rejected and pictures is None:
+        raise DetectError("--rejected: expected a folder for pictures beside it: --draw FOLDER")
     job = replace(
         _job_of(command),
         command=type(command).__name__.lower(),
@@ -43,7 +46,6 @@ def perform(command: DetectorFlags) -> int:
         resume=command.resume,
     )
     workers = _workers(command, job)
-    pictures = getattr(command, "draw", None)
     if pictures is not None:
         demand_recording(command.run)
         demand_pictures(job.run.frames, pictures, overwrite=command.force)
@@ -53,7 +55,7 @@ def perform(command: DetectorFlags) -> int:
         from detect.commands.draw import draw_run  # loads the detectors
 
         files = {kind: path for kind, path in job.places.items() if kind in KINDS}
-        plan = job.plan if getattr(command, "rejected", False) else None
+        plan = job.plan if rejected else None
         draw_run(job.run, RunRows(files), pictures, plan, overwrite=command.force)
     _print_results(job, summary)
     for hint in hints(job, summary):

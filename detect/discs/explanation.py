@@ -268,7 +268,7 @@ def _place(at: tuple[float, float], scene: _Examined) -> str:
             f"{words}, where the floor moves {per_row:.3f} m per image row: too far for discs of "
             f"{settings.radius_m:g} m, {settings.far_limit_m_per_px:.3f} m at most (--far-limit)."
         )
-    if min(u, v, camera.width - 1 - u, camera.height - 1 - v) < settings.border_px:
+    if min(u, v, camera.width - u, camera.height - v) < settings.border_px:
         return f"{words}: no centre of a disc is looked for there, it is too near to the border."
     votes, judgement = scene.judgement
     near = np.hypot(*(judgement.traced_from - [x, y]).T) < settings.radius_m

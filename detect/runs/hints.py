@@ -34,8 +34,8 @@ _LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
 def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
-    """Images spread over a run, if its length is known in advance."""
-    if run.frames.expected is None:
+    """Images spread over a recorded run."""
+    if not run.frames.is_recorded:
         raise DetectError("--radius-m auto: expected recorded images, which can be read twice")
     for frame in spread_frames(run.frames, count):
         with suppress(FrameError):
@@ -106,7 +106,7 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
             f"only {100 * camera.seen_share:.0f} % of the pixels are used"
         )
     run, settings = job.run, plan.circles
-    if not (isinstance(run, Run) and settings and settings.refine) or run.frames.expected is None:
+    if not (isinstance(run, Run) and settings and settings.refine and run.frames.is_recorded):
         return
     on_discs: list[str] = []
     few = processed >= _FEWEST_FRAMES and found["discs"] < _FEW_DISCS * processed

@@ -234,7 +234,7 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     camera, circles = plan.camera, plan.circles
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    if (run.frames.expected or 0) < LEAST_FRAMES:
+    if (run.frames.expected or 0) < LEAST_FRAMES or not run.frames.is_recorded:
         return plan
     # This loads the compiler.
     from detect.runs.level_run import lean_of_outlines, searched_lean, tilt_of_some

@@ -61,10 +61,11 @@ class RunFrame:
 
 
 class Frames(ABC):
-    """The frames of a run, made on demand; iterating again starts over (live: from then on)."""
+    """The frames of a run, made on demand; iterating again starts over, unless they are live."""
 
     ships_images = True  # yields contents of images, not files
     expected: int | None = None  # approximate number of frames, if known
+    is_recorded = True  # iterating again yields the same frames
     left_out = 0  # number of images, so far, that are not part of the run
     why_left_out = "images are left out"
 
@@ -84,6 +85,7 @@ class SomeFrames(Frames):
         self._frames, self._count, self._every = frames, count, every
         self._bit_depth = bit_depth
         self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
+        self.is_recorded = frames.is_recorded
         known = [number for number in (frames.expected, count or None) if number is not None]
         self.expected = -(-min(known) // every) if known else None
 

@@ -64,6 +64,13 @@ def open_source(
     """
     options = options or SourceOptions()
     source = _source(name, options)
+    if (options.wheel_base_m or options.metres_per_tick) and not options.odometry.endswith(
+        ".ticks"
+    ):
+        raise DetectError(
+            "--wheel-base-m, --metres-per-tick: expected counts of wheel encoders beside them: "
+            "--odometry FILE.ticks"
+        )
     if isinstance(camera, Path):
         camera = read_camera(camera)
     elif camera is None:
@@ -78,10 +85,16 @@ def open_source(
     else:
         frames, odometry = _frames(source, options)
         has_times = source.has_times
-    bit_depth = options.bit_depth
-    if bit_depth is None and not source.is_8_bit:
-        # Errors in the poses are those of the run.
-        bit_depth = bit_depth_of(source if isinstance(frames, FramesAlongPoses) else frames, camera)
+    # Errors in the poses are those of the run.
+    plain = source if isinstance(frames, FramesAlongPoses) else frames
+    bit_depth = None if source.is_8_bit else bit_depth_of(plain, camera)
+    if options.bit_depth is not None:
+        if bit_depth is None:
+            raise DetectError(
+                f"{source.name}: --bit-depth {options.bit_depth}: expected images whose values are "
+                "stored in 16 bits"
+            )
+        bit_depth = options.bit_depth
     if options.frames or bit_depth:
         frames = SomeFrames(frames, options.frames, bit_depth=bit_depth)
     base = source.output_base

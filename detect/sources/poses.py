@@ -251,6 +251,7 @@ class FramesAlongPoses(Frames):
     def __init__(self, source: Source, stream: PoseStream) -> None:
         self._source, self._stream = source, stream
         self.ships_images, self.expected = source.ships_images, source.expected
+        self.is_recorded = source.is_recorded
         self.why_left_out = (
             f"images without a time or a pose of {stream.name}, or not in order: left out"
         )

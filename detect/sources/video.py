@@ -69,6 +69,7 @@ class LiveCamera(Source):
     """Images of a camera as they come, named ``camera0.0000`` and so on; times are UNIX time."""
 
     is_8_bit = True
+    is_recorded = False
 
     def __init__(self, index: int) -> None:
         self.name = f"camera:{index}"

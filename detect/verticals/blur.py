@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from detect.line_settings import LineSettings
+from detect.line_settings import WIDEST_FILTER_PX, LineSettings
 from detect.verticals.refinement import LineFits
 
 _WIDE_ENOUGH = 0.68  #: Least width of the filter, as a share of the blur's width.
@@ -26,6 +26,7 @@ _ACROSS = (
     "largest_scatter_px", "largest_shift_px", "largest_noise_px", "bend_px", "largest_lean_px",
     "same_edge_px", "join_px", "shoulder_px", "sigma_px",
 )  # fmt: skip
+_FILTERS = ("sigma_across_px", "fine_scale_px", "coarse_scale_px")
 
 
 def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> float:
@@ -55,6 +56,7 @@ def width_for(sharpness: float, settings: LineSettings) -> float:
 @lru_cache(maxsize=32)
 def widened(settings: LineSettings, width: float) -> LineSettings:
     """The settings for edges `width` times as wide; only larger `blurred_widths` remain."""
+    width = min(width, WIDEST_FILTER_PX / max(getattr(settings, name) for name in _FILTERS))
     across = {name: width * getattr(settings, name) for name in _ACROSS}
     steps = tuple(
         (min(width * scale, _WIDEST_STEP_PX), width * most)

@@ -295,6 +295,7 @@ def test_wrong_command_lines(small_run: Path, capsys: Captured, wrong: list[str]
         (["circles", "images/e", "--radius-m", "-1"], "--radius-m is -1: expected above 0"),
         (["lines", "images/e", "--join-threshold", "-0.1"], "--join-threshold is -0.1: expected 0"),
         (["compare", "images/e", "--gate-m", "0"], "--gate-m is 0: expected above 0"),
+        (["export", "map.circles", "--rate-hz", "0"], "--rate-hz is 0: expected above 0"),
     ],
 )
 def test_a_setting_out_of_its_bounds_is_one_line(
@@ -305,6 +306,28 @@ def test_a_setting_out_of_its_bounds_is_one_line(
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: {said}")
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["lines", "RUN", "--rejected"], "--rejected: expected a folder"),
+        (["markers", "RUN", "--rejected"], "--rejected: expected a folder"),
+        (["circles", "RUN", "--wheel-base-m", "0.3"], "--odometry FILE.ticks"),
+        (["circles", "RUN", "--bit-depth", "12"], "expected images whose values are stored in 16"),
+        (["draw", "RUN", "-o", "RUN/pictures", "--fps", "5"], "--fps: expected a video"),
+        (
+            ["compare", "RUN", "--lines", "--camera", "gone.cam"],
+            "--camera, --gate-m: expected discs",
+        ),
+        (["compare", "RUN", "--lines", "--gate-m", "0.1"], "--camera, --gate-m: expected discs"),
+    ],
+)
+def test_a_flag_without_effect_is_refused(
+    small_run: Path, capsys: Captured, flags: list[str], said: str
+) -> None:
+    words = [word.replace("RUN", str(small_run)) for word in flags]
+    assert_refused(words, small_run, said, capsys)
 
 
 def test_refused_settings_are_named(small_run: Path, capsys: Captured) -> None:

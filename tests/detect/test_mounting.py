@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -188,6 +189,19 @@ def test_a_height_far_off_is_estimated_or_left(
     assert left == (height_m == 1.1)
     expected = height_m if left else 1.50354
     assert read_camera(output).centre[2] == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.long
+def test_failed_frames_are_told_once(project_root: Path, tmp_path: Path, capsys: Captured) -> None:
+    """The height is estimated twice, from 5 cm below."""
+    run = shutil.copytree(project_root / "images" / "e", tmp_path / "e")
+    broken = sorted((run / "images").iterdir())[3]
+    broken.write_bytes(broken.read_bytes()[:2000])
+    (run / "e.cam").write_text((run / "e.cam").read_text().replace("1.50354", "1.45"))
+    assert main(["level", str(run), "-o", str(tmp_path / "level.cam")]) == 3
+    said = capsys.readouterr().err
+    assert said.count("1 frame could not be processed") == 1
+    assert read_camera(tmp_path / "level.cam").centre[2] == pytest.approx(1.50354, abs=0.02)
 
 
 def test_images_of_another_size_are_told_once(

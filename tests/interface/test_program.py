@@ -178,11 +178,18 @@ def test_explain(demo_image: Path, demo: Path, tmp_path: Path, capsys: Captured)
     assert "exists already" in capsys.readouterr().err
     assert main(["explain", str(demo)]) == 1
     assert "expected one image" in capsys.readouterr().err
+    assert main(["explain", str(demo_image), "--no-refine"]) == 1
+    assert "--no-refine" in capsys.readouterr().err
     (tmp_path / "far" / "away").mkdir(parents=True)
     lonely = tmp_path / "far" / "away" / "image.jpg"
     lonely.write_bytes(demo_image.read_bytes())
     assert main(["detect", "explain", str(lonely)]) == 1
     assert "no calibration" in capsys.readouterr().err
+    for name in ("a.cam", "b.cam"):
+        (lonely.parent / name).write_bytes((demo / "e.cam").read_bytes())
+    assert main(["detect", "explain", str(lonely)]) == 1
+    assert "several calibrations" in capsys.readouterr().err
+    assert main(["detect", "explain", str(lonely), "--camera", str(lonely.parent / "a.cam")]) == 0
 
 
 # -- the demo -------------------------------------------------------------------------------

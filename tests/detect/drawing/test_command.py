@@ -257,6 +257,15 @@ def test_refusals(small_run: Path, tmp_path: Path, capsys: Captured) -> None:
     assert_refused(["draw", run, "-o", out], small_run, "--camera", capsys)
 
 
+def test_steps_that_name_one_image_have_one_picture(small_run: Path, tmp_path: Path) -> None:
+    steps = small_run / "s.txt"
+    lines = steps.read_text().splitlines(keepends=True)
+    steps.write_text("".join([*lines, lines[-1]]))
+    drawn = tmp_path / "d"
+    assert main(["circles", str(small_run), "--draw", str(drawn)]) == 0
+    assert len(list(drawn.iterdir())) == 3
+
+
 def test_no_picture_is_written_if_one_exists(
     small_run: Path, tmp_path: Path, capsys: Captured
 ) -> None:

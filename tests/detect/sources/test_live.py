@@ -21,7 +21,7 @@ from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.frames import read_times
-from tests.detect.commands import Captured
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.recordings import images_of, write_video
 from tests.pictures import read_grey
 
@@ -84,6 +84,19 @@ def test_so_many_frames_and_their_times(plugged: Plugged) -> None:
     assert times == sorted(set(times))
     assert {int(read_image(frame, None)[0, 0]) for frame in frames} <= {40, 80}
     assert all(capture.released.is_set() for capture in opened)
+
+
+def test_no_image_of_a_camera_is_taken_twice(
+    plugged: Plugged, small_run: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    """A recording would be read before and after the detection, for its tilt and for hints."""
+    opened = plugged([blank(40)])
+    command = ["circles", "camera:0", "--camera", str(small_run / "s.cam"), "--frames", "24"]
+    assert main([*command, "-o", str(tmp_path / "live.circles"), "--jobs", "1"]) == 0
+    assert sum(capture.given for capture in opened) == 24
+    capsys.readouterr()
+    command = [*command, "-o", str(tmp_path / "again.circles"), "--radius-m", "auto"]
+    assert_refused(command, small_run, "--radius-m auto: expected recorded images", capsys)
 
 
 def test_a_camera_that_ends(plugged: Plugged, caplog: pytest.LogCaptureFixture) -> None:
