@@ -49,7 +49,7 @@ def json_text(content: Any, indent: int | None = 1, *, limits: bool = False) -> 
 def json_rows(content: Any, indent: str = "") -> str:
     """As `json_text`, with objects over several lines and arrays on one.
 
-    The exception are matrices and arrays of objects: they have a line per row or object.
+    The exception are matrices and arrays of objects: each row or object begins a line.
     """
     value, deeper = plain(content), indent + " "
     if isinstance(value, dict) and value:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from redetect.bounds import MaybeInt, MaybePath
+from redetect.bounds import Bounded, Limit, LimitOr0, MaybeInt, MaybePath, whole
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.settings import (
     AlignmentSettings,
     FuseSettings,
@@ -76,7 +78,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Score:
+class Score(Bounded, error=GroundTruthError):
     """Compare poses with the truth: errors, and consistency of the covariances.
 
     Errors are absolute (ATE) and, with --relations or --rpe-step, also relative (RPE).
@@ -88,17 +90,23 @@ class Score:
     truth: Positional[Path]  # The same for the truth.
     # Which of the two is interpolated at the other's times.
     interpolate: Literal["truth", "poses"] = "truth"
-    largest_gap_s: float = 0.5  # Nothing is interpolated across longer gaps (s).
+    largest_gap_s: LimitOr0 = 0.5  # Nothing is interpolated across longer gaps (s).
     # Align the poses rigidly with the truth first, for solutions with a world of their own.
     align: bool = False
     # Relations between two times (t_i, t_j, x, y, z, roll, pitch, yaw): the poses are also compared
     # with these.
     relations: MaybePath = None
-    rpe_step: MaybeInt = None  # Number of compared poses between the poses of a relative error.
+    # Number of compared poses between the poses of a relative error.
+    rpe_step: Annotated[MaybeInt, whole(1)] = None
     # Steps that take longer than this, as across a gap, are ignored (s).
-    rpe_longest_s: float = float("inf")
+    rpe_longest_s: Limit = inf
     json: MaybePath = None  # Write the figures as JSON; -: to standard output only.
     force: bool = False  # Replace an existing file.
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rpe_step is None and self.rpe_longest_s < inf:
+            raise GroundTruthError("rpe_longest_s is of no use: expected --rpe-step as well")
 
 
 @dataclass(frozen=True)

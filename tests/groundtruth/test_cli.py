@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from camera import write_camera
 from redetect.groundtruth.cli import main
-from redetect.groundtruth.commands.outputs import progress
+from redetect.groundtruth.commands.outputs import progress, provenance
 from redetect.groundtruth.markers.session import (
     Network,
     Rig,
@@ -240,6 +240,10 @@ def test_rigs_that_cannot_be_made_are_refused(
     output = tmp_path / "rig.json"
     refused(["rig", str(session / "a"), "--width-m", width, "-o", str(output)], names, capsys)
     assert not output.exists()
+    (session / "a" / "a.cam").rename(session / "a" / "x.cam")
+    write_camera(lens(), session / "a" / "y.cam")
+    command = ["rig", str(session / "a"), "--width-m", "0.2", "-o", str(output)]
+    refused(command, "several calibrations (x.cam, y.cam): name one a.cam", capsys)
 
 
 @pytest.mark.parametrize(
@@ -274,6 +278,32 @@ def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> N
         main(["poses", "somewhere", "--outlier-sigma", "0"])
     assert caught.value.code == 2
     assert "--outlier-sigma is 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["--largest-gap-s", "nan"], "--largest-gap-s is nan"),
+        (["--largest-gap-s", "-1"], "--largest-gap-s is -1"),
+        (["--rpe-step", "0"], "--rpe-step is 0"),
+        (["--rpe-longest-s", "5"], "--rpe-longest-s is of no use: expected --rpe-step"),
+    ],
+)
+def test_flags_of_scores_are_checked_first(capsys: Captured, flags: list[str], names: str) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["score", "absent.csv", "absent.csv", *flags])
+    assert caught.value.code == 2
+    assert names in capsys.readouterr().err
+
+
+def test_files_of_one_name_are_named_by_their_paths(tmp_path: Path) -> None:
+    files = [tmp_path / "a" / "poses.csv", tmp_path / "b" / "poses.csv", tmp_path / "clock.json"]
+    for number, path in enumerate(files):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(str(number))
+    named = provenance(None, files)["files"]
+    assert list(named) == [str(files[0]), str(files[1]), "clock.json"]
+    assert named[str(files[0])] != named[str(files[1])]
 
 
 @pytest.mark.long

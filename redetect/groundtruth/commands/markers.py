@@ -53,7 +53,7 @@ def perform_network(command: Network) -> int:
             table.append({"camera": name, "board": board, **adjusted.residual_figures(chosen)})
     extra = {
         "made_by": outputs.provenance(command.settings),
-        "reduced_cost": adjusted.reduced_cost,
+        "reduced_cost": adjusted.chi2_per_dof,
         "residuals": table,
     }
     session.write_network(command.output, network, extra, overwrite=command.force)
@@ -82,7 +82,7 @@ def perform_rig(command: Rig) -> int:
         "made_by": outputs.provenance(command.settings),
         "frame": frame,
         "times": estimate.times,
-        "reduced_cost": estimate.adjusted.reduced_cost,
+        "reduced_cost": estimate.adjusted.chi2_per_dof,
         "residuals": table,
         "pairs": [
             {
@@ -103,7 +103,7 @@ def perform_rig(command: Rig) -> int:
     outputs.print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
     print(
         f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "
-        f"squared residuals per degree of freedom {estimate.adjusted.reduced_cost:.2f}"
+        f"squared residuals per degree of freedom {estimate.adjusted.chi2_per_dof:.2f}"
     )
     return 0
 
@@ -116,7 +116,7 @@ def _input(command: Rig) -> tuple[session.Network, list[tuple[session.MarkerFram
         return network, session.group_by_time(frames, command.settings.time_tolerance_s)
     count, files = len(command.runs), []
     for run in command.runs:
-        if (found := camera_file_in(run)) is None:
+        if (found := camera_file_in(run, advice=f"name one {run.resolve().name}.cam")) is None:
             raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
         files.append(found)
     network = session.Network(

@@ -38,9 +38,16 @@ def warn(text: str) -> None:
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
-    """Metadata of a result: version, settings, and the files on which it depends."""
-    hashes = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-    of_files = {name: {"sha256": value} for name, value in hashes.items()}
+    """Metadata of a result: version, settings, and the files on which it depends, by name, or by
+    path where names are equal.
+    """
+    names = [path.name for path in files]
+    of_files = {
+        path.name if names.count(path.name) == 1 else path.as_posix(): {
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest()
+        }
+        for path in files
+    }
     return {"version": __version__, "settings": settings, "files": of_files}
 
 

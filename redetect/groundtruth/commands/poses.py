@@ -16,6 +16,7 @@ from redetect.groundtruth.markers.track import PoseStatus, Track, report_entry, 
 from redetect.groundtruth.options import Poses
 from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.json_text import json_text
+from redetect.messages import counted
 from redetect.storage import write_bytes
 
 #: Share of markers that disagree, or times that have no pose, above which a warning is printed; a
@@ -44,7 +45,7 @@ def perform(command: Poses) -> int:
         + ", ".join(f"{number} {status}" for status, number in track.counts.items() if number)
     )
     if track.unknown_markers:
-        print(f"{track.unknown_markers} markers found are not on the rig: ignored")
+        print(f"ignored: {counted(track.unknown_markers, 'marker')} not on the rig")
         sets = {marker.dictionary for frame in frames for marker in frame.markers}
         if others := sorted(sets - {rig.dictionary}):
             found = f"markers of {', '.join(others)} were found"
@@ -56,10 +57,10 @@ def perform(command: Poses) -> int:
     if not len(poses):
         print("error: no pose", file=sys.stderr)
         return EXIT_ERROR
-    print(f"squared residuals per degree of freedom: {track.reduced_cost:.2f}")
-    if track.reduced_cost > _MUCH_TOO_LARGE:
+    print(f"squared residuals per degree of freedom: {track.chi2_per_dof:.2f}")
+    if track.chi2_per_dof > _MUCH_TOO_LARGE:
         outputs.warn(
-            f"residuals are {track.reduced_cost**0.5:.0f} times as large as expected: the "
+            f"residuals are {track.chi2_per_dof**0.5:.0f} times as large as expected: the "
             f"widths and poses of markers in {rig_path}, the poses of cameras in {network_path}, "
             "or a lens calibration may be wrong"
         )
@@ -68,7 +69,7 @@ def perform(command: Poses) -> int:
         **outputs.provenance(command.settings, (rig_path, network_path)),
         "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
         "times": dict(track.counts),
-        "reduced_cost": track.reduced_cost,
+        "reduced_cost": track.chi2_per_dof,
     }
     write_json(settings_path, content, overwrite=command.force)
     if command.tum is not None:
@@ -90,7 +91,7 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
                 left_out[view.marker.id] += not good
     total, failed = left_out.total(), track.counts[PoseStatus.FAILED]
     if total:
-        print(f"{total} markers disagree with the others at their time: ignored")
+        print(f"ignored: {counted(total, 'marker')} in disagreement with others at the time")
     if total <= _MANY_LEFT_OUT * seen.total() and failed <= _MANY_LEFT_OUT * len(track.times):
         return
     wrong = [m for m, count in sorted(left_out.items()) if count > _MOST_LEFT_OUT * seen[m]]

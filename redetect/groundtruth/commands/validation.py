@@ -35,6 +35,8 @@ OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.
 def perform_validate(options: Validate) -> int:
     """Execute the command; returns the exit code: 1 without a reference pose to compare with."""
     session, folder = options.session, options.output
+    if options.refine == "none" and options.clock is not None:
+        raise GroundTruthError("--clock is for scans on board, which --refine none ignores")
     outputs = {name: folder / name for name in OUTPUTS}
     check_outputs(list(outputs.values()), options.force)
     survey = reference_poses.read_survey(session / "fiducials.json")
@@ -114,11 +116,14 @@ def _scanners_on_board(
     content: dict[str, Any] = {"incidence": rows}
     if (found := onboard.refine_mounts(references, segments)) is not None:
         sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
-        scanners = next(r.still.scanners for r in references if r.still is not None)
         content["mounts"] = [
             {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
-            for s, m, e in zip(scanners, found.poses, sigma)
+            for s, m, e in zip(found.scanners, found.poses, sigma)
         ]
+        on_board = next(r.still.scanners for r in references if r.still is not None)
+        for scanner in on_board:
+            if scanner not in found.scanners:
+                warn(f"scanner {scanner.name}: no readings of walls: its mount is not refined")
     return content
 
 

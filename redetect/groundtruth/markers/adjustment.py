@@ -192,7 +192,7 @@ class AdjustedBundle:
         return self.covariance[cameras:, cameras:]
 
     @property
-    def reduced_cost(self) -> float:
+    def chi2_per_dof(self) -> float:
         """Cost over degrees of freedom: 1 if the corners' covariances are right."""
         return self.cost / max(1, self.degrees_of_freedom)
 

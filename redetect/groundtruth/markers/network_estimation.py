@@ -73,7 +73,7 @@ def estimate_network(
     return NetworkEstimate(
         names,
         adjusted.bundle.chain.world_from_camera,
-        adjusted.camera_covariance * adjusted.reduced_cost,
+        adjusted.camera_covariance * adjusted.chi2_per_dof,
         body_from_part.get(SECOND),
         adjusted,
         views,

@@ -80,7 +80,8 @@ def estimate_rig(
     ------
     GroundTruthError
         If markers of several dictionaries or of none were found, no two markers were seen together
-        often enough, the reference was not, or none of the known markers is in the rig.
+        often enough, the reference was not, or none of the known markers is in the rig, or they are
+        of another dictionary or width.
     """
     markers = [marker for group in groups for frame in group for marker in frame.markers]
     dictionaries = sorted({marker.dictionary for marker in markers})
@@ -121,7 +122,7 @@ def estimate_rig(
     rig = _bare_rig(dictionaries[0], kept_ids, width_m)
     priors: tuple[adjustment.PosePrior, ...] = ()
     if known is not None:
-        start, priors = _in_known_frame(kept_ids, start, known, len(network.cameras))
+        start, priors = _in_known_frame(rig, start, known, len(network.cameras))
     # One bundle adjustment of all markers and all times.
     bundle, views, times = _bundle(solved, rig, renumbered, start, network, settings)
     free = bundle.free.copy()
@@ -138,22 +139,31 @@ def estimate_rig(
         )
     except GeometryError as error:
         raise GroundTruthError(f"the rig cannot be adjusted: {error}") from None
-    covariance = adjusted.part_covariance * max(1.0, adjusted.reduced_cost)
+    covariance = adjusted.part_covariance * max(1.0, adjusted.chi2_per_dof)
     poses = adjusted.bundle.chain.body_from_part
     rig = replace(rig, robot_from_marker=poses, covariance=covariance)
     return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
 
 
 def _in_known_frame(
-    ids: Sequence[int], rig_from_marker: FloatArray, known: Rig, cameras: int
+    rig: Rig, rig_from_marker: FloatArray, known: Rig, cameras: int
 ) -> tuple[FloatArray, tuple[adjustment.PosePrior, ...]]:
     """Markers (M, 4, 4) moved to where some are known, and priors of these behind the cameras."""
-    common = [marker for marker in ids if marker in known.ids]
+    if known.dictionary != rig.dictionary:
+        raise GroundTruthError(
+            f"the known markers are of {known.dictionary}, those found of {rig.dictionary}"
+        )
+    common = [marker for marker in rig.ids if marker in known.ids]
     if not common:
-        raise GroundTruthError(f"the rig has markers {list(ids)}, none of {list(known.ids)}")
+        raise GroundTruthError(f"the rig has markers {list(rig.ids)}, none of {list(known.ids)}")
     priors, starts = [], []
     for marker in common:
-        i, j = ids.index(marker), known.ids.index(marker)
+        i, j = rig.ids.index(marker), known.ids.index(marker)
+        if not np.isclose(known.widths_m[j], rig.widths_m[i], atol=0.0):
+            raise GroundTruthError(
+                f"known marker {marker} is {known.widths_m[j]:g} m wide: expected "
+                f"{rig.widths_m[i]:g} m, as those found"
+            )
         priors.append(_prior(cameras + i, known.robot_from_marker[j], known.covariance, j))
         starts.append(known.robot_from_marker[j] @ se3.inverse(rig_from_marker[i]))
     robot_from_rig, _ = se3.mean_pose(starts, np.tile(np.eye(6), (len(starts), 1, 1)))

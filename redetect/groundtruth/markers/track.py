@@ -76,7 +76,7 @@ class Track:
         return {status: sum(t.status == status for t in self.times) for status in PoseStatus}
 
     @property
-    def reduced_cost(self) -> float:
+    def chi2_per_dof(self) -> float:
         """Sum of all costs over their degrees of freedom: 1 if the covariances are right."""
         freedom = sum(pose.degrees_of_freedom for _, pose in self.posed)
         return sum(pose.cost for _, pose in self.posed) / freedom if freedom else float("nan")

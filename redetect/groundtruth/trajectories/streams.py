@@ -7,9 +7,10 @@ a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth th
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
-from redetect.messages import excerpt
 from redetect.plane import fitted, rotation
 from redetect.storage import write_bytes
 
@@ -122,24 +122,19 @@ def read_planar_poses(path: PathLike) -> PlanarPoses:
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
 
 
-def format_planar_poses(poses: PlanarPoses, covariance_decimals: int = 12) -> str:
-    """Format poses as a RAWSEEDS stream.
-
-    `covariance_decimals`: the real files have 6, which rounds variances below (0.7 mm)^2 to zero
-    and makes matrices singular; therefore the default is larger.
-    """
-    lines = []
-    for i in range(len(poses)):
-        words = [f"{poses.times_s[i]:.6f}", *(f"{value:.6f}" for value in poses.poses[i])]
-        if poses.covariances is not None:
-            words += [f"{value:.{covariance_decimals}f}" for value in poses.covariances[i].ravel()]
-        lines.append(",".join(words) + "\n")
-    return "".join(lines)
-
-
 def write_planar_poses(path: PathLike, poses: PlanarPoses, *, overwrite: bool = False) -> None:
-    """Write poses as a RAWSEEDS stream, whole or not at all (see `format_planar_poses`)."""
-    write_bytes(path, format_planar_poses(poses).encode(), overwrite=overwrite)
+    """Write poses as a RAWSEEDS stream, whole or not at all.
+
+    Covariances have 12 decimals: the real files have 6, which rounds variances below (0.7 mm)^2 to
+    zero and makes matrices singular.
+    """
+    columns, formats = [poses.times_s[:, None], poses.poses], ["%.6f"] * _POSE_COLUMNS
+    if poses.covariances is not None:
+        columns.append(poses.covariances.reshape(-1, 9))
+        formats += ["%.12f"] * 9
+    text = io.StringIO()
+    np.savetxt(text, np.hstack(columns), formats, ",")
+    write_bytes(path, text.getvalue().encode(), overwrite=overwrite)
 
 
 def format_tum(times_s: FloatArray, world_from_robot: FloatArray) -> str:
@@ -203,10 +198,8 @@ def matched_streams(
     Raises
     ------
     GroundTruthError
-        If there are no common times, or `interpolate` is another word.
+        If there are no common times.
     """
-    if interpolate not in get_args(Interpolated):
-        raise GroundTruthError(f"interpolate is {excerpt(interpolate)}: expected truth or poses")
     if len(poses) == 0 or len(truth) == 0:
         raise GroundTruthError(
             f"{len(poses)} poses and {len(truth)} of the truth: expected at least one of each"

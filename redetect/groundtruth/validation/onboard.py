@@ -211,8 +211,9 @@ def refined_by_walls(
 
 
 class RefinedMounts(NamedTuple):
-    """Poses of M scanners on the robot."""
+    """Poses of those M scanners on the robot that have readings on walls."""
 
+    scanners: tuple[Scanner, ...]
     poses: FloatArray  # (M, 3): in the robot's frame
     covariance: FloatArray  # (3 M, 3 M)
 
@@ -245,7 +246,7 @@ def refine_mounts(
 
     Least squares over the mounts and all poses. Only the poses from distances, with their
     covariances, tie the mounts to the robot's frame; the measured mounts are not a prior.
-    None if fewer than three poses have both distances and scans.
+    None if fewer than three poses have both distances and scans, or readings determine no mount.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
     accepted = [r for r in references if r.distances.status == DistanceStatus.OK]
@@ -257,6 +258,7 @@ def refine_mounts(
     roots = whitening(np.stack([r.distances.covariance for r in used]))
     mounts = stills[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
+    known = np.ones(3 * (count + len(used)), dtype=np.bool_)
     along = segments[:, 2:] - segments[:, :2]
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     normals /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-12)[:, None]
@@ -284,12 +286,20 @@ def refine_mounts(
         walls = stack(blocks, unknowns, 0)
         of_walls = normal_equations(walls)
         variance = max(float(np.mean(walls.residual**2)), _LEAST_SIGMA_M**2)
-        information = of_walls.matrix / variance + of_priors.matrix
-        covariance = np.linalg.inv(information.toarray())
+        information = (of_walls.matrix / variance + of_priors.matrix).toarray()
+        seen = np.all(np.diagonal(information)[: 3 * count].reshape(-1, 3) > 0.0, axis=1)
+        known[: 3 * count] = np.repeat(seen, 3)
+        own, covariance = np.ix_(known, known), np.zeros_like(information)
+        try:
+            covariance[own] = np.linalg.inv(information[own])
+        except np.linalg.LinAlgError:
+            return None
         step = -covariance @ (of_walls.gradient / variance + of_priors.gradient)
         mounts = mounts + step.reshape(-1, 3)[:count]
         poses = poses + step.reshape(-1, 3)[count:]
-    return RefinedMounts(mounts, covariance[: 3 * count, : 3 * count])
+    scanners = tuple(s for s, there in zip(stills[0].scanners, seen) if there)
+    of_mounts = np.flatnonzero(known[: 3 * count])
+    return RefinedMounts(scanners, mounts[seen], covariance[np.ix_(of_mounts, of_mounts)])
 
 
 def _moment(arms: FloatArray, normals: FloatArray) -> FloatArray:

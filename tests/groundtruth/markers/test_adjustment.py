@@ -144,7 +144,7 @@ def test_the_minimum_and_the_covariances_are_scipys() -> None:
         scale = np.outer(sigmas[own], sigmas[own])
         np.testing.assert_allclose(found / scale, covariance[own, own] / scale, atol=1e-5)
     np.testing.assert_array_equal(adjusted.camera_covariance[:6], 0.0)
-    assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+    assert adjusted.chi2_per_dof == pytest.approx(1.0, abs=0.35)
 
 
 def test_a_wrong_view_is_left_out_and_the_rest_is_as_without_it() -> None:
@@ -169,7 +169,7 @@ def test_bodies_alone_and_shared_poses_alone_are_adjusted() -> None:
             free_bodies=not of_bodies, free_cameras=of_bodies, free_parts=of_bodies
         )
         adjusted = adjust_bundle(bundle)
-        assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+        assert adjusted.chi2_per_dof == pytest.approx(1.0, abs=0.35)
 
 
 def test_a_far_start_is_brought_home() -> None:
@@ -177,7 +177,7 @@ def test_a_far_start_is_brought_home() -> None:
     bundle = watched_robot(seed=4, times=10, off=0.15)
     adjusted = adjust_bundle(bundle)
     assert adjusted.used.all()
-    assert adjusted.reduced_cost == pytest.approx(1.0, abs=0.35)
+    assert adjusted.chi2_per_dof == pytest.approx(1.0, abs=0.35)
 
 
 def test_what_is_not_determined_is_refused() -> None:

@@ -130,7 +130,7 @@ def test_its_covariance_is_true(kind: str) -> None:
         estimate = estimated(found, offset, sigmas if kind == "measured" else None, sigma_px=0.15)
         error = errors_of(estimate).ravel()
         squares += float(error @ np.linalg.solve(estimate.covariance, error))
-        assert estimate.adjusted.reduced_cost == pytest.approx(1.0, abs=0.15)
+        assert estimate.adjusted.chi2_per_dof == pytest.approx(1.0, abs=0.15)
     low, high = chi2.ppf([0.005, 0.995], 24 * draws)
     assert low < squares < high
 

@@ -130,7 +130,7 @@ def test_the_rigs_covariance_is_true() -> None:
         estimate = estimated(walk_round(rig, 25, seed=100 + seed), rig)
         square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
         squares, freedom = squares + square, freedom + dof
-        assert estimate.adjusted.reduced_cost == pytest.approx(1.0, abs=0.2)
+        assert estimate.adjusted.chi2_per_dof == pytest.approx(1.0, abs=0.2)
         assert estimate.adjusted.used.all()
     low, high = chi2.ppf([0.005, 0.995], freedom)
     assert low < squares < high
@@ -301,6 +301,10 @@ def test_the_frame_follows_from_known_markers() -> None:
     other = Rig("rawseeds", (77,), rig.widths_m[:1], rig.robot_from_marker[:1], np.zeros((6, 6)))
     with pytest.raises(GroundTruthError, match="none of \\[77\\]"):
         estimated(groups, rig, known=other)
+    with pytest.raises(GroundTruthError, match="are of aruco, those found of rawseeds"):
+        estimated(groups, rig, known=replace(exact, dictionary="aruco"))
+    with pytest.raises(GroundTruthError, match=r"marker 33 is 0\.5 m wide: expected"):
+        estimated(groups, rig, known=replace(exact, widths_m=np.array([0.5])))
 
 
 def test_several_measured_markers_define_the_frame_together() -> None:

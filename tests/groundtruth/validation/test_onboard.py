@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,6 +80,22 @@ def test_mounts_come_back_with_their_covariance() -> None:
         total += float(error.ravel() @ np.linalg.solve(found.covariance, error.ravel()))
     low, high = chi2.ppf([0.001, 0.999], 36)
     assert low < total < high
+
+
+def test_a_scanner_without_readings_costs_no_other_its_mount() -> None:
+    found = references(np.random.default_rng(5), np.zeros(3), 4)
+    blind = []
+    for reference in found:
+        assert reference.still is not None
+        first, second = reference.still.scans
+        nothing = second._replace(range_m=np.zeros(0), direction=np.zeros((0, 2)))
+        still = reference.still._replace(scans=(first, nothing))
+        blind.append(replace(reference, still=still))
+    refined = refine_mounts(blind, ROOM)
+    assert refined is not None
+    assert refined.scanners == blind[0].still.scanners[:1]  # type: ignore[union-attr]
+    np.testing.assert_allclose(refined.poses, [[0.3, 0.0, 0.0]], atol=0.01)
+    assert refined.covariance.shape == (3, 3)
 
 
 def test_two_poses_are_too_few_for_mounts() -> None:

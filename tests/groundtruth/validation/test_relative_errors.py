@@ -204,9 +204,3 @@ def test_evo_computes_the_same() -> None:
         assert relative.position_median_m == pytest.approx(expected["median"], rel=1e-9)
         expected = figures(metrics.RPE(part.rotation_angle_rad, **shift))
         assert relative.angle_rmse_rad == pytest.approx(expected["rmse"], rel=1e-7)
-
-
-def test_which_stream_is_interpolated_is_one_of_two_words() -> None:
-    poses = PlanarPoses(np.arange(2.0), np.zeros((2, 3)))
-    with pytest.raises(GroundTruthError, match="interpolate is 'thruth': expected truth or poses"):
-        matched_streams(poses, poses, interpolate="thruth")  # type: ignore[arg-type]

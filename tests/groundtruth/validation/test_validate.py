@@ -204,6 +204,8 @@ def test_without_scans_distances_alone_count(
     out = capsys.readouterr().out
     assert "0 refined by scans" in out
     assert "no invertible covariance" in out
+    assert main([*command, "--force", "--clock", "absent.json"]) == 1
+    assert "--clock is for scans on board" in capsys.readouterr().err
     # Without the clock the scans are from another time, when the robot was elsewhere or unseen.
     (session / "clock.json").unlink()
     assert main(["validate", str(session), str(poses), "-o", str(session / "w")]) == 0
