@@ -24,7 +24,7 @@ from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import Fate, JudgedCandidates, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
-from detect.discs.quality import Limits, centres_of, least_part_quality
+from detect.discs.quality import Limits, centres_of, least_first_quality
 from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
@@ -226,9 +226,9 @@ def _by_quality(
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
-    least_part = least_part_quality(settings.threshold, settings.samples)
+    least_first = least_first_quality(settings.threshold, settings.samples)
     least = math.nextafter(settings.threshold, 1.0)
-    limits = Limits(least, least_part, weakest, _SIGNS[settings.polarity])
+    limits = Limits(least, least_first, weakest, _SIGNS[settings.polarity])
     pixels, quality, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
         qualities = np.zeros(image.shape)

@@ -4,9 +4,6 @@ from lut.cache import cache_folder as cache_folder
 from lut.cache import cached_disc_table as cached_disc_table
 from lut.cache import cached_vertical_table as cached_vertical_table
 from lut.cache import cached_vote_table as cached_vote_table
-from lut.outlines import GROUP_COLUMNS as GROUP_COLUMNS
-from lut.outlines import GROUP_SAMPLES as GROUP_SAMPLES
-from lut.outlines import CentreGroups as CentreGroups
 from lut.outlines import DiscShape as DiscShape
 from lut.outlines import DiscTable as DiscTable
 from lut.outlines import TableError as TableError

@@ -26,8 +26,6 @@ from redetect.messages import OneLineError
 
 #: Least share of an outline's samples inside the image.
 MIN_SHARE_INSIDE = 0.5
-GROUP_SAMPLES = 10  #: Samples of each outline that the centres of a group share.
-GROUP_COLUMNS = 16  #: Columns that a group covers.
 
 
 class TableError(OneLineError, ValueError):
@@ -57,23 +55,6 @@ class DiscShape:
     stride_m: float = 0.0
 
 
-class CentreGroups(NamedTuple):
-    """Neighbouring centres with some samples at the same offset from each centre.
-
-    A group's centres are in one row, within `GROUP_COLUMNS` of each other.
-    """
-
-    first: NDArray[np.int32]  # (G,) the first centre of each group
-    #: (G,) bit mask of the columns of its centres, counted from the first
-    columns: NDArray[np.int32]
-    #: (G, GROUP_SAMPLES, 2) the pixels of these samples of the inner and the outer outline for the
-    #: first centre, each `GROUP_COLUMNS` or more before the end of the image; all `begin` for a
-    #: centre with fewer samples
-    samples: NDArray[np.uint32]
-    begin: int  # first pixel of all columns of all samples
-    end: int  # one past their last pixel
-
-
 @dataclass(frozen=True, eq=False)
 class DiscTable:
     """The tested centres, and the pixels of their outlines; compared by identity."""
@@ -85,11 +66,6 @@ class DiscTable:
     #: (H, W, 2) floor position (robot X, Y, m) of each pixel; NaN above the horizon
     floor_xy: Float32Array
     made_for: ByteArray  # `fingerprint` of the camera and the shape
-
-    @cached_property
-    def groups(self) -> CentreGroups:
-        """Groups of neighbouring centres with shared samples."""
-        return _groups(self.samples, self.pixels, self.floor_xy[..., 0].size)
 
     @cached_property
     def usable(self) -> BoolArray:
@@ -164,41 +140,6 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
         floor_xy=floor_xy.astype(np.float32),
         made_for=fingerprint(camera, shape),
     )
-
-
-def _groups(samples: NDArray[np.uint32], pixels: NDArray[np.int32], outside: int) -> CentreGroups:
-    n = len(samples)
-    column, row = pixels.T
-    if samples.shape[1] < GROUP_SAMPLES or n == 0:
-        single = np.arange(n, dtype=np.int32), np.ones(n, np.int32)
-        return CentreGroups(*single, np.zeros((n, GROUP_SAMPLES, 2), np.uint32), 0, GROUP_COLUMNS)
-    # A group ends at the first centre with a sample at another offset, or if it would overrun.
-    beside = samples.astype(np.int32) - column[:, None, None]
-    moves = (beside[1:] != beside[:-1]) | (row[1:] != row[:-1])[:, None, None]
-    in_image = samples <= outside - GROUP_COLUMNS
-    moves |= ~in_image[1:]
-    until = np.full(samples.shape, n, np.int32)
-    until[:-1][moves] = np.nonzero(moves)[0] + 1
-    until = np.minimum.accumulate(until[::-1])[::-1]
-    until[~in_image] = 0
-    place = row * (column.max() + GROUP_COLUMNS) + column
-    in_reach = np.searchsorted(place, place + GROUP_COLUMNS)
-    shared_until = np.partition(until, -GROUP_SAMPLES, axis=1)[:, -GROUP_SAMPLES].min(axis=1)
-    end = np.maximum(np.minimum(in_reach, shared_until), np.arange(1, n + 1)).tolist()
-    start = [0]
-    while start[-1] < n:
-        start.append(end[start[-1]])
-    first = np.array(start[:-1], np.int32)
-    bits = 1 << (column - np.repeat(column[first], np.diff(start)))
-    shared = until[first] >= np.array(start[1:])[:, None, None]
-    # Of those that are shared, the first.
-    chosen = np.argsort(~shared, axis=1, kind="stable")[:, :GROUP_SAMPLES]
-    group_samples = np.take_along_axis(samples[first], chosen, axis=1)
-    enough = np.count_nonzero(shared, axis=1).min(axis=1) >= GROUP_SAMPLES
-    begin = int(group_samples[enough].min(initial=max(outside - GROUP_COLUMNS, 0)))
-    group_samples[~enough] = begin
-    end = int(group_samples.max()) + GROUP_COLUMNS
-    return CentreGroups(first, np.bitwise_or.reduceat(bits, first), group_samples, begin, end)
 
 
 class _Outlines(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ from hypothesis import strategies as st
 
 from camera import Camera
 from lut import (
-    GROUP_COLUMNS,
-    GROUP_SAMPLES,
     DiscShape,
     DiscTable,
     TableError,
@@ -78,29 +75,6 @@ def assert_table_is(table: DiscTable, plain: Outlines) -> None:
     order = np.concatenate([np.arange(0, samples, 2), np.arange(1, samples, 2)])
     pairs = np.stack([expected[:, :samples], expected[:, samples:]], axis=-1)
     assert np.array_equal(table.samples, pairs[:, order])
-    assert_groups(table)
-
-
-def assert_groups(table: DiscTable) -> None:
-    """Each centre is in one group, and sees the group's samples at its own column."""
-    groups, outside = table.groups, table.floor_xy[..., 0].size
-    assert groups.samples.shape == (len(groups.first), GROUP_SAMPLES, 2)
-    assert groups.samples.max(initial=0) <= max(outside - GROUP_COLUMNS, 0)
-    assert groups.samples.min(initial=groups.begin) == groups.begin
-    assert groups.samples.max(initial=groups.begin) + GROUP_COLUMNS == groups.end
-    members = [np.flatnonzero(bits >> np.arange(GROUP_COLUMNS) & 1) for bits in groups.columns]
-    assert sum(len(columns) for columns in members) == len(table.pixels)
-    for first, columns, samples in zip(groups.first, members, groups.samples, strict=True):
-        of_group = slice(first, first + len(columns))
-        u, v = table.pixels[of_group].T
-        assert np.array_equal(u, table.pixels[first, 0] + columns)
-        assert np.all(v == table.pixels[first, 1])
-        # A centre that shares too few is alone; but where pixels are few, `begin` is a sample, too.
-        if len(columns) > 1 or (samples != groups.begin).any():
-            for outline in range(2):
-                seen = samples[:, outline] + columns[:, None]
-                own = table.samples[of_group, :, outline]
-                assert not any(Counter(a) - Counter(b) for a, b in zip(seen, own, strict=True))
 
 
 # -- the published calibration --------------------------------------------------------------------
