@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
@@ -24,6 +25,8 @@ def noisy_rows(rows: Iterable[landmarks.Row], noise: AddedNoise) -> Iterator[lan
         if number == 0 and not noise.nothing:
             line_end = b"\r\n" if (row.source or b"").endswith(b"\r\n") else b"\n"
             yield landmarks.Row(None, b"# " + noise.comment.encode() + line_end)
+            if row.source is not None:  # the mark would be in the second line
+                row = replace(row, source=row.source.removeprefix(BOM_UTF8))
         record = row.record
         rng = of_steps if isinstance(record, landmarks.Step) else of_landmarks
         yield row if record is None else row.with_record(_noisy(record, noise, rng))

@@ -153,6 +153,18 @@ def test_command_keeps_comments_ids_and_line_ends(tmp_path: Path) -> None:
     assert [row.line for row in read_rows(source)] == [1, 2, 3, 4, 5, 6]
 
 
+def test_a_byte_order_mark_does_not_come_after_the_comment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, target = tmp_path / "map.circles", tmp_path / "out.circles"
+    source.write_bytes(b"\xef\xbb\xbfSTEP a.0 0.01 -0.2 0.05 2e-5 0 3e-5 0 0 3e-4\n")
+    assert main(["noise", str(source), "--sigma", "0.05", "-o", str(target), "-q"]) == 0
+    assert "".join(capsys.readouterr()) == ""
+    assert [frame.step for frame in read_frames(target)] == [
+        frame.step for frame in read_frames(source)
+    ]
+
+
 def test_command_refuses_to_overwrite_and_negative_noise(
     project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 from redetect.landmarks import read_rows, write_rows
 from redetect.slam.noise import noisy_rows
 from redetect.slam.options import Noise
@@ -16,5 +14,5 @@ def perform(options: Noise) -> int:
     (source,) = landmark_files(options.run, circles=not lines, lines=lines, stem=options.stem)
     target = options.output or source.with_name(f"noisy{source.suffix}")
     write_rows(target, noisy_rows(read_rows(source), noise), overwrite=options.force)
-    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}", file=sys.stderr)
+    print(f"{target}: {noise.comment if not noise.nothing else 'no noise added'}")
     return 0
