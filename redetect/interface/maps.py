@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypedDict, TypeVar, Unpack, get_type_hints
+from typing import Any, TypedDict, TypeVar, Unpack, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,7 @@ from camera import Camera
 from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.least_squares import LossKind
 from redetect.messages import excerpt, keywords_named, path_of
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import FilterRun
@@ -25,6 +26,7 @@ from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
 from redetect.slam.recording import joined, read_runs
 from redetect.slam.scoring import path_distance
+from redetect.slam.settings import Association, RowErrors, Solver
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
@@ -45,9 +47,9 @@ class MapOptions(RowOptions, total=False):
     more: PathLike | Sequence[PathLike]  #: Further runs of the same building.
     calibrate: bool
     place: bool
-    row_errors: Literal["corrected", "recorded"]
-    solver: Literal["separable", "gtsam"]
-    loss: Literal["none", "huber", "cauchy", "geman-mcclure"]
+    row_errors: RowErrors
+    solver: Solver
+    loss: LossKind
     loss_scale: float
     start: ArrayLike  #: (3,) pose at the start in the map (m, m, rad).
 
@@ -55,7 +57,7 @@ class MapOptions(RowOptions, total=False):
 class LocalizeOptions(RowOptions, total=False):
     """Options of `localize`: flags of `slam localize` (`redetect.slam.options.Localize`)."""
 
-    association: Literal["known", "nearest", "joint"]
+    association: Association
     gate_probability: float
     start: ArrayLike  #: (3,) pose at the start in the map (m, m, rad).
     start_sigma: ArrayLike  #: (3,) its standard deviations.

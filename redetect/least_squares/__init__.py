@@ -2,3 +2,8 @@
 
 Small fits inside a compiled kernel or a filter stay there: a call would cost more than the fit.
 """
+
+from typing import Literal
+
+#: Robust losses.
+LossKind = Literal["none", "huber", "cauchy", "geman-mcclure"]

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from redetect.array_types import FloatArray, IntArray
+from redetect.least_squares import LossKind
 
-LossKind = Literal["none", "huber", "cauchy", "geman-mcclure"]
 X = TypeVar("X")
 
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e10

@@ -8,10 +8,29 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from redetect.bounds import MaybePath, MaybeStr
+from redetect.bounds import (
+    ABOVE_0,
+    NOT_NEGATIVE,
+    PROBABILITY,
+    MaybeFloat,
+    MaybePath,
+    MaybeStr,
+    Positive,
+    whole,
+)
+from redetect.least_squares import LossKind
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise
-from redetect.slam.settings import AddedNoise, AssociateSettings, Place, PlaceSigma
+from redetect.slam.settings import (
+    DEFAULT_GATE_PROBABILITY,
+    AddedNoise,
+    AssociateSettings,
+    Association,
+    Place,
+    PlaceSigma,
+    RowErrors,
+    Solver,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,13 +88,13 @@ class Map(RunsFlags):
     # With --calibrate, how rows are compared with discs: `recorded`, as they were written, which
     # their covariances refer to; `corrected`, on the floor as the camera as mounted sees it, which
     # biases the camera's height downwards.
-    row_errors: Literal["corrected", "recorded"] = "recorded"
+    row_errors: RowErrors = "recorded"
     # `separable`: the project's own; `gtsam`: GTSAM's Levenberg-Marquardt does the last steps
     # (extra [slam]), for discs and plain least squares only.
-    solver: Literal["separable", "gtsam"] = "separable"
+    solver: Solver = "separable"
     # Robust loss: `huber`, `cauchy` or `geman-mcclure` reduces the weight of outliers.
-    loss: Literal["none", "huber", "cauchy", "geman-mcclure"] = "none"
-    loss_scale: float = 3.0  # Scale of the robust loss, standard deviations.
+    loss: LossKind = "none"
+    loss_scale: Positive = 3.0  # Scale of the robust loss, standard deviations.
     start: Place = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     # Folder for map.csv, path.csv (of several runs path_1.csv, path_2.csv, ...), table.json and
     # pictures; by default `slam` in the run folder.
@@ -92,7 +111,7 @@ class Audit(RunFlags):
 
     calibrate: bool = False  # Also estimate the camera's mounting.
     # Squared error of a row, in units of its covariance, from which it contradicts the rest.
-    gate: float = 100.0
+    gate: Positive = 100.0
     # `mend`: rows get the identifier of the landmark that they show, -1 if none explains them;
     # `drop`: their lines are removed.
     apply: Literal["mend", "drop"] = "mend"
@@ -109,9 +128,9 @@ class FilterFlags(RunFlags):
 
     # `known`: rows are associated by their IDs; `nearest` or `joint`: by Mahalanobis distance, of
     # one row at a time or of a frame's rows together.
-    association: Literal["known", "nearest", "joint"] = "known"
+    association: Association = "known"
     # Share of correct rows that pass the gate; not used with known association.
-    gate_probability: float = 0.999
+    gate_probability: Annotated[float, PROBABILITY] = DEFAULT_GATE_PROBABILITY
     start: Place = (0.0, 0.0, 0.0)  # Pose at the start in the map (m, m, rad).
     reference: MaybePath = None  # A path.csv to measure the distance from.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None
@@ -166,8 +185,8 @@ class Associate(RunsFlags):
     """
 
     # Repeat with noise added to the measurements (factors on their standard deviation).
-    noise: tuple[float, ...] = ()
-    seed: int = 1  # Seed of that noise.
+    noise: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
+    seed: Annotated[int, whole(0)] = 1  # Seed of that noise.
     # The landmark file to write; by default associated.circles (or .lines) in the run folder. Both
     # kinds give two files, which differ in the suffix; several runs give found_1.circles,
     # found_2.circles, ... for found.circles. The scores are written to a .json beside.
@@ -224,12 +243,15 @@ class Import:
     # estimates; for a trajectory a path.csv; for a robot a .circles file, or the .csv of its true
     # path; for true landmarks a map.csv.
     output: Annotated[Path, arg(aliases=["-o"])]
-    # Standard deviation of a data set's ranges (m); by default 0.1 in Victoria Park. In the UTIAS
-    # data set the noise is learned from the run, unless this or that of bearings is given.
-    range_sigma: float | None = None
-    # Standard deviation of a data set's bearings (rad); by default 0.03, or learned.
-    bearing_sigma: float | None = None
+    # Standard deviation of a data set's ranges (m). In the UTIAS data set the noise is learned from
+    # the run, unless this or that of bearings is given; then by default 0.03 and 2 %. By default
+    # 0.1 in Victoria Park, and without calibration.
+    range_sigma: Annotated[MaybeFloat, ABOVE_0] = None
+    # Standard deviation of a data set's bearings (rad); by default learned, or 0.02 if that of
+    # ranges is given. By default 0.03 in Victoria Park, and without calibration.
+    bearing_sigma: Annotated[MaybeFloat, ABOVE_0] = None
     # Correct what the UTIAS data set does not state: ranges are depths, and the robot moves later,
-    # faster and farther than its odometry, by as much as the landmarks show.
+    # faster and farther than its odometry, by as much as the landmarks show. (Victoria Park has no
+    # such corrections.)
     calibrated: bool = True
     force: bool = False  # Replace an existing file.

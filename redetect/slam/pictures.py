@@ -50,11 +50,17 @@ _MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
 _Extent = tuple[FloatArray, FloatArray]  # low and high corner (m)
 
 
+def demand_windows() -> None:
+    """Raise `SlamError` if no window can be opened."""
+    if mpl.get_backend().lower() in _WITHOUT_WINDOWS:
+        raise SlamError("no window can be opened here: expected a display for interactive")
+
+
 @contextmanager
 def picture(size: tuple[float, float], *, interactive: bool) -> Iterator[tuple[Figure, io.BytesIO]]:
     """A figure to draw into (size in inches), and its file; on request, it is shown at the end."""
-    if interactive and mpl.get_backend().lower() in _WITHOUT_WINDOWS:
-        raise SlamError("no window can be opened here: expected a display for interactive")
+    if interactive:
+        demand_windows()
     new = pyplot.figure if interactive else Figure
     with figure_file(size, "png", framed=True, new=new) as (figure, content):
         try:

@@ -12,7 +12,13 @@ from redetect.slam.errors import SlamError
 #: A pose given by flags (m, m, rad), and its standard deviations.
 Place = Annotated[tuple[float, float, float], from_to(-1e12, 1e12)]
 PlaceSigma = Annotated[tuple[float, float, float], from_to(0.0, 1e12)]
+#: How rows are paired with landmarks; `known`: by their identifiers.
 Method = Literal["nearest", "joint"]
+Association = Literal["known", "nearest", "joint"]
+#: Solvers of the map, and how rows are compared with discs.
+Solver = Literal["separable", "gtsam"]
+RowErrors = Literal["corrected", "recorded"]
+DEFAULT_GATE_PROBABILITY = 0.999
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,8 @@ class AssociateSettings(Bounded, error=SlamError):
     method: Method = "joint"
     # Then close loops by matching local maps of landmarks.
     map_level: bool = True
-    gate_probability: Annotated[float, PROBABILITY] = 0.999  # Share of correct rows that pass.
+    # Share of correct rows that pass.
+    gate_probability: Annotated[float, PROBABILITY] = DEFAULT_GATE_PROBABILITY
     # Factor on the discs' standard deviations: tilt and calibration move a frame's discs together
     # by more than the file states.
     sigma_scale: Positive = 1.4

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize, sparse
 
+from redetect.least_squares import LossKind
 from redetect.least_squares.covariance import (
     chosen_covariance,
     diagonal_blocks,
@@ -19,7 +20,6 @@ from redetect.least_squares.solver import (
     Block,
     Linear,
     Loss,
-    LossKind,
     minimise,
     normal_equations,
     robust,

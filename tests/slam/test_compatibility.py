@@ -15,7 +15,6 @@ from redetect.slam.association.compatibility import (
     chi_squared_gates,
     compatible,
 )
-from redetect.slam.errors import SlamError
 
 Case = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -169,12 +168,6 @@ def test_gates_are_quantiles_and_right_sets_pass_with_their_probability() -> Non
     squared = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
     passed = np.mean(squared <= chi_squared_gates(0.9, 2, 3)[3])
     assert passed == pytest.approx(0.9, abs=4 * np.sqrt(0.09 / 4000))
-
-
-@pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, float("nan")])
-def test_gate_probability_outside_its_range_is_refused(probability: float) -> None:
-    with pytest.raises(SlamError, match="gate_probability"):
-        compatible("joint", np.zeros((1, 1, 2)), np.eye(2), np.eye(2)[None], probability)
 
 
 def test_a_pair_without_positive_definite_covariance_is_never_made() -> None:

@@ -125,6 +125,29 @@ def test_distances_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert content["distance_from_reference_map"]["landmarks"] == 2
 
 
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--reference", "missing.csv"], "missing.csv: cannot be read"),
+        (["--reference-map", "missing.csv"], "missing.csv: cannot be read"),
+        (["--reference-map", "other.csv"], "no landmark is in both"),
+        (["--interactive"], "no window can be opened here"),
+    ],
+)
+def test_nothing_is_written_before_everything_is_read(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    tiny(Path("a.circles"))
+    Path("other.csv").write_text("id,x_m,y_m,rows\n77,0,0,1\n")
+    assert main(["ekf", "a.circles", *flags]) == 1
+    assert message in capsys.readouterr().err
+    if flags == ["--interactive"]:
+        assert main(["map", "a.circles", *flags]) == 1
+    assert not Path("slam").exists()
+
+
 def test_distance_of_paths_and_maps() -> None:
     path = Path2D(("start", "a"), np.array([[0.0, 0, 0], [3.0, 4.0, 3.1]]))
     distance = path_distance(path, np.array([[0.0, 0, 0], [0.0, 0.0, -3.1]]))

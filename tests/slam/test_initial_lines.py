@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from camera import Camera
-from redetect.least_squares.solver import LossKind
+from redetect.least_squares import LossKind
 from redetect.slam.mapping.graph import (
     MOST_SIGMA_M,
     Estimate,

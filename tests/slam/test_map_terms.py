@@ -16,11 +16,12 @@ from camera.rotations import left_jacobian, rotation_of
 from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import inverse_blocks
 from redetect.slam.mapping.graph import Estimate, Graph, first_sight, graph_of_recording, with_lines
-from redetect.slam.mapping.graph_terms import RowErrors, Weighting, errors, linearise
+from redetect.slam.mapping.graph_terms import Weighting, errors, linearise
 from redetect.slam.mapping.solve import marginals, moved, solve
 from redetect.slam.models import bearing_of_vertical
 from redetect.slam.mounting import mounting_change
 from redetect.slam.recording import LineRows
+from redetect.slam.settings import RowErrors
 from tests.slam.small_run import CAMERA_XY, small_run
 
 

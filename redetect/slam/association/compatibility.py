@@ -20,9 +20,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
-from redetect.slam.errors import SlamError
-
-DEFAULT_GATE_PROBABILITY = 0.999
+from redetect.slam.settings import DEFAULT_GATE_PROBABILITY
 
 
 def compatible(
@@ -75,8 +73,6 @@ def compatible(
 @cache
 def chi_squared_gates(probability: float, width: int, most_pairs: int) -> FloatArray:
     """(most_pairs + 1,) chi-squared quantiles for 0, 1, 2, ... pairs, not to be modified."""
-    if not 0.0 < probability < 1.0:
-        raise SlamError(f"gate_probability is {probability}: expected above 0 and below 1")
     gates = chdtri(width * np.arange(1, most_pairs + 1), 1.0 - probability)
     return np.concatenate([[0.0], gates])
 

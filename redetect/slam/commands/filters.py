@@ -18,7 +18,7 @@ from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_by_flags
 from redetect.slam.options import Ekf, Localize
-from redetect.slam.pictures import draw_errors, draw_map
+from redetect.slam.pictures import demand_windows, draw_errors, draw_map
 from redetect.slam.recording import Recording, camera_xy_of
 from redetect.slam.scoring import map_distance, path_distance
 from redetect.storage import demand_free, write_bytes
@@ -36,6 +36,8 @@ _Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
 def perform(command: Localize | Ekf) -> int:
     """Execute the command; returns the exit code."""
     demand_fields(command, SlamError)
+    if command.interactive:
+        demand_windows()
     name = type(command).__name__.lower()
     output = command.output or files.default_output(command.run, name)
     names = [map_file.PATH_NAME, f"{name}.json", files.MAP_PICTURE]
@@ -43,6 +45,10 @@ def perform(command: Localize | Ekf) -> int:
     if isinstance(command, Ekf):
         names += [map_file.MAP_NAME, map_file.covariance_file(Path(map_file.MAP_NAME)).name]
     demand_free([output / name for name in names], overwrite=command.force)
+    reference = None if command.reference is None else map_file.read_path(command.reference)
+    known = None
+    if isinstance(command, Ekf) and command.reference_map is not None:
+        known = map_file.read_map(command.reference_map)
     recording = files.recording_of(command)
     began = time.perf_counter()
     if isinstance(command, Localize):
@@ -57,10 +63,10 @@ def perform(command: Localize | Ekf) -> int:
     elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
         said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
-    reference = None if command.reference is None else map_file.read_path(command.reference)
     distance = None
     if reference is not None:
         distance = path_distance(run.path, reference.poses, f"{command.reference}: ")
+    off = None if known is None else map_distance(landmark_map, known)
 
     output.mkdir(parents=True, exist_ok=True)
     head = [f"slam {name} {__version__}: {source}"]
@@ -72,8 +78,7 @@ def perform(command: Localize | Ekf) -> int:
     }
     if isinstance(command, Ekf):
         content["landmarks"] = {"discs": len(landmark_map.discs), "lines": len(landmark_map.lines)}
-        if command.reference_map:
-            off = map_distance(landmark_map, map_file.read_map(command.reference_map))
+        if off is not None:
             content["distance_from_reference_map"] = off
             said.append(
                 "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "

@@ -21,7 +21,7 @@ from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run_by_flags, table_lines
 from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
-from redetect.slam.pictures import draw_map
+from redetect.slam.pictures import demand_windows, draw_map
 from redetect.slam.recording import first_poses, joined
 from redetect.storage import demand_free, write_bytes
 
@@ -36,6 +36,9 @@ _MOST_FACTOR = 2.5
 
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
+    demand_fields(command, SlamError)
+    if command.interactive:
+        demand_windows()
     output = command.output or files.default_output(command.run)
     joint_name = map_file.covariance_file(Path(map_file.MAP_NAME)).name
     several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
@@ -46,7 +49,6 @@ def perform(command: Map) -> int:
     runs = files.recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
-    demand_fields(command, SlamError)
     mapped = map_run_by_flags(command, recording)
     seconds = time.perf_counter() - begin
 

@@ -10,18 +10,18 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dtrtrs
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.bounds import PROBABILITY, Bounded
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.plane import apply, rotation
 from redetect.slam.association.compatibility import (
-    DEFAULT_GATE_PROBABILITY,
     chi_squared_gates,
     compatible,
     individual_distances,
@@ -36,6 +36,7 @@ from redetect.slam.models import (
     tilt_jacobian,
 )
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
+from redetect.slam.settings import DEFAULT_GATE_PROBABILITY, Association
 
 POSE_SIZE = 3
 _POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
@@ -45,8 +46,6 @@ NEW_DISC_GATES = 4.0
 FARTHEST_LINE_M = 15.0
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
-
-Association = Literal["known", "nearest", "joint"]
 
 
 class FrameRows(NamedTuple):
@@ -141,14 +140,6 @@ class Filter(ABC):
         Variance of a pitch and a roll common to all frames (rad^2). Their effect on discs is part
         of the covariances, but they are not estimated (Schmidt-Kalman filter): an error of odometry
         looks the same.
-
-    Attributes
-    ----------
-    disc_slots, line_slots : dict of int to int
-        Index of each landmark's first number in the state, by identifier.
-    count : RowCount
-    size : int
-        Number of numbers in the state.
     """
 
     #: Number of the state's numbers for a line.
@@ -167,7 +158,7 @@ class Filter(ABC):
         #: Index of each landmark's first number in the state, by identifier.
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
-        self.count = RowCount()
+        self.count = RowCount()  #: Use of the rows.
         # Numbers of the pose, and of the common tilt, if there is one.
         self._moving = np.arange(POSE_SIZE + 2 if common_tilt_variance else POSE_SIZE)
         self._tilt = slice(POSE_SIZE, len(self._moving))
@@ -355,15 +346,13 @@ def numbers_from(slots: ArrayLike, size: int) -> IntArray:
 
 
 @dataclass(frozen=True)
-class Associator:
+class Associator(Bounded, error=SlamError):
     """Pairs rows with landmarks."""
 
     method: Association = "known"  # `known`, `nearest` or `joint`
-    gate_probability: float = DEFAULT_GATE_PROBABILITY  # share of correct rows that pass
+    # Share of correct rows that pass.
+    gate_probability: Annotated[float, PROBABILITY] = DEFAULT_GATE_PROBABILITY
     new_id: Callable[[], int] | None = None  # gives the IDs of new discs; None: there are none
-
-    def __post_init__(self) -> None:
-        chi_squared_gates(self.gate_probability, 1, 1)
 
     def identified(self, rows: FrameRows, estimate: Filter) -> FrameRows:
         """Rows with the identifiers of their paired landmarks."""
@@ -392,15 +381,17 @@ class Associator:
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
 
+BY_IDENTIFIERS = Associator()
+
+
 def run_filter(
-    recording: Recording, estimate: Filter, associator: Associator | None = None
+    recording: Recording, estimate: Filter, pairing: Associator = BY_IDENTIFIERS
 ) -> FilterRun:
     """Run a filter, which is at the start, over a run.
 
-    Rows are paired with landmarks by their identifiers, unless an associator is given; those
-    without are ignored. Raises `SlamError`, which names the step, if an update is not possible.
+    Rows without a landmark are ignored. Raises `SlamError`, which names the step, if an update is
+    not possible.
     """
-    pairing = associator or Associator()
     disc_ids: list[int] = []
     line_ids: list[tuple[int, ...]] = []
     poses = np.empty((len(recording) + 1, 3))

@@ -222,14 +222,13 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
 
 
 def run_ekf(
-    recording: Recording, ekf: EkfSlam, associator: base.Associator | None = None
+    recording: Recording, ekf: EkfSlam, pairing: base.Associator = base.BY_IDENTIFIERS
 ) -> base.FilterRun:
     """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
     If identities have to be found, discs far from all others are new ones, numbered from 1. Lines
     may be anywhere on a ray at first: `SlamError` is raised if their rows have no identifiers.
     """
-    pairing = associator or base.Associator()
     if pairing.method != "known" and len(recording.lines):
         raise SlamError(
             f"association {pairing.method} with lines: EKF-SLAM finds identities of discs only: "

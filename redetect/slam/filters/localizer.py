@@ -22,6 +22,7 @@ from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import (
+    BY_IDENTIFIERS,
     POSE_SIZE,
     Associator,
     Filter,
@@ -92,7 +93,7 @@ class Localizer(Filter):
 def localize_run(
     recording: Recording,
     landmark_map: LandmarkMap,
-    associator: Associator | None = None,
+    pairing: Associator = BY_IDENTIFIERS,
     *,
     start: ArrayLike | None = (0.0, 0.0, 0.0),
     start_sigma: ArrayLike = (0.0, 0.0, 0.0),
@@ -106,7 +107,7 @@ def localize_run(
     unknown start, None, is estimated from the discs of the first frames, whatever their
     identifiers. Raises `SlamError` if that has no certain place, or no row shows a landmark.
     """
-    pairing, covariance, found = associator or Associator(), np.diag(np.square(start_sigma)), None
+    covariance, found = np.diag(np.square(start_sigma)), None
     if start is None:
         found = localise_globally(recording, landmark_map.discs.xy)
         if found is None:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
 
 import numpy as np
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import Bounded, Positive
 from redetect.landmarks import wrap_angle
-from redetect.least_squares.solver import Block, Linear, Loss, LossKind, robust_cost, stack
+from redetect.least_squares import LossKind
+from redetect.least_squares.solver import Block, Linear, Loss, robust_cost, stack
 from redetect.plane import between
 from redetect.slam import models
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mounting import rows_as_recorded, rows_through_mounting
-
-RowErrors = Literal["corrected", "recorded"]
+from redetect.slam.settings import RowErrors
 
 #: Rotation about robot x, y, z, and position in robot x, y, z.
 MOUNTING = 6

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.options import Map
 from redetect.slam.recording import Recording, camera_of_run
+from redetect.slam.settings import Solver
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
@@ -47,7 +47,6 @@ _PLAUSIBLE_FACTOR = 2.5
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
-Solver = Literal["separable", "gtsam"]
 Descent = Callable[[Graph, Estimate, Weighting], Minimum[Estimate]]
 _coarsely: Descent = partial(solve, tolerance=_COARSE)
 
