@@ -103,6 +103,10 @@ def test_existing_files_and_settings_without_sense_are_refused(
             main(["associate", run, "-o", str(target), *setting])
         assert message in capsys.readouterr().err
         assert not target.exists()
+    report = tmp_path / "found.json"
+    assert main(["associate", run, "-o", str(report), "--force"]) == 1
+    assert "the scores are written there" in capsys.readouterr().err
+    assert not report.exists()
     assert main(["associate", run, "-o", str(target), "--noise", "-1"]) == 1
     assert "noise is -1: expected 0 or more" in capsys.readouterr().err
 

@@ -150,9 +150,20 @@ def test_mending_leaves_all_other_rows(spoilt_demo: Path, tmp_path: Path) -> Non
     assert [line.split(",")[3:6] for line in table[2:]] == [["30", "exchange", "11"]] * 5
     assert len(list(pictures.glob("*.png"))) > 0
     assert main(arguments) == 1  # nothing is overwritten unasked
+    table_file = str(output.with_suffix(".csv"))
+    assert main(["audit", str(spoilt_demo), "-o", table_file, "--force"]) == 1
     bytes_before = output.read_bytes(), output.with_suffix(".csv").read_bytes()
     assert main([*arguments, "--force"]) == 0
     assert (output.read_bytes(), output.with_suffix(".csv").read_bytes()) == bytes_before
+
+
+def test_images_in_another_folder_leave_the_calibration_that_of_the_run(
+    spoilt_demo: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "images").mkdir()
+    arguments = ["audit", str(spoilt_demo), "-o", str(tmp_path / "a.circles")]
+    images = ["--images", str(tmp_path / "images"), "--pictures", str(tmp_path / "pictures")]
+    assert main([*arguments, *images]) == 0
 
 
 def test_dropping_leaves_out_the_lines(spoilt_demo: Path, tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 
 from redetect import __version__
 from redetect.array_types import IntArray
-from redetect.bounds import NOT_NEGATIVE, demand, whole
+from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
+from redetect.messages import is_quiet
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import Scores, score_run
 from redetect.slam.commands import files
@@ -30,7 +31,7 @@ Labels = dict[type[CircleLandmark] | type[LineLandmark], IntArray]
 
 def perform(options: Associate) -> int:
     """Execute the command; returns the exit code."""
-    demand(options, SlamError, noise=NOT_NEGATIVE, seed=whole(0))
+    demand_fields(options, SlamError)
     settings = options.settings
     files_of_runs = [landmark_files(run, **options.rows) for run in options.runs]
     sources = [(k, file) for k, own in enumerate(files_of_runs) for file in own]
@@ -38,6 +39,8 @@ def perform(options: Associate) -> int:
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
     report = (options.output or targets[0]).with_suffix(".json")
+    if report in targets:
+        raise SlamError(f"{report}: the scores are written there: expected another suffix")
     demand_free([*targets, report], overwrite=options.force)
     runs = files.recordings_of(options)
     recording = joined(runs)
@@ -141,5 +144,5 @@ def _target(options: Associate, run: int, source: Path, several: bool) -> Path:
 
 
 def _progress(text: str) -> None:
-    if sys.stderr.isatty():
+    if sys.stderr.isatty() and not is_quiet():
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)

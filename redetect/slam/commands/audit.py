@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect import __version__
-from redetect.bounds import ABOVE_0, demand
+from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import recording_of
@@ -29,14 +29,17 @@ _COLUMNS = (
 
 def perform(options: Options) -> int:
     """Execute the command; returns the exit code."""
-    demand(options, SlamError, gate=ABOVE_0)
+    demand_fields(options, SlamError)
     (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")
-    demand_free((target, target.with_suffix(".csv")), overwrite=options.force)
+    listed = target.with_suffix(".csv")
+    if listed == target:
+        raise SlamError(f"{target}: the rows are listed there: expected another suffix")
+    demand_free((target, listed), overwrite=options.force)
     recording = recording_of(options)
     camera = None
     if options.calibrate or options.pictures:
-        camera = camera_of_run(options.images or options.run, options.camera)
+        camera = camera_of_run(options.run, options.camera)
     audit = audit_run(
         recording,
         camera if options.calibrate else None,
@@ -46,11 +49,11 @@ def perform(options: Options) -> int:
     )
     rows = list(read_rows(source))
     write_rows(target, audited_rows(rows, audit, options.apply), overwrite=options.force)
-    listed, head = _table(recording, audit, rows), f"slam audit {__version__}: {source.name}"
-    write_table(target.with_suffix(".csv"), _COLUMNS, listed, [head], overwrite=options.force)
+    table, head = _table(recording, audit, rows), f"slam audit {__version__}: {source.name}"
+    write_table(listed, _COLUMNS, table, [head], overwrite=options.force)
     for line in _report(recording, audit):
         print(line)
-    print(f"{target}, {target.with_suffix('.csv').name}")
+    print(f"{target}, {listed.name}")
     if options.pictures is not None and camera is not None:
         _draw(options, camera, audit, source)
     return 0
