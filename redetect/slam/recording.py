@@ -190,6 +190,8 @@ def landmark_files(
     """
     if not run.is_dir():
         _demand_landmarks(run)
+        if lines and run.suffix == ".circles":
+            raise SlamError(f"{run}: has discs, not lines: expected its .lines file, or the folder")
         return [run]
     kinds = ["circles"] * circles + ["lines"] * lines
     if not kinds:

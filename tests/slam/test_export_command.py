@@ -112,6 +112,30 @@ def test_bearings_need_a_camera(tmp_path: Path, capsys: Capture) -> None:
     refused([*arguments, "--force"], "several calibrations (one.cam, two.cam)", capsys)
 
 
+def test_flags_that_do_not_apply_are_refused(tmp_path: Path, capsys: Capture) -> None:
+    graph, tables = tmp_path / "e.g2o", ["--to", "csv", "-o", str(tmp_path / "tables")]
+    refused(
+        ["export", str(DEMO), "--times", "missing", "-o", str(graph)],
+        "--times: only --to tum has times, not g2o", capsys,
+    )  # fmt: skip
+    refused(["export", str(DEMO / "map.circles"), "--lines", *tables], "has discs, not", capsys)
+    assert main(["export", str(DEMO), "-o", str(graph)]) == 0
+    capsys.readouterr()
+    again = ["import", str(graph), "-o", str(tmp_path / "e.circles")]
+    refused([*again, "--range-sigma", "0.1"], "--range-sigma: has no effect on e.g2o", capsys)
+    refused([*again, "--range-sigma", "-3"], "range_sigma is -3: expected above 0", capsys)
+    refused([*again, "--no-calibrated"], "--no-calibrated: has no effect on e.g2o", capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["e.g2o"]
+
+
+def test_the_first_pose_of_a_path_without_a_start_has_its_time(tmp_path: Path) -> None:
+    file, tum = tmp_path / "path.csv", tmp_path / "e.tum"
+    write_path(file, Path2D(("a", "b"), np.array([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])))
+    (tmp_path / "e.times").write_text("a 5\nb 6\n")
+    assert main(["export", str(file), "--to", "tum", "-o", str(tum)]) == 0
+    np.testing.assert_array_equal(np.loadtxt(tum)[:, 0], [5.0, 6.0])
+
+
 def test_a_trajectory_with_times(tmp_path: Path, capsys: Capture) -> None:
     """Of the file named, else of that beside the run which has all frames; the start has none."""
     run = tmp_path / "run"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from redetect import __version__
-from redetect.bounds import ABOVE_0, demand
+from redetect.bounds import demand_fields
 from redetect.landmarks import write_frames
 from redetect.landmarks.axes import MEANING
 from redetect.landmarks.frames import read_times
@@ -23,9 +23,13 @@ from redetect.slam.options import Export, Import
 from redetect.slam.recording import Recording, camera_xy_of, frames_of_discs
 from redetect.storage import demand_free
 
+_DATA_SET_FLAGS = ("range_sigma", "bearing_sigma", "calibrated")
+
 
 def perform_export(command: Export) -> int:
     """Execute the command; returns the exit code."""
+    if command.times is not None and command.to != "tum":
+        raise SlamError(f"--times: only --to tum has times, not {command.to}")
     {"g2o": _export_g2o, "tum": _export_tum, "csv": _export_tables}[command.to](command)
     return 0
 
@@ -53,18 +57,19 @@ def _export_tum(command: Export) -> None:
     times = _times_of(command, path)
     head = [*_head(command.run), "t counts the steps" if times is None else "t in seconds"]
     write_tum(command.output, path, times=times, comments=head, overwrite=command.force)
-    count = len(path.poses) if times is None else len(path.poses) - 1
+    count = len(path.poses) if times is None else len(times)
     print(f"{command.output}: {count} poses")
 
 
 def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
     """Times of a path's poses, from the given file, or the first complete one beside the run."""
     folder = command.run if command.run.is_dir() else command.run.parent
+    names = path.prefixes[path.prefixes[0] == "start" :]  # it has no frame
     for file in [command.times] if command.times else sorted(folder.glob("*.times")):
         times = read_times(file)
-        missing = [name for name in path.prefixes[1:] if name not in times]
+        missing = [name for name in names if name not in times]
         if not missing:
-            found = {name: times[name] for name in path.prefixes[1:]}
+            found = {name: times[name] for name in names}
             if np.any(np.diff(list(found.values())) < 0.0):
                 raise SlamError(f"{file}: the frames' times go back: expected them in order")
             return found
@@ -103,6 +108,11 @@ def perform_import(command: Import) -> int:
             f"{command.file}: is a landmark file: expected a .g2o graph or a trajectory; "
             "`slam export` writes them"
         )
+    demand_fields(command, SlamError)
+    for name in _DATA_SET_FLAGS:
+        if name not in _flags_used(command) and getattr(command, name) != getattr(Import, name):
+            flag = "no-calibrated" if name == "calibrated" else name.replace("_", "-")
+            raise SlamError(f"--{flag}: has no effect on {command.file.name}")
     if command.file.suffix in (".dat", ".mat"):
         _import_data_set(command)
     elif command.file.suffix != ".g2o":
@@ -115,9 +125,15 @@ def perform_import(command: Import) -> int:
     return 0
 
 
+def _flags_used(command: Import) -> tuple[str, ...]:
+    """Those of `_DATA_SET_FLAGS` that have an effect."""
+    if command.file.name.endswith(data_sets.ODOMETRY) and command.output.suffix != ".csv":
+        return _DATA_SET_FLAGS
+    return _DATA_SET_FLAGS[:2] if command.file.name == data_sets.DRIVE else ()
+
+
 def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
-    demand(command, SlamError, range_sigma=ABOVE_0, bearing_sigma=ABOVE_0)
     file, sigmas = command.file, (command.range_sigma, command.bearing_sigma)
     if file.name == data_sets.LANDMARKS:
         landmark_map = data_sets.read_landmarks(file)
@@ -141,9 +157,8 @@ def _import_data_set(command: Import) -> None:
 
 
 def _write_run(command: Import, run: Recording, what: str, *notes: str) -> None:
-    names = ("range_sigma", "bearing_sigma", "calibrated")
-    settings = ", ".join(f"{name}: {getattr(command, name)}" for name in names)
-    head = [_made_by(command.file), *([settings] if what == "measurements" else []), *notes]
+    settings = ", ".join(f"{name}: {getattr(command, name)}" for name in _flags_used(command))
+    head = [_made_by(command.file), *([settings] if settings else []), *notes]
     frames = frames_of_discs(run)
     write_frames(command.output, frames, head="\n".join(head), overwrite=command.force)
     print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *notes]))
