@@ -43,7 +43,9 @@ def perform(options: Convert) -> int:
         )
     if isinstance(source, Camera) and not isinstance(camera, Camera):
         print("the pose is dropped: the format has none (--pose-from restores it)")
-    content = files.format_of(camera, to_format).encode()
+    if getattr(source, "covariance", None) and not getattr(camera, "covariance", None):
+        print("the covariance is dropped: it is kept in .cam files of the same rows and pose")
+    content = files.FORMATS[to_format].write(camera).encode()
     write_bytes(options.target, content, overwrite=options.force)
     print(f"written: {options.target}")
     return 0

@@ -216,17 +216,20 @@ def convert_to_camera(
     is fitted with the source's tangential terms and, if that is not close enough, all terms and a
     polynomial. Source, rows, result and errors are those of `convert_to_foreign`. The pose,
     ``sensor2Tcp`` and ``mountIndex`` are those of `pose`, else of the source, else the identity.
+    The source's covariance is kept with the same rows and pose.
     """
     factor = _FACTORS[rows]
     width, height = target_size(source, rows)
-    if pose is None:
-        pose = source if isinstance(source, Camera) else UNPOSED
-    unknown = source.unknown if isinstance(source, Camera) else ()
+    own = source if isinstance(source, Camera) else UNPOSED
+    covariance = own.covariance if rows == "same" and pose is None else None
+    pose = own if pose is None else pose
     check = _grid(source, rows, _CHECK_GRID)
 
     def measured(intrinsics: FloatArray) -> Converted:
         size = {"width": width, "height": height}
-        camera = with_intrinsics(pose, intrinsics, **size, unknown=unknown, covariance=None)
+        camera = with_intrinsics(
+            pose, intrinsics, **size, unknown=own.unknown, covariance=covariance
+        )
         return _measured(camera, check)
 
     fx, fy, cx, cy = source.pinhole

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
@@ -10,16 +12,29 @@ from camera.formats import conversion, yaml_files
 from camera.formats.colmap import format_colmap, parse_colmap
 from camera.formats.conversion import AnyCamera, Converted
 from camera.formats.models import ForeignCamera, Model
-from camera.model import Camera
 from camera.options import Convert, Format
 from redetect.storage import bounded
 
-#: The models of each format, the simplest first, with their numbers of coefficients: some lack k3.
-MODELS: dict[str, dict[Model, int]] = {
-    "opencv": {"radtan": 5, "rational": 8, "fisheye": 4},
-    "ros": {"radtan": 5, "rational": 8, "fisheye": 4},
-    "kalibr": {"radtan": 4, "fisheye": 4},
-    "colmap": {"radtan": 4, "rational": 8, "fisheye": 4},
+
+class FileFormat(NamedTuple):
+    """How cameras are read from a format's text and written to it."""
+
+    parse: Callable[..., AnyCamera]  # By text, name and, of a file with several, the camera's name
+    write: Callable[[Any], str]
+    # Its models, the simplest first, with their numbers of coefficients: some lack k3.
+    models: dict[Model, int]
+    has_several: bool = False  # Whether a file may have several cameras
+
+
+_WITH_K3: dict[Model, int] = {"radtan": 5, "rational": 8, "fisheye": 4}
+FORMATS: dict[Format, FileFormat] = {
+    "cam": FileFormat(parse_camera, format_camera, {}),
+    "opencv": FileFormat(yaml_files.parse_opencv, yaml_files.format_opencv, _WITH_K3),
+    "ros": FileFormat(yaml_files.parse_ros, yaml_files.format_ros, _WITH_K3),
+    "kalibr": FileFormat(
+        yaml_files.parse_kalibr, yaml_files.format_kalibr, {"radtan": 4, "fisheye": 4}, True
+    ),
+    "colmap": FileFormat(parse_colmap, format_colmap, {**_WITH_K3, "radtan": 4}, True),
 }
 # Formats by parts of a YAML file's name.
 _YAML_NAMES: dict[str, Format] = {
@@ -77,27 +92,10 @@ def format_of_text(path: Path, text: str) -> Format:
 
 def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
     """A camera of the text of a file."""
-    if from_format == "kalibr":
-        return yaml_files.parse_kalibr(text, name, camera_name)
-    if from_format == "colmap":
-        return parse_colmap(text, name, camera_name)
-    if from_format == "cam":
-        return parse_camera(text, name)
-    if from_format == "ros":
-        return yaml_files.parse_ros(text, name)
-    return yaml_files.parse_opencv(text, name)
-
-
-def format_of(camera: AnyCamera, to_format: Format) -> str:
-    """The text of a file of a camera."""
-    if isinstance(camera, Camera):
-        return format_camera(camera)
-    formats = {
-        "opencv": yaml_files.format_opencv,
-        "ros": yaml_files.format_ros,
-        "kalibr": yaml_files.format_kalibr,
-    }
-    return formats.get(to_format, format_colmap)(camera)
+    known = FORMATS[from_format]
+    if camera_name and not known.has_several:
+        raise ConversionError(f"{name}: has one camera: expected no --camera-name")
+    return known.parse(text, name, *([camera_name] if known.has_several else []))
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
@@ -106,9 +104,13 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
     Otherwise to the first one within the limit, or the closest one.
     """
     if to_format == "cam":
+        if options.model != "auto":
+            raise ConversionError(".cam files have a model of their own: expected no --model")
         pose = read_camera(options.pose_from) if options.pose_from is not None else None
         return conversion.convert_to_camera(source, options.rows, pose)
-    models = MODELS[to_format]
+    if options.pose_from is not None:
+        raise ConversionError(f"{to_format} has no pose: expected no --pose-from")
+    models = FORMATS[to_format].models
     if options.model != "auto":
         if options.model not in models:
             raise ConversionError(

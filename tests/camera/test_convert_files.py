@@ -9,14 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from camera import Camera
+from camera import Camera, read_camera, write_camera
 from camera.cli import main
 from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
-from camera.formats.files import convert, format_of, format_of_text, parse
+from camera.formats.files import FORMATS, convert, format_of_text, parse
 from camera.formats.models import ForeignCamera, Model
 from camera.formats.yaml_files import format_kalibr, format_ros, parse_kalibr, parse_ros
 from camera.options import Convert, Format
+from camera.uncertainty import with_covariance
 
 RADTAN = ForeignCamera(
     "radtan", 640, 480, 500.0, 505.0, 318.5, 241.0, (-0.3, 0.1, 1e-3, -5e-4, 0.0)
@@ -129,7 +130,7 @@ def test_what_a_format_holds_is_taken_over(
         # However much the loss of a term would be allowed to show.
         options = Convert(Path("source"), Path("target"), limit_px=100.0)
         found = convert(source, to_format, options).camera
-        back = parse(format_of(found, to_format), to_format, "back")
+        back = parse(FORMATS[to_format].write(found), to_format, "back")
         np.testing.assert_allclose(back.distort(rays), source.distort(rays), rtol=0, atol=1e-9)
 
 
@@ -137,7 +138,8 @@ def test_a_polynomial_of_three_terms_stays_whole_in_colmaps_format() -> None:
     source = replace(RADTAN, distortion=(-0.3, 0.1, 1e-3, -5e-4, -0.02))
     camera = convert_to_camera(source).camera
     options = Convert(Path("source"), Path("cameras.txt"), limit_px=100.0)
-    back = parse(format_of(convert(camera, "colmap", options).camera, "colmap"), "colmap", "back")
+    text = FORMATS["colmap"].write(convert(camera, "colmap", options).camera)
+    back = parse(text, "colmap", "back")
     assert isinstance(back, ForeignCamera)
     assert back.distortion[:5] == source.distortion
     assert not any(back.distortion[5:])
@@ -155,3 +157,38 @@ def test_two_cameras_of_one_number_are_refused() -> None:
     text = "1 PINHOLE 640 480 500 500 320 240\n1 PINHOLE 64 48 50 50 32 24\n"
     with pytest.raises(ConversionError, match="list:2: camera 1 a second time, after line 1"):
         parse(text, "colmap", "list", "1")
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "flags", "message"),
+    [
+        ("a.cam", "b.cam", ["--model", "fisheye"], "expected no --model"),
+        ("a.cam", "b.ros.yaml", ["--pose-from", "absent.cam"], "expected no --pose-from"),
+        ("a.cam", "b.ros.yaml", ["--camera-name", "cam0"], "expected no --camera-name"),
+        ("a.ros.yaml", "b.cam", ["--camera-name", "cam0"], "expected no --camera-name"),
+    ],
+)
+def test_flags_without_effect_are_refused(
+    tmp_path: Path, published_camera: Camera, capsys: pytest.CaptureFixture[str],
+    source: str, target: str, flags: list[str], message: str,
+) -> None:  # fmt: skip
+    write_camera(published_camera, tmp_path / "a.cam")
+    (tmp_path / "a.ros.yaml").write_text(format_ros(RADTAN))
+    assert main(["convert", str(tmp_path / source), str(tmp_path / target), *flags]) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / target).exists()
+
+
+def test_a_covariance_is_kept_where_it_is_still_true(
+    tmp_path: Path, published_camera: Camera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = with_covariance(published_camera, 1e-6 * np.eye(20))
+    write_camera(known, tmp_path / "a.cam")
+    convert_a = ["convert", str(tmp_path / "a.cam"), str(tmp_path / "b.cam"), "--force"]
+    assert main(convert_a) == 0
+    assert read_camera(tmp_path / "b.cam") == known
+    assert "dropped" not in capsys.readouterr().out
+    for flags in (["--rows", "double"], ["--pose-from", str(tmp_path / "a.cam")]):
+        assert main([*convert_a, *flags]) == 0
+        assert read_camera(tmp_path / "b.cam").covariance is None
+        assert "the covariance is dropped" in capsys.readouterr().out
