@@ -41,6 +41,7 @@ _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
 # Pictures that leave the ratio of the scales more uncertain than this leave it open.
 _ASPECT_SIGMA = 0.003
+_DEFAULT = CalibrationSettings()
 
 
 def largest_rms_px(width: int) -> float:
@@ -151,7 +152,7 @@ def calibrate(
     views: Sequence[BoardView],
     board: Board,
     size: tuple[int, int],
-    settings: CalibrationSettings | None = None,
+    settings: CalibrationSettings = _DEFAULT,
 ) -> Calibration:
     """Calibrate a camera by views of a board, by the reprojection error.
 
@@ -172,7 +173,6 @@ def calibrate(
     CalibrationError
         If the views are too few or too much alike, or nothing explains them.
     """
-    settings = settings if settings is not None else CalibrationSettings()
     demand_enough(len(views))
     measured = points_of(views, board, size)
     names = tuple(view.name for view in views)

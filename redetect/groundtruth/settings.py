@@ -26,21 +26,27 @@ _UP_TO_A_DAY = Bounds("above 0, at most 100000", lambda x: 0.0 < x <= 1e5)
 
 
 @dataclass(frozen=True)
-class PoseSettings(Bounded, error=GroundTruthError):
-    """Settings of the poses."""
+class _MarkerSettings(Bounded, error=GroundTruthError):
+    """Settings of all estimations from markers."""
 
-    solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
-    # A marker in an image is an outlier, and listed, if its normalised error is larger than this
-    # and its residual larger than --outlier-px.
+    # A marker in an image is an outlier, and listed or counted, if its normalised error is larger
+    # than this and its residual larger than --outlier-px.
     outlier_sigma: Positive = 5.0
     outlier_px: NotNegative = 1.0  # Least root mean square residual of an outlier (px).
     # Standard deviation added to each corner's own covariance, for errors that a fit to the image
     # does not include: the lens calibration, the print (px).
     corner_floor_px: NotNegative = 0.01
+    # Images of different cameras whose times differ by at most this are used together (s).
+    time_tolerance_s: NotNegative = 0.005
+
+
+@dataclass(frozen=True)
+class PoseSettings(_MarkerSettings):
+    """Settings of the poses."""
+
+    solver: Solver = "sqpnp"  # The solver for the initial pose of least squares.
     # A second solution is ruled out only if the first is this many times more likely.
     ambiguity_odds: Annotated[float, _ODDS] = 1000.0
-    # Images whose times differ by at most this are used together (s).
-    time_tolerance_s: NotNegative = 0.005
     # Largest speed of the robot, if neighbouring frames decide between solutions (m/s).
     speed_m_s: Positive = 1.0
     turn_deg_s: Positive = 90.0  # The same for its turn rate (deg/s).
@@ -58,19 +64,11 @@ class PoseSettings(Bounded, error=GroundTruthError):
 
 
 @dataclass(frozen=True)
-class RigSettings(Bounded, error=GroundTruthError):
+class RigSettings(_MarkerSettings):
     """Settings of the rig's estimation."""
 
     # Least number of times, or images, that show a marker of the rig with another one and agree
     least_support: Annotated[int, whole(1)] = 3
-    # A marker in an image is left out, and counted, if its normalised error is larger than this
-    # and its residual larger than --outlier-px.
-    outlier_sigma: NotNegative = 5.0
-    outlier_px: NotNegative = 1.0  # Least root mean square residual of an outlier (px).
-    # Standard deviation added to each corner's own covariance (px).
-    corner_floor_px: NotNegative = 0.01
-    # Images of different cameras whose times differ by at most this are used together (s).
-    time_tolerance_s: NotNegative = 0.005
 
 
 @dataclass(frozen=True)

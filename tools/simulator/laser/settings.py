@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from redetect.bounds import ABOVE_0, NOT_NEGATIVE, Bounds, demand
+from redetect.bounds import Bounds, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 
 FIXED_SCANNERS = 4
+_NAMES = ("", *(f"fixed{i}" for i in range(FIXED_SCANNERS)))
+_NAME = Bounds("fixed0 to fixed3", _NAMES.__contains__)
+_RANGE = Bounds("above 0, at most 65", lambda x: 0.0 < x <= 65.0)
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,15 @@ class DrivingLimits:
 class Faults:
     """Deliberate faults; times count from when the robot first enters the room."""
 
-    wrong_scanner: str = ""
+    wrong_scanner: Annotated[str, _NAME] = ""
     """This fixed scanner's pose measured by hand is wrong, far beyond its sigma."""
-    moved_scanner: str = ""  # This fixed scanner was knocked after the empty area was scanned.
+    moved_scanner: Annotated[str, _NAME] = (
+        ""  # This fixed scanner was knocked after the empty area was scanned.
+    )
     by: tuple[float, float, float] = (0.4, -0.3, 0.15)
     """How far the scanner is wrong or was knocked: x, y (m), theta (rad)."""
-    clock_jump_s: float = 0.0  # The robot's clock is set by this ...
+    # The robot's clock is set by this; set back, it would give two readings the same stamp ...
+    clock_jump_s: NotNegative = 0.0
     clock_jump_at_s: float = 30.0  # ... at this time.
     lost_camera_at_s: float = 20.0  # The cameras give nothing from this time on ...
     lost_camera_s: float = 0.0  # ... for so long.
@@ -70,35 +77,39 @@ class Faults:
 class LaserSettings:
     """All settings of a session except its seed."""
 
-    visits: int = 3  # Visits to the covered room.
-    visit_s: float = 60.0  # About how long each of them lasts.
-    between_s: float = 120.0  # About how long the robot is away between them.
+    visits: Annotated[int, whole(1)] = 3  # Visits to the covered room.
+    visit_s: Positive = 60.0  # About how long each of them lasts.
+    between_s: NotNegative = 120.0  # About how long the robot is away between them.
     straight: bool = False  # The robot goes straight through the room, without turns.
-    references: int = 23  # Poses at which it stands and distances to fiducials are measured.
-    stand_s: float = 1.5  # How long it stands there.
-    passers: int = 2  # Passers-by in each visit.
+    references: Annotated[int, whole(0)] = (
+        23  # Poses at which it stands and distances to fiducials are measured.
+    )
+    stand_s: Positive = 1.5  # How long it stands there.
+    passers: Annotated[int, whole(0)] = 2  # Passers-by in each visit.
     furniture: bool = True  # Things that stand there without being in the map.
     front_cut_m: float = 0.12
     """The robot's front corners are cut by this; 0 makes it a rectangle, which looks the same
     turned round."""
-    rate_hz: float = 75.0  # Of the fixed scanners.
-    onboard_hz: float = 75.0  # Of the scanners on board.
-    max_range_m: float = 16.0  # Of all scanners.
-    empty_s: float = 4.0  # How long the empty room is scanned.
-    odometry_hz: float = 50.0  # Of the odometry.
+    rate_hz: Positive = 75.0  # Of the fixed scanners.
+    onboard_hz: Positive = 75.0  # Of the scanners on board.
+    max_range_m: Annotated[float, _RANGE] = 16.0  # Of all scanners.
+    empty_s: Positive = 4.0  # How long the empty room is scanned.
+    odometry_hz: Positive = 50.0  # Of the odometry.
     pause_log: bool = False  # The robot's log pauses between the visits.
-    camera_hz: float = 5.0  # Of the poses from markers.
+    camera_hz: Positive = 5.0  # Of the poses from markers.
     camera_misses: float = 0.1  # Share of times at which the cameras see nothing.
-    truth_hz: float = 100.0  # Of the exact poses.
-    ptpd_hz: float = 0.5  # Of ptpd's reports.
+    truth_hz: Positive = 100.0  # Of the exact poses.
+    ptpd_hz: Positive = 0.5  # Of ptpd's reports.
     clock_offset_s: float = 0.18  # Robot's clock minus ground truth's at the beginning.
     clock_drift: float = 4e-5  # The robot's clock goes faster by this share.
     hand_sigma_m: float = 0.05  # Of the fixed scanners' positions measured by hand.
     hand_sigma_deg: float = 2.0  # Of their directions.
     distance_sigma_m: float = 0.005  # Of the distances to the fiducials, and all others by tape.
-    drawing_sigma_m: float = 0.0  # Of the walls' ends in the drawing, as against the building.
-    mount_sigma_m: float = 0.0  # Of the places of the scanners on board, as measured by hand.
-    mount_sigma_deg: float = 0.0  # Of their directions.
+    drawing_sigma_m: NotNegative = (
+        0.0  # Of the walls' ends in the drawing, as against the building.
+    )
+    mount_sigma_m: NotNegative = 0.0  # Of the places of the scanners on board, as measured by hand.
+    mount_sigma_deg: NotNegative = 0.0  # Of their directions.
     reading: ReadingErrors = field(default_factory=ReadingErrors)
     wheels: WheelErrors = field(default_factory=WheelErrors)
     driving: DrivingLimits = field(default_factory=DrivingLimits)
@@ -106,17 +117,5 @@ class LaserSettings:
 
     def check(self) -> None:
         """Raise a GroundTruthError if a setting is out of its range."""
-        demand(
-            self, GroundTruthError, visits=ABOVE_0, visit_s=ABOVE_0, rate_hz=ABOVE_0,
-            onboard_hz=ABOVE_0, odometry_hz=ABOVE_0, camera_hz=ABOVE_0, truth_hz=ABOVE_0,
-            ptpd_hz=ABOVE_0, empty_s=ABOVE_0, stand_s=ABOVE_0, references=NOT_NEGATIVE,
-            passers=NOT_NEGATIVE, between_s=NOT_NEGATIVE, drawing_sigma_m=NOT_NEGATIVE,
-            mount_sigma_m=NOT_NEGATIVE, mount_sigma_deg=NOT_NEGATIVE,
-            max_range_m=Bounds("above 0, at most 65", lambda x: 0.0 < x <= 65.0),
-        )  # fmt: skip
-        # A clock that is set back gives two readings the same stamp.
-        demand(self.faults, GroundTruthError, clock_jump_s=NOT_NEGATIVE)
-        names = {f"fixed{i}" for i in range(FIXED_SCANNERS)} | {""}
-        for name in (self.faults.wrong_scanner, self.faults.moved_scanner):
-            if name not in names:
-                raise GroundTruthError(f"no scanner {name!r}: expected one of fixed0 to fixed3")
+        demand_fields(self, GroundTruthError)
+        demand_fields(self.faults, GroundTruthError)
