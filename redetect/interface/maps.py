@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar, Unpack, get_type_hints
 
@@ -12,7 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from redetect import __version__
 from redetect.bounds import demand_fields
+from redetect.json_text import json_text
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
 from redetect.least_squares import LossKind
@@ -24,13 +27,15 @@ from redetect.slam.mapping.run_map import MappedRun, map_run_by_flags
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map
 from redetect.slam.pictures import draw_map
-from redetect.slam.recording import joined, read_runs
+from redetect.slam.recording import ASSUMED, first_poses, joined, read_runs
 from redetect.slam.scoring import path_distance
 from redetect.slam.settings import Association, RowErrors, Solver
+from redetect.storage import OutputExistsError
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
 Command = TypeVar("Command", Map, Localize)
+_OF_THE_COMMAND = {"output", "force", "interactive", "reference"}
 
 
 class RowOptions(TypedDict, total=False):
@@ -98,15 +103,22 @@ class RunMap(Table):
     discs, lines : redetect.landmarks.map_file.Landmarks
         Identifiers, positions (m) and covariances (m^2).
     path : redetect.landmarks.map_file.Path2D
-        Poses with covariances: the start, and one after each step.
+        Poses with covariances: the start, and one after each step; of several runs one after the
+        other.
+    paths : tuple of redetect.landmarks.map_file.Path2D
+        The path of each run.
     result : redetect.slam.mapping.run_map.MappedRun
         Details: residuals, ignored rows, the camera's mounting.
+    head : tuple of str
+        Version, runs and settings, for the head of the files.
     """
 
     discs: Landmarks
     lines: Landmarks
     path: Path2D
+    paths: tuple[Path2D, ...]
     result: MappedRun
+    head: tuple[str, ...]
 
     @property
     def chi_squared_factor(self) -> float:
@@ -133,7 +145,8 @@ class RunMap(Table):
         return Poses(self.path)
 
     def write(self, folder: PathLike, *, overwrite: bool = False) -> None:
-        """Write map.csv with its joint covariance, and path.csv, as `slam map` does.
+        """Write map.csv with its joint covariance, and path.csv (of several runs path_1.csv,
+        path_2.csv, ...), as `slam map` does.
 
         Parameters
         ----------
@@ -142,12 +155,14 @@ class RunMap(Table):
         overwrite : bool
             Whether existing files may be replaced; else `redetect.storage.OutputExistsError`.
         """
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
-        map_file.write_map(
-            place / map_file.MAP_NAME, self.result.landmarks_to_write(), overwrite=overwrite
-        )
-        map_file.write_path(place / map_file.PATH_NAME, self.path, overwrite=overwrite)
+        landmarks = self.result.landmarks_to_write()
+        try:
+            map_file.write_map_and_paths(
+                Path(folder), landmarks, self.paths, self.head, overwrite=overwrite
+            )
+        except OutputExistsError as error:
+            error.args = (str(error).replace("--force", "overwrite=True"),)
+            raise
 
     def joint_covariance(self) -> Any:
         """(2 M, 2 M) covariance of all positions, discs first (m^2)."""
@@ -212,8 +227,18 @@ def map_landmarks(
     command = _checked(
         Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
     )
-    mapped = map_run_by_flags(command, joined(read_runs(command)))
-    return RunMap(mapped.landmarks.discs, mapped.landmarks.lines, mapped.path, mapped)
+    runs = read_runs(command)
+    mapped = map_run_by_flags(command, joined(runs))
+    landmarks, path = mapped.landmarks, mapped.path
+    paths = tuple(path.part(*ends) for ends in pairwise(first_poses(runs).tolist()))
+    settings = {
+        each.name: value
+        for each in fields(command)
+        if each.name not in _OF_THE_COMMAND
+        and not isinstance(value := getattr(command, each.name), Camera)
+    }
+    head = f"redetect.map {__version__}", json_text(settings, indent=None)
+    return RunMap(landmarks.discs, landmarks.lines, path, paths, mapped, head)
 
 
 @keywords_named()
@@ -250,10 +275,15 @@ def localize(
     in_file = path_of("the map" if in_memory else landmarks, "a RunMap, or its map.csv", SlamError)
     flags = _flags(options, LocalizeOptions)
     command = _checked(Localize(run=_run(run), map=in_file, circles=circles, lines=lines, **flags))
+    # Otherwise the map is assumed to be exact.
+    known = command.association == "known"
     if isinstance(landmarks, RunMap):
-        places = landmarks.result.landmarks_jointly()
+        mapped = landmarks.result
+        places = mapped.landmarks_to_write() if known else mapped.landmarks
     else:
-        places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
+        places = map_file.read_map(in_file)
+        if known:
+            places = map_file.with_joint_covariance(places, in_file)
     result = localize_by_flags(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
 
@@ -261,7 +291,7 @@ def localize(
 def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
     """Options as the command has them; a SlamError if there are none of that name."""
     flags, known = dict(options), get_type_hints(kind)
-    if without_effect := flags.keys() & {"output", "force", "interactive", "reference"}:
+    if without_effect := flags.keys() & _OF_THE_COMMAND:
         raise SlamError(f"{', '.join(sorted(without_effect))}: of the command only")
     if unknown := sorted(flags.keys() - known):
         raise SlamError(f"{', '.join(unknown)}: no such option: expected {', '.join(known)}")
@@ -269,11 +299,16 @@ def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
         flags[name] = tuple(np.ravel(flags[name]).tolist())
         if len(flags[name]) != 3:
             raise SlamError(f"{name} is {excerpt(options[name])}: expected three numbers")
-    if isinstance(flags.get("camera"), str | os.PathLike):
-        flags["camera"] = Path(flags["camera"])
+    if not isinstance(camera := flags.get("camera"), Camera | None):
+        expected = "a Camera, or the name of its .cam file"
+        flags["camera"] = path_of(camera, expected, SlamError)
+    noise = flags.get("odometry_noise", ASSUMED)
+    if not isinstance(noise, OdometryNoise):
+        raise SlamError(f"odometry_noise is {excerpt(noise)}: expected an OdometryNoise")
     if "more" in flags:
         more = flags["more"]
-        flags["more"] = tuple(map(_run, [more] if isinstance(more, str | os.PathLike) else more))
+        alone = isinstance(more, str | os.PathLike) or not isinstance(more, Iterable)
+        flags["more"] = tuple(map(_run, [more] if alone else more))
     return flags
 
 

@@ -166,7 +166,11 @@ def compare(
     run = path_of(run, "a run folder", DetectError)
     kind: Kind = "lines" if lines else "circles"
     seen_by = None if camera is None else camera_of(camera)
-    in_file = None if reference is None else Path(reference)
+    if not isinstance(options, CompareOptions | None):
+        raise DetectError(f"options is {excerpt(options)}: expected rd.CompareOptions")
+    in_file = None
+    if reference is not None:
+        in_file = path_of(reference, "the name of a file of rows", DetectError)
     if detected is None or isinstance(detected, str | os.PathLike):
         path = None if detected is None else Path(detected)
         return compare_run(run, kind, path, in_file, camera=seen_by, options=options)

@@ -17,7 +17,7 @@ import numpy as np
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import FINITE, LARGEST_NUMBER, number_in, whole_number_in
 from redetect.landmarks.records import LandmarkFileError
-from redetect.storage import write_bytes
+from redetect.storage import demand_free, write_bytes
 from redetect.storage.bounded import FilePath, read_bounded, read_plain_array
 
 N = TypeVar("N", int, float)
@@ -112,6 +112,31 @@ def write_map(
         content = io.BytesIO()
         np.save(content, np.ascontiguousarray(landmark_map.joint_covariance, dtype=np.float64))
         write_bytes(covariance_file(Path(path)), content.getvalue(), overwrite=overwrite)
+
+
+def path_names(runs: int) -> list[str]:
+    """Names of the files of paths of one or several runs."""
+    return [PATH_NAME] if runs == 1 else [f"path_{k + 1}.csv" for k in range(runs)]
+
+
+def write_map_and_paths(
+    folder: Path,
+    landmark_map: LandmarkMap,
+    paths: Sequence[Path2D],
+    comments: Sequence[str],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write a map, and the paths of its runs, to a folder, which is created if necessary."""
+    joint, names = covariance_file(folder / MAP_NAME), path_names(len(paths))
+    demand_free([joint, *(folder / name for name in (MAP_NAME, *names))], overwrite=overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_map(folder / MAP_NAME, landmark_map, comments, overwrite=overwrite)
+    if landmark_map.joint_covariance is None:
+        # The file of an earlier map must not stay beside this one.
+        joint.unlink(missing_ok=True)
+    for name, path in zip(names, paths):
+        write_path(folder / name, path, comments, overwrite=overwrite)
 
 
 def read_map(path: FilePath) -> LandmarkMap:

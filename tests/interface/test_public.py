@@ -242,6 +242,11 @@ ANY: Any = rd
         (lambda one: ANY.map([one]), "expected a run folder or a file of rows"),
         (lambda one: ANY.map("images/e", more=[one]), "expected a run folder or a file of rows"),
         (lambda one: ANY.localize("images/e", one), "expected a RunMap, or its map.csv"),
+        (lambda _: ANY.map("images/e", more=5), "5: expected a run folder or a file of rows"),
+        (lambda _: ANY.map("images/e", camera=5), "5: expected a Camera, or the name of its .cam"),
+        (lambda _: ANY.map("images/e", odometry_noise=0.1), "is 0.1: expected an OdometryNoise"),
+        (lambda one: ANY.compare("images/e", one, 5), "5: expected the name of a file of rows"),
+        (lambda one: ANY.compare("images/e", one, options=5), "5: expected rd.CompareOptions"),
     ],
 )  # fmt: skip
 def test_arguments_of_another_kind(
@@ -354,8 +359,11 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     assert "data:image/png" in landmarks._repr_html_()
     assert "<table>" in landmarks._repr_html_()
     landmarks.write(tmp_path)
-    with pytest.raises(OutputExistsError):
+    with pytest.raises(OutputExistsError, match="exists already: give overwrite=True"):
         landmarks.write(tmp_path)
+    head = (tmp_path / "map.csv").read_text().splitlines()[:2]
+    assert head[0] == f"# redetect.map {rd.__version__}"
+    assert '"lines": true' in head[1]
     in_memory = rd.localize(demo, landmarks, lines=True)
     from_file = rd.localize(demo, tmp_path / "map.csv", lines=True)
     np.testing.assert_allclose(in_memory.path.poses, from_file.path.poses, atol=1e-9)
@@ -381,8 +389,24 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
     for more in (str(demo), [demo]):
         both = rd.map(demo, more=more)
         assert list(both.discs.rows) == [2 * rows for rows in rd.map(demo).discs.rows]
+        assert [path.prefixes[0] for path in both.paths] == ["start", "start"]
+    both.write(tmp_path / "both")
+    assert {file.name for file in (tmp_path / "both").iterdir()} == {
+        "map.csv", "map_covariance.npy", "path_1.csv", "path_2.csv",
+    }  # fmt: skip
     assert len(repr(landmarks)) < 200
     assert len(repr(in_memory)) < 200
+
+
+def test_the_joint_covariance_of_too_many_landmarks_is_not_computed(
+    demo: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    landmarks = rd.map(demo)
+    assert rd.localize(demo, landmarks).landmarks.joint_covariance is not None
+    joint = rd.localize(demo, landmarks, association="joint")
+    assert joint.landmarks.joint_covariance is None
+    monkeypatch.setattr("redetect.slam.mapping.run_map.MOST_LANDMARKS_TOGETHER", 30)
+    assert rd.localize(demo, landmarks).landmarks.joint_covariance is None
 
 
 @pytest.mark.parametrize(("options", "flags"), [(MapOptions, Map), (LocalizeOptions, Localize)])

@@ -41,9 +41,8 @@ def perform(command: Map) -> int:
         demand_windows()
     output = command.output or files.default_output(command.run)
     joint_name = map_file.covariance_file(Path(map_file.MAP_NAME)).name
-    several = [f"path_{k + 1}.csv" for k in range(len(command.runs))]
-    paths = several if command.more else [map_file.PATH_NAME]
-    names = [map_file.MAP_NAME, *paths, TABLE_NAME, files.MAP_PICTURE]
+    names = [map_file.MAP_NAME, *map_file.path_names(len(command.runs)), TABLE_NAME]
+    names.append(files.MAP_PICTURE)
     names += [CAMERA_NAME] * command.calibrate
     demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
     runs = files.recordings_of(command)
@@ -52,17 +51,12 @@ def perform(command: Map) -> int:
     mapped = map_run_by_flags(command, recording)
     seconds = time.perf_counter() - begin
 
-    output.mkdir(parents=True, exist_ok=True)
+    check = check_odometry(mapped)
     name = ", ".join(run.resolve().name for run in command.runs)
     head = [f"slam map {__version__}: {name}"]
     final, path = mapped.landmarks_to_write(), mapped.path
-    map_file.write_map(output / map_file.MAP_NAME, final, head, overwrite=command.force)
-    if final.joint_covariance is None:
-        # The file of an earlier map must not stay beside this one.
-        (output / joint_name).unlink(missing_ok=True)
-    for (first, end), own in zip(pairwise(first_poses(runs)), paths):
-        map_file.write_path(output / own, path.part(first, end), head, overwrite=command.force)
-    check = check_odometry(mapped)
+    paths = [path.part(*ends) for ends in pairwise(first_poses(runs).tolist())]
+    map_file.write_map_and_paths(output, final, paths, head, overwrite=command.force)
     files.write_json(output / TABLE_NAME, _results(mapped, check, command), overwrite=command.force)
     for line in _report(mapped, check, seconds):
         print(line)
