@@ -67,6 +67,16 @@ def with_heading(matrices: FloatArray) -> FloatArray:
     return whole
 
 
+def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
+    """Covariances (N, 3, 3) of steps in axes rotated by angles (N,).
+
+    Rotated by their own dphi, they are in the axes at the end, as errors of SE(2) edges.
+    """
+    turn = with_heading(np.swapaxes(rotation(angle_rad), 1, 2))
+    turned = turn @ covariance @ np.swapaxes(turn, 1, 2)
+    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
+
+
 def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Jacobians of `move` by the pose (J1) and by the step (J2).
 

@@ -19,11 +19,10 @@ from redetect.slam.formats.g2o import (
     RunGraph,
     first_disc_vertex,
     graph_of_run,
-    in_turned_axes,
     read_g2o,
     write_g2o,
 )
-from redetect.slam.models import disc_in_robot
+from redetect.slam.models import disc_in_robot, in_turned_axes
 from redetect.slam.recording import read_recording, recording_of_frames
 
 DEMO = Path(__file__).parents[2] / "images" / "e" / "map.circles"

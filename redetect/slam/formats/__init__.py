@@ -1,1 +1,1 @@
-"""Files of other tools: g2o graphs, TUM trajectories, comma-separated tables."""
+"""Files of other tools: g2o graphs, TUM trajectories, data sets."""

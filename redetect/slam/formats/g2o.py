@@ -26,10 +26,9 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import FINITE, number_in, whole_number_in
 from redetect.landmarks import is_positive_definite
 from redetect.landmarks.axes import covariance_from_dataset, from_dataset, to_dataset
-from redetect.plane import rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import first_sight, graph_of_recording
-from redetect.slam.models import with_heading
+from redetect.slam.models import in_turned_axes
 from redetect.slam.recording import CircleRows, LineRows, Recording
 from redetect.storage import write_text
 from redetect.storage.bounded import read_text
@@ -69,16 +68,6 @@ def graph_of_run(recording: Recording) -> RunGraph:
 def first_disc_vertex(last_pose_vertex: int) -> int:
     """Offset of the discs' vertex numbers: the power of ten above all poses."""
     return int(10 ** len(str(last_pose_vertex)))
-
-
-def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
-    """Covariances (N, 3, 3) of steps in axes rotated by angles (N,).
-
-    Rotated by their own dphi, they are in the axes at the end, as errors of SE(2) edges.
-    """
-    turn = with_heading(np.swapaxes(rotation(angle_rad), 1, 2))
-    turned = turn @ covariance @ np.swapaxes(turn, 1, 2)
-    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
 
 
 def write_g2o(
