@@ -71,13 +71,9 @@ class LocalizeOptions(RowOptions, total=False):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Poses(Table):
-    """The poses of a path as a table.
+    """The poses of a path as a table."""
 
-    Attributes
-    ----------
-    path : Path2D
-    """
-
+    #: Poses with covariances: the start, and one after each step.
     path: Path2D
 
     def columns(self) -> dict[str, Any]:
@@ -96,29 +92,14 @@ class Poses(Table):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunMap(Table):
-    """Least-squares map of a run; its frame is the robot's at the start, X left, Y backward.
+    """Least-squares map of a run; its frame is the robot's at the start, X left, Y backward."""
 
-    Attributes
-    ----------
-    discs, lines : redetect.landmarks.map_file.Landmarks
-        Identifiers, positions (m) and covariances (m^2).
-    path : redetect.landmarks.map_file.Path2D
-        Poses with covariances: the start, and one after each step; of several runs one after the
-        other.
-    paths : tuple of redetect.landmarks.map_file.Path2D
-        The path of each run.
-    result : redetect.slam.mapping.run_map.MappedRun
-        Details: residuals, ignored rows, the camera's mounting.
-    head : tuple of str
-        Version, runs and settings, for the head of the files.
-    """
-
-    discs: Landmarks
+    discs: Landmarks  #: Identifiers, positions (m) and covariances (m^2).
     lines: Landmarks
-    path: Path2D
-    paths: tuple[Path2D, ...]
-    result: MappedRun
-    head: tuple[str, ...]
+    path: Path2D  #: Poses with covariances: the start, one after each step; then the next run's.
+    paths: tuple[Path2D, ...]  #: The path of each run.
+    result: MappedRun  #: Details: residuals, ignored rows, the camera's mounting.
+    head: tuple[str, ...]  #: Version, runs and settings, for the head of the files.
 
     @property
     def chi_squared_factor(self) -> float:
@@ -174,20 +155,10 @@ class RunMap(Table):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Localization(Poses):
-    """A run localised in a map.
+    """A run localised in a map."""
 
-    Attributes
-    ----------
-    path : redetect.landmarks.map_file.Path2D
-        Poses with covariances: the start, and one after each step.
-    result : redetect.slam.filters.base.FilterRun
-        Details, such as the use of the rows.
-    landmarks : redetect.landmarks.map_file.LandmarkMap
-        The map.
-    """
-
-    result: FilterRun
-    landmarks: LandmarkMap
+    result: FilterRun  #: Details, such as the use of the rows.
+    landmarks: LandmarkMap  #: The map.
 
     def distance(self, reference: Path2D) -> Mapping[str, float]:
         """Distance from another path of the same run in the same map, m and rad."""

@@ -18,21 +18,8 @@ def diagonal_blocks(
 ) -> tuple[list[FloatArray], FloatArray]:
     """Covariances of groups of unknowns, and of the shared ones, marginalised over all others.
 
-    Parameters
-    ----------
-    equations : NormalEquations
-    blocks : list of (width, (b,) int64)
-        Width and first indices of groups.
-
-    Returns
-    -------
-    covariances : list of (b, width, width) float64
-    shared : (s, s) float64
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the residuals do not determine the unknowns.
+    Takes width and first indices (b,) of groups; returns their covariances (b, width, width), and
+    (s, s). Raises `numpy.linalg.LinAlgError` if the residuals do not determine the unknowns.
     """
     found = inverse_blocks(equations.matrix, blocks)
     eliminated, shared = by_shared(equations)

@@ -35,22 +35,12 @@ class Loss(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Whitened residuals of one kind, with their derivatives.
+    """Whitened residuals of one kind, with their derivatives."""
 
-    Attributes
-    ----------
-    error : (n, d) float64
-        Each row is one residual for the loss.
-    by : sequence of ((n,) int64, (n, d, k) float64)
-        Index of the first of k unknowns (below 0: not an unknown), and derivatives by them.
-    shared : (n, d, s) float64 or None
-        Derivatives by the shared unknowns; None: all are 0.
-    loss : Loss
-    """
-
-    error: FloatArray
+    error: FloatArray  # (n, d): each row is one residual for the loss
+    # ((n,), (n, d, k)): index of the first of k unknowns (below 0: none), derivatives by them.
     by: Sequence[tuple[IntArray, FloatArray]]
-    shared: FloatArray | None = None
+    shared: FloatArray | None = None  # (n, d, s): by the shared unknowns; None: all are 0
     loss: Loss = Loss()
 
 
@@ -214,29 +204,10 @@ def minimise(
 ) -> Minimum[X]:
     """Minimise by Levenberg and Marquardt's method.
 
-    Parameters
-    ----------
-    problem : Problem
-    start : X
-    tolerance : float
-        Stop if a step lowers the cost by less than this share of it.
-    most_steps : int
-        Largest number of steps.
-    damping : float
-        Initial damping, as a share of the diagonal.
-    refined : callable, optional
-        Improves each trial before it is judged; takes and returns the trial and its cost.
-
-    Returns
-    -------
-    Minimum
-
-    Raises
-    ------
-    StartError
-        If the cost is not finite at the start.
-    numpy.linalg.LinAlgError
-        If the residuals do not determine the unknowns.
+    Ends if a step lowers the cost by less than the share `tolerance` of it. `damping` is the first
+    one, as a share of the diagonal; `refined` improves each trial before it is judged, and takes
+    and returns the trial and its cost. Raises `StartError` if the cost is not finite at the start,
+    `numpy.linalg.LinAlgError` if the residuals do not determine the unknowns.
     """
     at, lowest = start, problem.cost(start)
     if not np.isfinite(lowest):

@@ -98,25 +98,10 @@ def draw_map(
 ) -> bytes:
     """Draw a map: path, landmarks and their 3-sigma ellipses; returns a PNG's bytes.
 
-    Parameters
-    ----------
-    landmark_map : LandmarkMap
-        Discs and verticals. Verticals far outside are counted in the legend, not drawn.
-    path : Path2D
-        The robot's path.
-    before : (LandmarkMap, Path2D), optional
-        The same before loops were closed: drawn in a separate panel, to the same scale.
-    reference : Path2D, optional
-        The true path, or another to compare with; dashed.
-    title : str
-        Drawn above the picture.
-    interactive : bool
-        Show a window as well, and wait until it is closed.
-
-    Raises
-    ------
-    SlamError
-        If it is `interactive` and no window can be opened.
+    Verticals far outside are counted in the legend, not drawn. Map and path `before` loops were
+    closed are drawn in a separate panel, to the same scale; the `reference`, a path to compare
+    with, is dashed. `interactive` shows a window as well, and waits until it is closed;
+    `SlamError` if none can be opened.
     """
     panels = [("", landmark_map, path)]
     if before is not None:

@@ -259,24 +259,11 @@ def read_recording(
 ) -> Recording:
     """Read a run's rows.
 
-    Parameters
-    ----------
-    run : path
-        A run folder, or a single ``.circles`` or ``.lines`` file.
-    circles, lines : bool
-        Which landmarks to read from a folder. All rows of a single file are read.
-    stem : str, optional
-        Name of the files in the folder without suffix; see `landmark_files`.
-    noise : OdometryNoise
-        Noise of steps without a covariance.
-
-    Raises
-    ------
-    redetect.landmarks.LandmarkFileError
-        If a file is malformed.
-    SlamError
-        If there is no file, no step, two files are not of the same run, or a covariance is not
-        positive definite; the message names file, step and row.
+    Of a folder, `circles` and `lines` of the files named `stem` (`landmark_files`); all rows of a
+    single ``.circles`` or ``.lines`` file. `noise` is that of steps without a covariance. Raises
+    `redetect.landmarks.LandmarkFileError` if a file is malformed; `SlamError`, with file, step and
+    row, if there is no file or step, two files are not of the same run, or a covariance is not
+    positive definite.
     """
     files = landmark_files(Path(run), circles=circles, lines=lines, stem=stem)
     frames = list(landmarks.read_frames(files[0]))

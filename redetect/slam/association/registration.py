@@ -137,23 +137,12 @@ def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> 
 def register_maps(
     places: Sequence[FloatArray], stretches: Sequence[Sequence[loops.Stretch]]
 ) -> tuple[FloatArray, list[IntArray], list[int]]:
-    """Register maps in the first one, or in those already registered.
+    """Register K maps in the first one, or in those already registered.
 
-    Parameters
-    ----------
-    places : K arrays of (M, 2)
-        Landmarks of each map (m); NaN if unknown.
-    stretches : K lists of Stretch
-        Stretches of each map, without common frames; their labels are the landmarks' indices.
-
-    Returns
-    -------
-    motions : (K, 3) float64
-        Poses of the maps' frames in the first one's.
-    pairs : list of (k, 2) int64
-        Identical landmarks, numbered through all maps.
-    apart : list of int
-        Maps that cannot be registered in the others.
+    Takes the landmarks (M, 2) of each map (m; NaN if unknown), and its stretches, without common
+    frames, whose labels are the landmarks' indices. Returns poses (K, 3) of the maps' frames in the
+    first one's, pairs (k, 2) of identical landmarks, numbered through all maps, and the maps that
+    cannot be registered in the others.
     """
     offsets = np.cumsum([0, *map(len, places)])
     names = np.flatnonzero(np.isfinite(places[0][:, 0]))

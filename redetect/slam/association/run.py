@@ -89,15 +89,8 @@ def associate_run(
 ) -> RunAssociation:
     """Find which rows show the same landmark, ignoring IDs in the file.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run.
-    settings : AssociateSettings, optional
-    camera_xy : (2,)
-        The camera's centre in the robot frame (m); only bearings of lines need it.
-    progress : callable, optional
-        Called with a description of the current stage.
+    Only bearings of lines need the camera's centre in the robot frame, `camera_xy` (2,) (m).
+    `progress` is called with a description of the current stage.
     """
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)

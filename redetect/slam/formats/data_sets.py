@@ -194,31 +194,15 @@ def read_robot(
     *,
     calibrated: bool = True,
 ) -> tuple[Recording, Response | None, Noise | None]:
-    """A robot's log, with landmarks as discs.
+    """A robot's log, with landmarks as discs; `SlamError` if a file cannot be used.
 
-    Parameters
-    ----------
-    odometry : Path
-    sigma_m, sigma_rad : float, optional
-        Standard deviations of independent ranges and bearings. By default, those of calibrated ones
-        are learned, and so are covariances of steps (`redetect.slam.formats.ranges`); if only that
-        of bearings is given, ranges have the usual errors. Otherwise most steps have none.
-    calibrated : bool
-        Whether steps are as the robot follows its commands (`response_of`), not as commanded, and
-        ranges are computed from the depths that the log has.
+    Calibrated, steps are as the robot follows its commands (`response_of`), not as commanded, and
+    ranges are computed from the depths that the log has; otherwise there is no `Response`.
 
-    Returns
-    -------
-    Recording
-    Response or None
-        None without calibration.
-    Noise or None
-        None if it was not learned.
-
-    Raises
-    ------
-    SlamError
-        If a file cannot be used.
+    Takes standard deviations of independent ranges (m) and bearings (rad). By default, those of
+    calibrated ones are learned, and so are covariances of steps (`redetect.slam.formats.ranges`);
+    if only that of bearings is given, ranges have the usual errors. Otherwise most steps have no
+    covariance, and there is no `Noise`.
     """
     velocity = _log(odometry, "time v omega")
     seen = _seen_by_robot(odometry, calibrated=calibrated)
@@ -257,16 +241,9 @@ def response_of(
     landmarks seen in succession have a known distance. The most likely response predicts both
     best; where they show little, it is the usual one.
 
-    Parameters
-    ----------
-    velocity : (k, 3) float64
-        Time (s), speed (m/s) and turn rate (rad/s) of each command.
-    seen : Sightings
-        The landmarks, n times, with ranges that are too long by a factor.
-    sigma : (n, 2) float64
-        Standard deviations of ranges (m) and bearings (rad).
-    places : (n, 2) float64
-        True positions of the landmarks (m), NaN for unknown ones.
+    Takes time (s), speed (m/s) and turn rate (rad/s) of each command (k, 3), n sightings with
+    ranges that are too long by a factor, their standard deviations (n, 2) (m, rad), and the true
+    positions of the landmarks (n, 2) (m), NaN for unknown ones.
     """
     time, every = seen.times[seen.frame], np.arange(len(seen.ids))
     before, after = _in_succession(np.lexsort((seen.frame, seen.ids)), time)

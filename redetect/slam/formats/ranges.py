@@ -114,20 +114,10 @@ def estimate_noise(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[
 
     Steps become longer or shorter, and turn more or less in each metre, as fits the rows best.
 
-    Parameters
-    ----------
-    run : Recording
-        The run; its n rows of discs are those seen, and their covariances are not used. Zero
-        covariances of steps become the assumed ones.
-    seen : Sightings
-        The landmarks, n times.
-    sigma : (n, 2) float64
-        Stated standard deviations of ranges (m) and bearings (rad), apart from factors.
-
-    Returns
-    -------
-    Recording, Noise
-        With the usual noise if the run shows too little of its own, or no map of it is found.
+    Takes a run whose n rows of discs are those seen, and the stated standard deviations (n, 2) of
+    ranges (m) and bearings (rad), apart from factors. Covariances of its rows are not used, zero
+    ones of steps become the assumed ones. The noise is the usual one if the run shows too little of
+    its own, or no map of it is found.
     """
     assumed = ASSUMED.covariance(run.steps)
     stated = np.any(run.step_covariance, axis=(1, 2))[:, None, None]

@@ -200,25 +200,10 @@ def map_run(
     First odometry and discs are fitted, starting from first sight; then lines are triangulated from
     those poses and everything is fitted together; a robust loss and the mounting start from there.
 
-    Parameters
-    ----------
-    recording : Recording
-        The run. Rows without an identifier are ignored.
-    camera : Camera, optional
-        As calibrated: needed for lines (the origin of bearings), and if the mounting is unknown.
-    weighting : Weighting, optional
-        Loss and unknowns; plain least squares by default.
-    start : (3,)
-        The first pose (m, m, rad).
-    solver : "separable" or "gtsam"
-        The solver for the final optimisation.
-    name : str
-        Name of the run in messages.
-
-    Raises
-    ------
-    SlamError
-        If no row has an identifier, the run is disconnected, or there is no calibration or minimum.
+    Rows without an identifier are ignored. The camera, as calibrated, is needed for lines (the
+    origin of bearings), and if the mounting is unknown. `start` is the first pose (m, m, rad),
+    `solver` that of the final optimisation, `name` that of the run in messages. Raises `SlamError`
+    if no row has an identifier, the run is disconnected, or there is no calibration or minimum.
     """
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
