@@ -60,19 +60,17 @@ def read_camera(path: str | os.PathLike[str]) -> Camera:
     return parse_camera(text, name=os.fspath(path))
 
 
-def camera_file_in(
-    folder: Path, stem: str = "", advice: str = "name one by --camera"
-) -> Path | None:
+def camera_file_in(folder: Path, stem: str = "", how: str = "by --camera") -> Path | None:
     """The ``.cam`` file of a stem in a folder, or the only one there; None if there is none.
 
-    The stem is by default the folder's own name. Raises CameraError, with advice, if there are
-    several others.
+    The stem is by default the folder's own name. Raises CameraError if there are several others,
+    and says how to name one.
     """
     own = folder / f"{stem or folder.resolve().name}.cam"
     found = [own] if own.is_file() else sorted(folder.glob("*.cam"))
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:4])
-        raise CameraError(f"{folder}: several calibrations ({names}): {advice}")
+        raise CameraError(f"{folder}: several calibrations ({names}): name one {how}")
     return found[0] if found else None
 
 

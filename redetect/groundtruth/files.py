@@ -116,9 +116,7 @@ class JsonObject:
         """Objects by their names, at least one."""
         value = self.values.get(key)
         if not isinstance(value, dict) or not value:
-            raise GroundTruthError(
-                f"{self.place}: {key}: expected an object with at least one entry"
-            )
+            raise self.wrong(key, "an object with at least one entry")
         kind = f"{self.place}: {key.removesuffix('s')}"
         return {name: JsonObject(f"{kind} {one_line(name, 60)}", v) for name, v in value.items()}
 

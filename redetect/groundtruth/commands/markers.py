@@ -116,7 +116,7 @@ def _input(command: Rig) -> tuple[session.Network, list[tuple[session.MarkerFram
         return network, session.group_by_time(frames, command.settings.time_tolerance_s)
     count, files = len(command.runs), []
     for run in command.runs:
-        if (found := camera_file_in(run, advice=f"name one {run.resolve().name}.cam")) is None:
+        if (found := camera_file_in(run, how=f"{run.resolve().name}.cam")) is None:
             raise GroundTruthError(f"{run}: no calibration: expected a .cam file in it")
         files.append(found)
     network = session.Network(

@@ -38,17 +38,11 @@ def warn(text: str) -> None:
 
 
 def provenance(settings: Any, files: Sequence[Path] = ()) -> dict[str, Any]:
-    """Metadata of a result: version, settings, and the files on which it depends, by name, or by
-    path where names are equal.
-    """
+    """Version, settings, and the files on which a result depends, by name or, if equal, by path."""
     names = [path.name for path in files]
-    of_files = {
-        path.name if names.count(path.name) == 1 else path.as_posix(): {
-            "sha256": hashlib.sha256(path.read_bytes()).hexdigest()
-        }
-        for path in files
-    }
-    return {"version": __version__, "settings": settings, "files": of_files}
+    keys = [name if names.count(name) == 1 else str(path) for name, path in zip(names, files)]
+    hashes = [{"sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in files]
+    return {"version": __version__, "settings": settings, "files": dict(zip(keys, hashes))}
 
 
 def progress(items: Sequence[T], label: str) -> Iterable[T]:

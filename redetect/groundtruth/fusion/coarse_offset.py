@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,22 +41,16 @@ _UNRELATED, _MUCH_MOVEMENT = 0.5, 10.0
 _AT_ONCE = 1_000_000
 
 
-class Split(NamedTuple):
-    """The best split of a series into two parts, each of which may have its own alternative."""
+def best_split(
+    costs: Iterable[FloatArray], times_s: FloatArray, least_s: float
+) -> tuple[int, float, IntArray, float]:
+    """Split a series with times (N,) into two parts of a least duration, each with its own of K
+    alternatives, whose costs (K, N) come in blocks.
 
-    at: int  # Index of the last one in the first part
-    cost: float  # Of both parts; infinite if none is long enough
-    before: int  # The best alternatives of the parts
-    after: int
-    unsplit: float  # Cost of the best alternative without a split
-
-
-def best_split(costs: Iterable[FloatArray], times_s: FloatArray, least_s: float) -> Split:
-    """Split a series with times (N,) into two parts of a least duration.
-
-    `costs`: blocks (K, N) of the series' costs by alternatives.
+    Returns the last index of the first part, the cost, the alternatives of both (2,), and the cost
+    of the best one without a split.
     """
-    columns, first, unsplit = np.arange(len(times_s)), 0, np.inf
+    columns, first, whole = np.arange(len(times_s)), 0, np.inf
     least, best = np.full((2, len(times_s)), np.inf), np.zeros((2, len(times_s)), dtype=np.int64)
     for block in costs:
         before = np.cumsum(block, axis=1)
@@ -65,12 +58,11 @@ def best_split(costs: Iterable[FloatArray], times_s: FloatArray, least_s: float)
             own = np.argmin(total, axis=0)
             best[side] = np.where(total[own, columns] < least[side], first + own, best[side])
             least[side] = np.minimum(total[own, columns], least[side])
-        unsplit = min(unsplit, float(before[:, -1].min()))
-        first += len(block)
+        first, whole = first + len(block), min(whole, float(before[:, -1].min()))
     parted = least.sum(axis=0)
     parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < least_s] = np.inf
     at = int(np.argmin(parted))
-    return Split(at, float(parted[at]), int(best[0, at]), int(best[1, at]), unsplit)
+    return at, float(parted[at]), best[:, at], whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +142,9 @@ class OffsetSearch:
         blocks = compared.single_errors(compared.overlapping(self._steps))
         costs = (np.minimum(block, compared.unrelated) for block in blocks)
         times_s = np.asarray(_STEP_S * (compared.at + compared.own.first))
-        found = best_split(costs, times_s, _LEAST_PART_S)
-        jump_s = _STEP_S * abs(found.before - found.after)
-        is_set = found.cost < _MUCH_BETTER * found.unsplit and jump_s > _LEAST_JUMP_S
-        return float(times_s[found.at]) if is_set else None
+        at, cost, offsets, whole = best_split(costs, times_s, _LEAST_PART_S)
+        is_set = cost < _MUCH_BETTER * whole and _STEP_S * np.ptp(offsets) > _LEAST_JUMP_S
+        return float(times_s[at]) if is_set else None
 
     def nearest_s(self, part: PlanarPoses, around_s: float) -> float:
         """The best offset near the expected one."""

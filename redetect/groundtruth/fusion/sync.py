@@ -22,15 +22,11 @@ from scipy.optimize import Bounds, minimize, minimize_scalar
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.fusion import stream_errors
 from redetect.groundtruth.fusion.clock import ClockSegment, ClockStatus, knots_of, on_one_line
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, best_split
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
-from redetect.groundtruth.fusion.stream_errors import (
-    white_noise_sigmas,
-    with_common,
-    with_jitter_covered,
-)
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -104,7 +100,7 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
-    groundtruth, _ = with_jitter_covered(groundtruth)
+    groundtruth, _ = stream_errors.with_jitter_covered(groundtruth)
     slices = segments_between_gaps(groundtruth.times_s, settings.segment_gap_s)
     parts = [groundtruth.only(part) for part in slices]
     search = OffsetSearch(_smoothed(odometry), parts, settings.largest_offset_s)
@@ -211,7 +207,9 @@ def _fit_of_segment(
     None if turns do not determine the offset.
     """
     start = np.array([start_s, 0.0])
-    headings_alone = with_common(measured, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0]))
+    headings_alone = stream_errors.with_common(
+        measured, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0])
+    )
     by_headings = _most_likely_clock(odometry, headings_alone, start, bounds)
     least = _LEAST_DETERMINED * bounds.largest_offset_s
     if by_headings is None or not by_headings.sigmas[0] < least:
@@ -363,10 +361,10 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
     """
     covariances = measured.covariances
     if covariances is None:
-        covariances = np.diag([0.0, 0.0, white_noise_sigmas(measured)[2] ** 2])
+        covariances = np.diag([0.0, 0.0, stream_errors.white_noise_sigmas(measured)[2] ** 2])
     # Between two samples odometry's path is unknown by the sag of what it bends.
     sag = np.sqrt(np.mean(np.square(np.diff(odometry.continuous, 2, axis=0)), axis=0)) / 8.0
-    variances = white_noise_sigmas(odometry) ** 2 + sag**2 + rounding**2
+    variances = stream_errors.white_noise_sigmas(odometry) ** 2 + sag**2 + rounding**2
     own = np.tile(np.diag(variances), (len(measured), 1, 1))
     return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 
@@ -396,9 +394,9 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
     times_s = fit.problem_at(fit.clock).measured_s
-    found = best_split([squared], times_s, _LEAST_PART_S)
-    gain = float(np.sum(fit.squared(fit.clock))) - found.cost
-    return float(times_s[found.at]) if gain >= _JUMP_GAIN else None
+    at, cost, *_ = best_split([squared], times_s, _LEAST_PART_S)
+    gain = float(np.sum(fit.squared(fit.clock))) - cost
+    return float(times_s[at]) if gain >= _JUMP_GAIN else None
 
 
 def _differ(parts: list[ClockSegment]) -> bool:

@@ -149,20 +149,17 @@ def _in_known_frame(
     rig: Rig, rig_from_marker: FloatArray, known: Rig, cameras: int
 ) -> tuple[FloatArray, tuple[adjustment.PosePrior, ...]]:
     """Markers (M, 4, 4) moved to where some are known, and priors of these behind the cameras."""
-    if known.dictionary != rig.dictionary:
-        raise GroundTruthError(
-            f"the known markers are of {known.dictionary}, those found of {rig.dictionary}"
-        )
     common = [marker for marker in rig.ids if marker in known.ids]
     if not common:
         raise GroundTruthError(f"the rig has markers {list(rig.ids)}, none of {list(known.ids)}")
     priors, starts = [], []
     for marker in common:
         i, j = rig.ids.index(marker), known.ids.index(marker)
-        if not np.isclose(known.widths_m[j], rig.widths_m[i], atol=0.0):
+        is_like = np.isclose(known.widths_m[j], rig.widths_m[i], atol=0.0)
+        if not is_like or known.dictionary != rig.dictionary:
             raise GroundTruthError(
-                f"known marker {marker} is {known.widths_m[j]:g} m wide: expected "
-                f"{rig.widths_m[i]:g} m, as those found"
+                f"the known marker {marker} of {known.dictionary} is {known.widths_m[j]:g} m wide: "
+                f"expected {rig.dictionary} and {rig.widths_m[i]:g} m, as those found"
             )
         priors.append(_prior(cameras + i, known.robot_from_marker[j], known.covariance, j))
         starts.append(known.robot_from_marker[j] @ se3.inverse(rig_from_marker[i]))

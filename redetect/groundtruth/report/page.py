@@ -86,8 +86,6 @@ def _state(inputs: Inputs) -> list[Part]:
 
 def _extent(poses: PlanarPoses) -> tuple[str, str, str, str]:
     with_them = "yes" if poses.covariances is not None else "no"
-    if not len(poses):
-        return "0", "-", "-", with_them
     first, last = f"{poses.times_s[0]:.3f}", f"{poses.times_s[-1]:.3f}"
     return str(len(poses)), first, last, with_them
 

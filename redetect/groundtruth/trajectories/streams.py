@@ -37,7 +37,7 @@ _COVARIANCE_COLUMNS = 13
 class PlanarPoses:
     """Poses of a robot on the floor over time.
 
-    Raises `GroundTruthError` if shapes disagree, a number is not finite or times decrease.
+    Raises `GroundTruthError` if a number is not finite or times decrease.
     """
 
     times_s: FloatArray  # (N,): seconds, not decreasing
@@ -46,14 +46,6 @@ class PlanarPoses:
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
-        if self.times_s.shape != (count,) or self.poses.shape != (count, 3):
-            raise GroundTruthError(
-                f"poses of shapes {self.times_s.shape} and {self.poses.shape}: "
-                "expected (N,) times and (N, 3) poses"
-            )
-        shape = (count, 3, 3) if self.covariances is None else self.covariances.shape
-        if shape != (count, 3, 3):
-            raise GroundTruthError(f"covariances of shape {shape}: expected ({count}, 3, 3)")
         columns = {"times": self.times_s, "poses": self.poses, "covariances": self.covariances}
         for name, values in columns.items():
             if values is not None and not np.all(np.isfinite(values)):

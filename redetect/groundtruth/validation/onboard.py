@@ -258,7 +258,6 @@ def refine_mounts(
     roots = whitening(np.stack([r.distances.covariance for r in used]))
     mounts = stills[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
-    known = np.ones(3 * (count + len(used)), dtype=np.bool_)
     along = segments[:, 2:] - segments[:, :2]
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     normals /= np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-12)[:, None]
@@ -287,19 +286,19 @@ def refine_mounts(
         of_walls = normal_equations(walls)
         variance = max(float(np.mean(walls.residual**2)), _LEAST_SIGMA_M**2)
         information = (of_walls.matrix / variance + of_priors.matrix).toarray()
-        seen = np.all(np.diagonal(information)[: 3 * count].reshape(-1, 3) > 0.0, axis=1)
-        known[: 3 * count] = np.repeat(seen, 3)
-        own, covariance = np.ix_(known, known), np.zeros_like(information)
+        seen = np.diagonal(information)[: 3 * count].reshape(-1, 3).min(axis=1) > 0.0
+        # The mounts of others stay as they are.
+        information[np.arange(3 * count), np.arange(3 * count)] += np.repeat(~seen, 3)
         try:
-            covariance[own] = np.linalg.inv(information[own])
+            covariance = np.linalg.inv(information)
         except np.linalg.LinAlgError:
             return None
         step = -covariance @ (of_walls.gradient / variance + of_priors.gradient)
         mounts = mounts + step.reshape(-1, 3)[:count]
         poses = poses + step.reshape(-1, 3)[count:]
     scanners = tuple(s for s, there in zip(stills[0].scanners, seen) if there)
-    of_mounts = np.flatnonzero(known[: 3 * count])
-    return RefinedMounts(scanners, mounts[seen], covariance[np.ix_(of_mounts, of_mounts)])
+    own = np.flatnonzero(np.repeat(seen, 3))
+    return RefinedMounts(scanners, mounts[seen], covariance[np.ix_(own, own)])
 
 
 def _moment(arms: FloatArray, normals: FloatArray) -> FloatArray:

@@ -196,8 +196,6 @@ def score_steps(
     GroundTruthError
         If no step remains.
     """
-    if step < 1:
-        raise GroundTruthError(f"step is {step}: expected 1 or more")
     known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
     mine, right = (between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
     return relative_score(right, mine, int((~known).sum()))

@@ -117,7 +117,7 @@ GOOD: dict[str, Any] = {
     ("place", "value", "problem"),
     [
         (["dictionary"], 5, "dictionary is 5: expected its name"),
-        (["markers"], {}, "markers: expected an object with at least one entry"),
+        (["markers"], {}, "markers is {}: expected an object with at least one entry"),
         (["markers"], {"x": {}}, "expected whole numbers as keys"),
         (["markers"], {"-1": {}}, "IDs of 0 or more"),
         (["markers", "31"], 3, "31: expected an object"),

@@ -242,7 +242,7 @@ def test_a_boards_file_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "problem"),
     [
-        (["boards"], {}, "boards: expected an object"),
+        (["boards"], {}, "boards is {}: expected an object"),
         (["boards", "third"], {"columns": 7, "rows": 6, "square_m": 1}, "expected world, and"),
         (["boards", "first"], {"columns": 7.5, "rows": 6, "square_m": 1}, "columns is 7.5"),
         (["boards", "first", "rows"], 7, "board first: board of 7 x 7"),

@@ -301,9 +301,9 @@ def test_the_frame_follows_from_known_markers() -> None:
     other = Rig("rawseeds", (77,), rig.widths_m[:1], rig.robot_from_marker[:1], np.zeros((6, 6)))
     with pytest.raises(GroundTruthError, match="none of \\[77\\]"):
         estimated(groups, rig, known=other)
-    with pytest.raises(GroundTruthError, match="are of aruco, those found of rawseeds"):
+    with pytest.raises(GroundTruthError, match=r"marker 33 of aruco is .* expected rawseeds"):
         estimated(groups, rig, known=replace(exact, dictionary="aruco"))
-    with pytest.raises(GroundTruthError, match=r"marker 33 is 0\.5 m wide: expected"):
+    with pytest.raises(GroundTruthError, match=r"marker 33 of rawseeds is 0\.5 m wide: expected"):
         estimated(groups, rig, known=replace(exact, widths_m=np.array([0.5])))
 
 
