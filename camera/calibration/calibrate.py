@@ -10,12 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.boards.board import Board
-from camera.calibration.adjustment import (
-    Adjusted,
-    Points,
-    residuals_of,
-    with_unfitted_terms,
-)
+from camera.calibration.adjustment import Adjusted, Points, residuals_of, with_unfitted_terms
 from camera.calibration.choice import choose_lens
 from camera.calibration.consensus import (
     ALL_THE_SAME,

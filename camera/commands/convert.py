@@ -45,8 +45,8 @@ def perform(options: Convert) -> int:
         print("the pose is dropped: the format has none (--pose-from restores it)")
     if getattr(source, "covariance", None) and not getattr(camera, "covariance", None):
         print("the covariance is dropped: it is kept in .cam files of the same rows and pose")
-    content = files.FORMATS[to_format].write(camera).encode()
-    write_bytes(options.target, content, overwrite=options.force)
+    _, text_of, _ = files.FORMATS[to_format]
+    write_bytes(options.target, text_of(camera).encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

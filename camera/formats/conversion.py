@@ -147,9 +147,8 @@ def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> Flo
 
 def target_size(source: AnyCamera, rows: Rows) -> tuple[int, int]:
     """Width and height of the target's image."""
-    if rows == "halve":
-        return source.width, (source.height + 1) // 2
-    return source.width, source.height * (2 if rows == "double" else 1)
+    height = source.height
+    return source.width, {"same": height, "halve": (height + 1) // 2, "double": 2 * height}[rows]
 
 
 def convert_to_foreign(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
@@ -15,27 +15,20 @@ from camera.formats.models import ForeignCamera, Model
 from camera.options import Convert, Format
 from redetect.storage import bounded
 
-
-class FileFormat(NamedTuple):
-    """How cameras are read from a format's text and written to it."""
-
-    parse: Callable[..., AnyCamera]  # By text, name and, of a file with several, the camera's name
-    write: Callable[[Any], str]
-    # Its models, the simplest first, with their numbers of coefficients: some lack k3.
-    models: dict[Model, int]
-    has_several: bool = False  # Whether a file may have several cameras
-
-
-_WITH_K3: dict[Model, int] = {"radtan": 5, "rational": 8, "fisheye": 4}
-FORMATS: dict[Format, FileFormat] = {
-    "cam": FileFormat(parse_camera, format_camera, {}),
-    "opencv": FileFormat(yaml_files.parse_opencv, yaml_files.format_opencv, _WITH_K3),
-    "ros": FileFormat(yaml_files.parse_ros, yaml_files.format_ros, _WITH_K3),
-    "kalibr": FileFormat(
-        yaml_files.parse_kalibr, yaml_files.format_kalibr, {"radtan": 4, "fisheye": 4}, True
-    ),
-    "colmap": FileFormat(parse_colmap, format_colmap, {**_WITH_K3, "radtan": 4}, True),
+_Models = dict[Model, int]
+_WITH_K3: _Models = {"radtan": 5, "rational": 8, "fisheye": 4}
+_WITHOUT_K3: _Models = {"radtan": 4, "fisheye": 4}
+#: What parses and what writes the text of each format, and its models, the simplest first, with
+#: their numbers of coefficients: some lack k3.
+FORMATS: dict[Format, tuple[Callable[..., AnyCamera], Callable[[Any], str], _Models]] = {
+    "cam": (parse_camera, format_camera, {}),
+    "opencv": (yaml_files.parse_opencv, yaml_files.format_opencv, _WITH_K3),
+    "ros": (yaml_files.parse_ros, yaml_files.format_ros, _WITH_K3),
+    "kalibr": (yaml_files.parse_kalibr, yaml_files.format_kalibr, _WITHOUT_K3),
+    "colmap": (parse_colmap, format_colmap, {**_WITH_K3, "radtan": 4}),
 }
+# Formats whose files may have several cameras.
+_OF_SEVERAL = ("kalibr", "colmap")
 # Formats by parts of a YAML file's name.
 _YAML_NAMES: dict[str, Format] = {
     "opencv": "opencv",
@@ -92,10 +85,10 @@ def format_of_text(path: Path, text: str) -> Format:
 
 def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
     """A camera of the text of a file."""
-    known = FORMATS[from_format]
-    if camera_name and not known.has_several:
+    if camera_name and from_format not in _OF_SEVERAL:
         raise ConversionError(f"{name}: has one camera: expected no --camera-name")
-    return known.parse(text, name, *([camera_name] if known.has_several else []))
+    parser, _, _ = FORMATS[from_format]
+    return parser(text, name, *([camera_name] if camera_name else []))
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
@@ -110,7 +103,7 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
         return conversion.convert_to_camera(source, options.rows, pose)
     if options.pose_from is not None:
         raise ConversionError(f"{to_format} has no pose: expected no --pose-from")
-    models = FORMATS[to_format].models
+    _, _, models = FORMATS[to_format]
     if options.model != "auto":
         if options.model not in models:
             raise ConversionError(

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,18 +59,13 @@ _LINK_M = 0.3
 _LEAST_AGREEMENT = 0.75
 
 
-class Background(NamedTuple):
-    """A scanner's static background, beam by beam."""
+def learn_background(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> tuple[FloatArray, float]:
+    """The background of a scanner's beams, from scans (N, readings) of the empty area.
 
-    near_m: FloatArray  # (readings,): a reading below this is new; infinite without any
-    quantum_m: float  # All readings are whole multiples of this; 0 if there are none.
-
-
-def learn_background(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> Background:
-    """Learn the background of a scanner's beams from scans (N, readings) of the empty area.
-
-    The nearest object of a beam is at a low quantile of its readings: beams along an edge jump, and
-    nearer ones are of passing objects.
+    Returns the range below which a reading of each beam is new (readings,), infinite without any,
+    and of what all readings are whole multiples, 0 without any (m). The nearest object of a beam is
+    at a low quantile of its readings: beams along an edge jump, and nearer ones are of passing
+    objects.
     """
     metres = scanner.metres(ranges_mm)
     hit = np.isfinite(metres)
@@ -92,7 +86,7 @@ def learn_background(scanner: Scanner, ranges_mm: NDArray[np.uint16]) -> Backgro
     near = np.where(seen, quantile(ordered, _PASSING), 0.0)
     near -= _MARGIN_SIGMA * np.where(seen, sigma, 0.0)
     quantum_m = 1e-3 * float(np.gcd.reduce(ranges_mm[hit]))
-    return Background(np.where(seen, np.maximum(near, 0.0), np.inf), quantum_m)
+    return np.where(seen, np.maximum(near, 0.0), np.inf), quantum_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +118,8 @@ def fixed_scanners(
     width = max(scanner.readings for scanner in scanners)
     near = np.zeros((len(scanners), width))
     direction, beam_times = np.zeros((len(scanners), width, 2)), np.zeros((len(scanners), width))
-    for i, (scanner, background) in enumerate(zip(scanners, backgrounds)):
-        near[i, : scanner.readings] = 1e3 * np.minimum(background.near_m, scanner.max_range_m)
+    for i, (scanner, (near_m, _)) in enumerate(zip(scanners, backgrounds)):
+        near[i, : scanner.readings] = 1e3 * np.minimum(near_m, scanner.max_range_m)
         beam_times[i, : scanner.readings] = scanner.beam_times_s
         angle = scanner.pose[2] + scanner.angles_rad
         direction[i, : scanner.readings] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -134,7 +128,7 @@ def fixed_scanners(
         direction,
         np.stack([scanner.pose[:2] for scanner in scanners]),
         # Rounding adds an error that is uniform over a quantum.
-        np.sqrt([s.sigma_m**2 + b.quantum_m**2 / 12.0 for s, b in zip(scanners, backgrounds)]),
+        np.sqrt([s.sigma_m**2 + m**2 / 12.0 for s, (_, m) in zip(scanners, backgrounds)]),
         covariance,
         beam_times,
     )

@@ -18,12 +18,7 @@ from scipy.stats import trim_mean
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
-from redetect.groundtruth.lasers.acquisition import (
-    LEAST_READINGS,
-    MOST_STEPS,
-    ScanSets,
-    acquire,
-)
+from redetect.groundtruth.lasers.acquisition import LEAST_READINGS, MOST_STEPS, ScanSets, acquire
 from redetect.groundtruth.lasers.icp import fit_outline, nearest_on_segments
 from redetect.groundtruth.lasers.outline import robot_body
 from redetect.groundtruth.lasers.scanners import Robot, Scanner

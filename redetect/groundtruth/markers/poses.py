@@ -164,14 +164,10 @@ def _pycolmap(problem: refinement.PoseProblem) -> list[FloatArray]:
     if not np.all(np.isfinite(pixels)):
         raise GeometryError("a corner lies where the lens sees nothing")
     # Cameras without distortion whose pixels are about those of the images.
+    kind = "SIMPLE_PINHOLE"
     pinholes = [
-        pycolmap.Camera(
-            model="SIMPLE_PINHOLE",
-            width=lens.width,
-            height=lens.height,
-            params=[lens.scale_x, 0.0, 0.0],
-        )
-        for lens in lenses
+        pycolmap.Camera(model=kind, width=c.width, height=c.height, params=[c.scale_x, 0.0, 0.0])
+        for c in lenses
     ]
     found = pycolmap.estimate_and_refine_generalized_absolute_pose(
         pixels,

@@ -180,17 +180,8 @@ def matched_streams(
 ) -> tuple[PlanarPoses, PlanarPoses, int]:
     """Both streams at common times, and the number of times without a match.
 
-    Parameters
-    ----------
-    largest_gap_s : float
-        Longer gaps are not interpolated.
-    interpolate : "truth" or "poses"
-        `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS' definition).
-
-    Raises
-    ------
-    GroundTruthError
-        If there are no common times.
+    `interpolate`: `truth` at the poses' times, or `poses` at the truth's times (RAWSEEDS'
+    definition), but not across longer gaps. Raises `GroundTruthError` if no times are common.
     """
     if len(poses) == 0 or len(truth) == 0:
         raise GroundTruthError(

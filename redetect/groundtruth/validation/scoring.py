@@ -180,21 +180,10 @@ def score_relations(
 def score_steps(
     poses: PlanarPoses, truth: PlanarPoses, step: int, longest_s: float = np.inf
 ) -> RelativeScore:
-    """Relative errors over steps of a truth, starting at every pose.
+    """Relative errors from every pose to the one `step` poses later; both have the same times.
 
-    Parameters
-    ----------
-    poses, truth : PlanarPoses
-        With the same times.
-    step : int
-        From each pose to the one `step` poses later.
-    longest_s : float
-        Longer steps, such as across a gap, are not used (s).
-
-    Raises
-    ------
-    GroundTruthError
-        If no step remains.
+    Steps that take more than `longest_s`, as across a gap, are not used. Raises `GroundTruthError`
+    if none remains.
     """
     known = truth.times_s[step:] - truth.times_s[:-step] <= longest_s
     mine, right = (between(p.poses[:-step], p.poses[step:])[known] for p in (poses, truth))
@@ -274,21 +263,11 @@ def stream_of(references: Sequence[ReferencePose]) -> PlanarPoses:
 def reference_errors(
     references: Sequence[ReferencePose], poses: PlanarPoses
 ) -> tuple[ReferenceErrors, list[Refused]]:
-    """Errors of a ground truth at reference poses.
+    """Errors of a ground truth at reference poses, in order of time, and those without any.
 
-    Parameters
-    ----------
-    references : sequence of ReferencePose
-        In order of time.
-    poses : PlanarPoses
-        The ground truth. As the robot is at rest, the pose nearest in time is used, if it is at
-        most half a second away: the covariance of an interpolated pose would depend on the unknown
-        correlation of its neighbours' errors.
-
-    Returns
-    -------
-    without : list of Refused
-        References without ground truth at their time.
+    As the robot is at rest, the pose nearest in time is used, if it is at most half a second away:
+    the covariance of an interpolated pose would depend on the unknown correlation of its
+    neighbours' errors.
     """
     times = np.array([r.time_s for r in references])
     nearest = np.argmin(np.abs(times[:, None] - poses.times_s), axis=1)
