@@ -10,9 +10,12 @@ the best are traced and classified, and fits through the camera model give the p
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from camera import Camera
@@ -125,8 +128,9 @@ def _by_rims(
 ) -> CircleDetections:
     """The default detector: finds discs by their rims and locates them by fits."""
     image, camera, table, left = within_margins(image, camera, table, settings)
-    scene = scene_of(image, camera, table, settings)
-    discs, log_odds = judged_discs(scene, table, settings)
+    levels = levels_of(image, camera, table, settings)
+    discs, log_odds = judged_discs(levels, settings)
+    scene = levels[0].scene
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
@@ -167,6 +171,55 @@ def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[C
     return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
+class Level(NamedTuple):
+    """An image, or one of reduced size, with the table of the discs that are searched there."""
+
+    scene: Scene
+    table: VoteTable
+
+
+def levels_of(
+    image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
+) -> list[Level]:
+    """The image, then smaller ones in which discs that are large in it are searched.
+
+    In these, the texture of the floor is averaged, and all discs have sizes of which the networks
+    know examples. Parameters as for `detect_circles`.
+    """
+    levels = [Level(scene_of(image, camera, table, settings), table)]
+    for factor, smaller, of_smaller in _reduced(camera, vote_shape(settings)):
+        size = smaller.width, smaller.height
+        cut = image[: factor * smaller.height, : factor * smaller.width]
+        reduced = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+        levels.append(Level(scene_of(reduced, smaller, of_smaller, settings), of_smaller))
+    return levels
+
+
+@lru_cache(maxsize=16)
+def _reduced(camera: Camera, shape: VoteShape) -> tuple[tuple[int, Camera, VoteTable], ...]:
+    """Factors by which images are reduced, until no disc is too large; cameras, and tables."""
+    levels: list[tuple[int, Camera, VoteTable]] = []
+    for factor in (2**k for k in range(1, 8)):
+        smaller = replace(
+            camera, width=camera.width // factor, height=camera.height // factor,
+            scale_x=camera.scale_x / factor, scale_y=camera.scale_y / factor,
+            offset_x=(camera.offset_x + 0.5) / factor - 0.5,
+            offset_y=(camera.offset_y + 0.5) / factor - 0.5,
+        )  # fmt: skip
+        larger = replace(
+            shape,
+            border_px=shape.border_px // factor,
+            far_limit_m_per_px=factor * shape.far_limit_m_per_px,
+            smallest_px=0.5 * shape.largest_px,
+            largest_px=math.inf,
+        )
+        if not len(build_vote_table(smaller, larger).image_row):
+            break
+        table = build_vote_table(smaller, replace(larger, largest_px=shape.largest_px))
+        levels.append((factor, smaller, table))
+    return tuple(levels)
+
+
 def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:
     """An image with what all stages need; parameters as for `detect_circles`."""
     # Optics blur equally in all directions. Where pixels are not square, as in single fields of
@@ -177,13 +230,25 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 
 def judged_discs(
-    scene: Scene, table: VoteTable, settings: CircleSettings
+    levels: Sequence[Level], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
-    judgement = judged(scene, settings, candidates_of(scene, table, settings))
+    _, judgement = judged_candidates(levels, settings)
     log_odds = adjusted_log_odds(judgement, settings)
     best = best_apart(judgement.floor_xy, log_odds, settings.evidence, settings.separation_m)
     return judgement.where(best), log_odds[best]
+
+
+def judged_candidates(
+    levels: Sequence[Level], settings: CircleSettings
+) -> tuple[FloatArray, JudgedCandidates]:
+    """(N,) scores of all candidates, and their classification."""
+    candidates = [candidates_of(level.scene, level.table, settings) for level in levels]
+    found = [judged(level.scene, settings, each) for level, each in zip(levels, candidates)]
+    return (
+        np.concatenate([each.score for each in candidates]),
+        JudgedCandidates._make(map(np.concatenate, zip(*found))),
+    )
 
 
 def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> HoughCandidates:

@@ -15,7 +15,7 @@ import numpy as np
 
 from camera import Camera
 from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
-from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
+from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 
 _CELL_RADII = 0.25  #: Width of a cell, radii.
 _CELL_PX = 0.8  #: Its least length ahead, pixels.
@@ -28,12 +28,16 @@ _WIDE_PX, _HIGH_PX = 9.0, 6.0
 
 @dataclass(frozen=True)
 class VoteShape:
-    """Size of the discs, and the nearest and farthest centres."""
+    """Size of the discs, and the centres: how far from the border and how large discs are there."""
 
     radius_m: float = 0.10  #: Radius of the discs, metres.
     border_px: int = 6  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: float = 0.12
+    #: Radius of the discs in pixels, the geometric mean along both axes of the image. Larger ones
+    #: are searched in a reduced image.
+    smallest_px: float = 0.0
+    largest_px: float = 20.0
 
 
 class VoteTable(NamedTuple):
@@ -70,6 +74,7 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     offset = floor_xy - foot
     limits = shape.border_px, shape.far_limit_m_per_px
     usable = pixels_within(size_down(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
+    usable &= _sizes_within(floor_xy, shape)
     if min(usable.shape) < 3 or not usable.any():
         nothing = np.zeros(0, np.int64)
         return VoteTable(
@@ -103,7 +108,8 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
         + [sign * entry / (2.0 * np.pi * radius) for entry in matrix],
         axis=-1,
     )
-    inside = np.isfinite(pixel).all(axis=-1) & (place[..., 1] < edges[-1] + radius)
+    inside = np.isfinite(pixel).all(axis=-1)
+    inside &= (place[..., 1] > edges[0] - radius) & (place[..., 1] < edges[-1] + radius)
     pixel = np.where(inside[..., None], pixel, 0.0).astype(np.float32)
     image_row = []
     v = 1
@@ -130,6 +136,15 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
         columns=int(last.max()) + 3, cell=cell, step=step, left=left, foot=foot, turn=turn,
         made_for=fingerprint(camera, shape),
     )  # fmt: skip
+
+
+def _sizes_within(floor_xy: FloatArray, shape: VoteShape) -> BoolArray:
+    """(H, W) pixels at which discs are neither too small nor too large."""
+    by_row, by_column = np.gradient(floor_xy, axis=0), np.gradient(floor_xy, axis=1)
+    area = by_row[..., 0] * by_column[..., 1] - by_row[..., 1] * by_column[..., 0]  # of a pixel
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius_px = shape.radius_m / np.sqrt(abs(area))
+    return np.asarray((radius_px > shape.smallest_px) & (radius_px <= shape.largest_px))
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:

@@ -19,10 +19,9 @@ from camera import Camera
 from detect.circles import (
     CircleDetections,
     adjusted_log_odds,
-    candidates_of,
     detect_circles,
-    judged,
-    scene_of,
+    judged_candidates,
+    levels_of,
     vote_shape,
     within_margins,
 )
@@ -201,9 +200,7 @@ class _Examined:
         """Votes for the candidates of both polarities, and their classification."""
         settings = replace(self.settings, polarity="any")
         image, camera, table, _ = within_margins(self.image, self.camera, self.table, settings)
-        scene = scene_of(image, camera, table, settings)
-        candidates = candidates_of(scene, table, settings)
-        return candidates.score, judged(scene, settings, candidates)
+        return judged_candidates(levels_of(image, camera, table, settings), settings)
 
     def count(self, at: tuple[float, float] | None) -> int:
         """Number of discs found, near a pixel if one is given."""

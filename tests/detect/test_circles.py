@@ -213,6 +213,19 @@ def test_what_is_no_disc_is_not_reported(
     assert_found_once(detect(floor.image(), published_camera), disc[None], within_m=0.004)
 
 
+def test_large_discs_on_a_floor_with_texture() -> None:
+    """Their rims are 80 to 150 pixels wide, the grains of the floor some."""
+    pose = (-1.0, 0.0, 0.0, 0.0), (0.0, 0.7071, -0.7071, 0.0), (0.0, -0.7071, -0.7071, 1.2)
+    camera = Camera(960, 720, 900.0, 900.0, 479.5, 359.5, (0.0,) * 5, pose)
+    places = np.array([(0.0, -1.15), (-0.35, -0.85), (0.45, -1.4), (-0.45, -1.5), (0.1, -2.2)])
+    floor = PaintedFloor(camera)
+    for place in places:
+        floor.disc(place, radius_m=0.15)
+    noise = np.random.default_rng(0).normal(size=floor.grey.shape)
+    floor.grey += 60.0 * scipy.ndimage.gaussian_filter(noise, 1.5)
+    assert_found_once(detect(floor.image(), camera, CircleSettings(radius_m=0.15)), places, 1e-3)
+
+
 def test_verification_is_what_drops_the_square(published_camera: Camera) -> None:
     image = PaintedFloor(published_camera).shape((0.2, -1.1), SHAPES["square"]).image()
     assert len(detect(image, published_camera, replace(DEFAULT, refine=False))) >= 1
