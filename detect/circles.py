@@ -42,6 +42,7 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import fingerprint, floor_positions
+from lut.votes import largest_disc_px
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.tables import ByContent
 
@@ -198,26 +199,25 @@ def levels_of(
 @lru_cache(maxsize=16)
 def _reduced(camera: Camera, shape: VoteShape) -> tuple[tuple[int, Camera, VoteTable], ...]:
     """Factors by which images are reduced, until no disc is too large; cameras, and tables."""
-    levels: list[tuple[int, Camera, VoteTable]] = []
-    for factor in (2**k for k in range(1, 8)):
-        smaller = replace(
-            camera, width=camera.width // factor, height=camera.height // factor,
-            scale_x=camera.scale_x / factor, scale_y=camera.scale_y / factor,
-            offset_x=(camera.offset_x + 0.5) / factor - 0.5,
-            offset_y=(camera.offset_y + 0.5) / factor - 0.5,
-        )  # fmt: skip
-        larger = replace(
-            shape,
-            border_px=shape.border_px // factor,
-            far_limit_m_per_px=factor * shape.far_limit_m_per_px,
-            smallest_px=0.5 * shape.largest_px,
-            largest_px=math.inf,
-        )
-        if not len(build_vote_table(smaller, larger).image_row):
-            break
-        table = build_vote_table(smaller, replace(larger, largest_px=shape.largest_px))
-        levels.append((factor, smaller, table))
-    return tuple(levels)
+    largest = largest_disc_px(camera, shape)
+    count = math.ceil(math.log2(max(largest / shape.largest_px, 1.0)))
+    return tuple(_reduced_by(2**k, camera, shape) for k in range(1, count + 1))
+
+
+def _reduced_by(factor: int, camera: Camera, shape: VoteShape) -> tuple[int, Camera, VoteTable]:
+    smaller = replace(
+        camera, width=camera.width // factor, height=camera.height // factor,
+        scale_x=camera.scale_x / factor, scale_y=camera.scale_y / factor,
+        offset_x=(camera.offset_x + 0.5) / factor - 0.5,
+        offset_y=(camera.offset_y + 0.5) / factor - 0.5,
+    )  # fmt: skip
+    larger = replace(
+        shape,
+        border_px=shape.border_px // factor,
+        far_limit_m_per_px=factor * shape.far_limit_m_per_px,
+        smallest_px=0.5 * shape.largest_px,
+    )
+    return factor, smaller, build_vote_table(smaller, larger)
 
 
 def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
+from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 
 _CELL_RADII = 0.25  #: Width of a cell, radii.
@@ -24,6 +24,8 @@ _STEPS_PER_RADIUS = 16.0
 #: If every disc is this wide (pixels), columns are added in pairs; if it is this high, every second
 #: row votes, and so on.
 _WIDE_PX, _HIGH_PX = 9.0, 6.0
+#: Distance of the pixels at which the largest disc is looked for.
+_SIZED_PX = 8
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,9 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     floor_xy = floor_positions(camera)
     foot, radius = np.array(camera.centre[:2]), shape.radius_m
     offset = floor_xy - foot
-    limits = shape.border_px, shape.far_limit_m_per_px
-    usable = pixels_within(size_down(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
-    usable &= _sizes_within(floor_xy, shape)
-    if min(usable.shape) < 3 or not usable.any():
+    radius_px, visible = _radius_px(floor_xy, shape)
+    usable = visible & (radius_px > shape.smallest_px) & (radius_px <= shape.largest_px)
+    if not usable.any():
         nothing = np.zeros(0, np.int64)
         return VoteTable(
             floor_xy.astype(np.float32), False, nothing, np.zeros((0, 0, 6), np.float32), nothing,
@@ -138,13 +139,26 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     )  # fmt: skip
 
 
-def _sizes_within(floor_xy: FloatArray, shape: VoteShape) -> BoolArray:
-    """(H, W) pixels at which discs are neither too small nor too large."""
+def largest_disc_px(camera: Camera, shape: VoteShape) -> float:
+    """The largest radius of discs in the image, pixels, if their size does not matter; or 0."""
+    border = shape.border_px
+    u, v = (np.arange(border, size - border, _SIZED_PX) for size in (camera.width, camera.height))
+    jacobian = camera.floor_jacobian(np.stack(np.meshgrid(u, v), axis=-1))
+    near = np.hypot(*np.moveaxis(jacobian[..., 1], -1, 0)) <= shape.far_limit_m_per_px
+    area = abs(np.linalg.det(jacobian[near]))  # of a pixel
+    return float(shape.radius_m / np.sqrt(area.min(initial=math.inf)))
+
+
+def _radius_px(floor_xy: FloatArray, shape: VoteShape) -> tuple[FloatArray, BoolArray]:
+    """(H, W) radii of discs in pixels; which pixels are not too far, nor too near the border."""
+    if min(floor_xy.shape[:2]) < 3:
+        return np.zeros(floor_xy.shape[:2]), np.zeros(floor_xy.shape[:2], np.bool_)
     by_row, by_column = np.gradient(floor_xy, axis=0), np.gradient(floor_xy, axis=1)
     area = by_row[..., 0] * by_column[..., 1] - by_row[..., 1] * by_column[..., 0]  # of a pixel
-    with np.errstate(divide="ignore", invalid="ignore"):
-        radius_px = shape.radius_m / np.sqrt(abs(area))
-    return np.asarray((radius_px > shape.smallest_px) & (radius_px <= shape.largest_px))
+    limits = shape.border_px, shape.far_limit_m_per_px
+    visible = pixels_within(np.hypot(by_row[..., 0], by_row[..., 1]), *limits) & (area != 0.0)
+    with np.errstate(divide="ignore"):
+        return shape.radius_m / np.sqrt(abs(area)), visible
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:

@@ -53,19 +53,10 @@ class HoughCandidates(NamedTuple):
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
-    """Find possible centres of discs of one radius from the votes of edges.
+    """Find possible centres of discs of one radius (metres) from the votes of edges.
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    table : VoteTable
-        The camera's, for this radius.
-    radius : float
-        Metres.
-    sign : int
-        1 for light discs, -1 for dark ones, 0 for both.
-    least_step : float
-        Gradient of an edge, grey levels per pixel.
+    The table is that of the image's camera for this radius; `sign` is 1 for light discs, -1 for
+    dark ones, 0 for both; edges have a gradient of at least `least_step` grey levels per pixel.
     """
     signs = np.array([1.0, -1.0]) if sign == 0 else np.full(1, float(sign))
     most = len(signs) * _MOST_PEAKS

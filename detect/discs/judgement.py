@@ -111,19 +111,10 @@ def judge(
     camera_numbers: FloatArray,
     networks: Networks,
 ) -> JudgedCandidates:
-    """Judge candidates, the best first.
+    """Judge candidates, the best first, in an image (H, W).
 
-    Parameters
-    ----------
-    image : (H, W) uint8
-    candidates : HoughCandidates
-    nominal : float
-        Radius of discs, metres.
-    least_step : float
-        Lowest step of the grey value at a rim.
-    camera_numbers : (K,) float64
-        `camera.kernels.camera_numbers`.
-    networks : Networks
+    Discs have a `nominal` radius, metres, and at least `least_step` grey levels at their rims;
+    `camera_numbers` are those of `camera.kernels.camera_numbers`.
     """
     n = len(candidates.score)
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()

@@ -70,20 +70,8 @@ class Size(NamedTuple):
 def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[FloatArray, FloatArray]:
     """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
-    Parameters
-    ----------
-    scene : Scene
-    discs : JudgedCandidates
-        N discs.
-    work : WORK
-        Working space (`detect.discs.fit`).
-
-    Returns
-    -------
-    floor_xy : (N, 2) float64
-        Centres, metres.
-    covariance : (N, 2, 2) float64
-        Square metres.
+    `work` is a working space (`detect.discs.fit`). Returns (N, 2) centres, metres, and their
+    (N, 2, 2) covariances, square metres.
     """
     count = len(discs.step)
     whole = [NO_FIT for _ in range(count)]
