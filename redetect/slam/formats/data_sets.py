@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import io
 import math
+import subprocess
+import sys
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.io import loadmat
 from scipy.optimize import least_squares
 
 from redetect.array_types import FloatArray, IntArray
@@ -73,6 +72,14 @@ _LATE_S = 0.08
 #: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
 DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
 _LARGEST_BYTES = 1 << 28
+# Reads arrays of such a file, in a process of its own, which a damaged file may crash.
+_READER = """
+import io, sys, numpy, scipy.io
+found = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), variable_names=sys.argv[1:])
+content = io.BytesIO()
+numpy.savez(content, **{name: found[name] for name in sys.argv[1:]})
+sys.stdout.buffer.write(content.getvalue())
+"""
 # The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
 _AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
 _MOST_STEERING_RAD = 1.2
@@ -457,14 +464,16 @@ def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
 
 def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
     content = read_content(path, _LARGEST_BYTES, "MATLAB file", SlamError)
+    reader = subprocess.run(
+        [sys.executable, "-c", _READER, *names], input=content, capture_output=True, check=False
+    )
     try:
-        # In a process of its own, which a damaged file may crash.
-        with ProcessPoolExecutor(1, get_context("spawn")) as reader:
-            found = reader.submit(loadmat, io.BytesIO(content)).result()
+        found = np.load(io.BytesIO(reader.stdout))
         arrays = [np.asarray(np.real_if_close(found[name]), np.float64) for name in names]
     except Exception as error:  # damage can raise almost any
+        why = reader.stderr.decode(errors="replace").strip().rpartition("\n")[2] or error
         raise SlamError(
-            f"{path}: cannot be read ({error}): expected a MATLAB file with {', '.join(names)}"
+            f"{path}: cannot be read ({why}): expected a MATLAB file with {', '.join(names)}"
         ) from None
     for name, values in zip(names, arrays):
         if not np.all(np.abs(values) <= LARGEST_NUMBER):
