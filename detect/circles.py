@@ -56,10 +56,12 @@ _NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
 _EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.
 _LEAST_STEP = 5.0  #: Lowest step at a rim, grey levels.
+#: Factors by which images may be reduced for large discs, and the smallest side of such an image.
+_FACTORS, _SMALLEST_SIDE_PX = (2, 4, 8, 16, 32), 16
 
 
 #: A camera in the form that kernels take.
-_numbers = lru_cache(maxsize=4)(camera_numbers)
+_numbers = lru_cache(maxsize=16)(camera_numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +131,9 @@ def _by_rims(
 ) -> CircleDetections:
     """The default detector: finds discs by their rims and locates them by fits."""
     image, camera, table, left = within_margins(image, camera, table, settings)
-    levels = levels_of(image, camera, table, settings)
-    discs, log_odds = judged_discs(levels, settings)
-    scene = levels[0].scene
+    octaves = octaves_of(image, camera, table, settings)
+    discs, log_odds = judged_discs(octaves, settings)
+    scene = octaves[0].scene
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
@@ -172,36 +174,36 @@ def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[C
     return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
-class Level(NamedTuple):
+class Octave(NamedTuple):
     """An image, or one of reduced size, with the table of the discs that are searched there."""
 
     scene: Scene
     table: VoteTable
 
 
-def levels_of(
+def octaves_of(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
-) -> list[Level]:
+) -> list[Octave]:
     """The image, then smaller ones in which discs that are large in it are searched.
 
     In these, the texture of the floor is averaged, and all discs have sizes of which the networks
     know examples. Parameters as for `detect_circles`.
     """
-    levels = [Level(scene_of(image, camera, table, settings), table)]
+    octaves = [Octave(scene_of(image, camera, table, settings), table)]
     for factor, smaller, of_smaller in _reduced(camera, vote_shape(settings)):
         size = smaller.width, smaller.height
         cut = image[: factor * smaller.height, : factor * smaller.width]
         reduced = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
-        levels.append(Level(scene_of(reduced, smaller, of_smaller, settings), of_smaller))
-    return levels
+        octaves.append(Octave(scene_of(reduced, smaller, of_smaller, settings), of_smaller))
+    return octaves
 
 
 @lru_cache(maxsize=16)
 def _reduced(camera: Camera, shape: VoteShape) -> tuple[tuple[int, Camera, VoteTable], ...]:
     """Factors by which images are reduced, until no disc is too large; cameras, and tables."""
-    largest = largest_disc_px(camera, shape)
-    count = math.ceil(math.log2(max(largest / shape.largest_px, 1.0)))
-    return tuple(_reduced_by(2**k, camera, shape) for k in range(1, count + 1))
+    too_large = largest_disc_px(camera, shape) / shape.largest_px
+    most = min(2.0 * too_large, min(camera.width, camera.height) / _SMALLEST_SIDE_PX)
+    return tuple(_reduced_by(factor, camera, shape) for factor in _FACTORS if factor < most)
 
 
 def _reduced_by(factor: int, camera: Camera, shape: VoteShape) -> tuple[int, Camera, VoteTable]:
@@ -230,21 +232,21 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 
 def judged_discs(
-    levels: Sequence[Level], settings: CircleSettings
+    octaves: Sequence[Octave], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
-    _, judgement = judged_candidates(levels, settings)
+    _, judgement = judged_candidates(octaves, settings)
     log_odds = adjusted_log_odds(judgement, settings)
     best = best_apart(judgement.floor_xy, log_odds, settings.evidence, settings.separation_m)
     return judgement.where(best), log_odds[best]
 
 
 def judged_candidates(
-    levels: Sequence[Level], settings: CircleSettings
+    octaves: Sequence[Octave], settings: CircleSettings
 ) -> tuple[FloatArray, JudgedCandidates]:
     """(N,) scores of all candidates, and their classification."""
-    candidates = [candidates_of(level.scene, level.table, settings) for level in levels]
-    found = [judged(level.scene, settings, each) for level, each in zip(levels, candidates)]
+    candidates = [candidates_of(octave.scene, octave.table, settings) for octave in octaves]
+    found = [judged(octave.scene, settings, each) for octave, each in zip(octaves, candidates)]
     return (
         np.concatenate([each.score for each in candidates]),
         JudgedCandidates._make(map(np.concatenate, zip(*found))),

@@ -52,10 +52,9 @@ def read_settings(path: Path) -> SettingsFile:
     if not isinstance(given, dict):
         raise DetectError(f'{path}: no "settings": expected those of circles, lines or markers')
     kinds = get_type_hints(SettingsFile)
-    unknown = sorted(given.keys() - kinds.keys())
-    if unknown or not given:
-        wrong = excerpt(unknown[0]) if unknown else "no settings"
-        raise DetectError(f"{path}: {wrong}: expected those of {', '.join(kinds)}")
+    for unknown in sorted(given.keys() - kinds.keys())[:1]:
+        expected = f"those of {', '.join(kinds)}"
+        raise DetectError(f"{path}: settings of {excerpt(unknown)}: expected {expected}")
     try:
         return SettingsFile(**{n: checked_settings(n, v, kinds[n]) for n, v in given.items()})
     except DetectError as error:

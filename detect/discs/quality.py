@@ -64,24 +64,21 @@ def _quality_of(
     grey: ByteArray, samples: NDArray[np.uint32], i: int, count: int
 ) -> tuple[float, float, bool]:
     """Quality and contrast of the first samples of a centre; whether all are in the image."""
-    # All sums are integers, hence exact. As floats they are not reordered by the compiler, which is
-    # faster than gathering single samples into vectors.
     outside = len(grey)
-    a = b = squares = 0.0
+    a = b = squares = np.int64(0)
     n_inner = n_outer = 0
     for k in range(count):
         inner, outer = samples[i, k, 0], samples[i, k, 1]
-        x = float(grey[inner]) if inner < outside else 0.0
-        y = float(grey[outer]) if outer < outside else 0.0
-        a += x
-        b += y
-        squares += x * x + y * y
-        n_inner += inner < outside
-        n_outer += outer < outside
-    difference, pairs = n_outer * a - n_inner * b, float(n_inner * n_outer)
+        if inner < outside:
+            x = np.int64(grey[inner])
+            a, squares, n_inner = a + x, squares + x * x, n_inner + 1
+        if outer < outside:
+            x = np.int64(grey[outer])
+            b, squares, n_outer = b + x, squares + x * x, n_outer + 1
+    difference, pairs = n_outer * a - n_inner * b, n_inner * n_outer
     spread = (n_inner + n_outer) * squares - (a + b) * (a + b)
-    quality = difference * difference / (pairs * spread) if spread > 0.0 else 0.0
-    contrast = difference / pairs if pairs > 0.0 else 0.0
+    quality = difference * difference / (pairs * spread) if spread > 0 and pairs > 0 else 0.0
+    contrast = difference / pairs if pairs > 0 else 0.0
     return quality, contrast, n_inner == count and n_outer == count
 
 

@@ -226,6 +226,13 @@ def test_large_discs_on_a_floor_with_texture() -> None:
     assert_found_once(detect(floor.image(), camera, CircleSettings(radius_m=0.15)), places, 1e-3)
 
 
+def test_discs_larger_than_the_image() -> None:
+    pose = (-1.0, 0.0, 0.0, 0.0), (0.0, 0.7071, -0.7071, 0.0), (0.0, -0.7071, -0.7071, 0.1)
+    camera = Camera(96, 40, 60.0, 60.0, 48.0, 20.0, (0.0,) * 5, pose)
+    image = np.random.default_rng(0).integers(0, 256, (40, 96), np.uint8)
+    assert len(detect(image, camera, CircleSettings(radius_m=5.0))) == 0
+
+
 def test_verification_is_what_drops_the_square(published_camera: Camera) -> None:
     image = PaintedFloor(published_camera).shape((0.2, -1.1), SHAPES["square"]).image()
     assert len(detect(image, published_camera, replace(DEFAULT, refine=False))) >= 1

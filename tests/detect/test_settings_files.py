@@ -60,8 +60,10 @@ def test_what_ran_runs_again(project_root: Path, tmp_path: Path) -> None:
         pytest.param("[" * 100_000, "not JSON", id="deep"),
         ("[]", 'no "settings"'),
         ('{"settings": 3}', 'no "settings"'),
-        ('{"settings": {}}', "no settings: expected those of circles, lines, markers"),
-        ('{"settings": {"circels": {}}}', "'circels': expected those of circles, lines, markers"),
+        (
+            '{"settings": {"circels": {}}}',
+            "settings of 'circels': expected those of circles, lines, markers",
+        ),
         ('{"settings": {"circles": 3}}', "names and values"),
         ('{"settings": {"circles": {"radius": 1}}}', "radius is not a parameter of CircleSettings"),
         ('{"settings": {"circles": {"radius_m": "1"}}}', "expected a number"),
