@@ -12,6 +12,7 @@ STUDIES = {
     "accuracy": "accuracy.AccuracyStudy",
     "association": "association.Association",
     "buildings": "detection.Buildings",
+    "cameras": "cameras.Cameras",
     "camera-photographs": "calibration.CameraPhotographs",
     "camera-rendered": "calibration.CameraRendered",
     "disturbed": "disturbed.Disturbed",

@@ -214,13 +214,14 @@ def measure(
         while tally.shown < discs:
             image, places = render_scene(stage, kind, share, rng)
             found = detect_circles(image, camera, table, settings)
-            _count(tally, camera, found, places, settings.radius_m)
+            count_found(tally, camera, found, places, settings.radius_m)
         yield kind, share, tally
 
 
-def _count(
+def count_found(
     tally: Tally, camera: Camera, found: CircleDetections, places: list[FloatArray], radius: float
 ) -> None:
+    """Count the discs at some places that were found, with their errors, and rows elsewhere."""
     taken = np.zeros(len(found), np.bool_)
     for place in places:
         tally.shown += 1

@@ -15,7 +15,7 @@ CODE := $(shell git ls-files 'camera/*.py' 'detect/*.py' 'detect/*.npz' 'lut/*.p
 
 # The studies: half an hour on two busy cores, of which speed, fusion and markers-frames take six minutes each, poses four, tilt-tilted and
 # markers more than two, association, markers-photographs and real-run one to two.
-FIGURES ?= accuracy photographs buildings buildings-published buildings-report rendered-r1 rendered-r2 disturbed \
+FIGURES ?= accuracy photographs buildings buildings-published buildings-report rendered-r1 rendered-r2 disturbed cameras \
     demo sight-r1 sight-r2 tutorial real-run tilt-of-discs tilt-demo tilt-tilted tilt-room tilt-down soft \
     markers markers-frames markers-photographs markers-timing poses fusion association association-rows association-demo \
     map-speed speed
@@ -28,6 +28,7 @@ buildings-report = buildings $(DATA)/york --preset report
 rendered-r1 = rendered $(DATA)/rendered/r1
 rendered-r2 = rendered $(DATA)/rendered/r2
 disturbed = disturbed
+cameras = cameras
 demo = programs 'detect circles images/e -o @/e.circles' 'detect compare images/e --detected @/e.circles --json @/circles.json' \
     'detect all images/e -o @/e' 'detect compare images/e --detected @/e/detected.circles --json @/all.json'
 sight = programs 'detect all $(DATA)/rendered/$(1) -o @/$(1)' \
