@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from camera import Camera
@@ -25,6 +24,7 @@ from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import Fate, JudgedCandidates, judge
+from detect.discs.octaves import octaves_of
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_first_quality
@@ -42,7 +42,6 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import fingerprint, floor_positions
-from lut.votes import largest_disc_px
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.tables import ByContent
 
@@ -56,8 +55,6 @@ _NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
 _EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.
 _LEAST_STEP = 5.0  #: Lowest step at a rim, grey levels.
-#: Factors by which images may be reduced for large discs, and the smallest side of such an image.
-_FACTORS, _SMALLEST_SIDE_PX = (2, 4, 8, 16, 32), 16
 
 
 #: A camera in the form that kernels take.
@@ -131,9 +128,9 @@ def _by_rims(
 ) -> CircleDetections:
     """The default detector: finds discs by their rims and locates them by fits."""
     image, camera, table, left = within_margins(image, camera, table, settings)
-    octaves = octaves_of(image, camera, table, settings)
-    discs, log_odds = judged_discs(octaves, settings)
-    scene = octaves[0].scene
+    searched = searched_images(image, camera, table, settings)
+    discs, log_odds = judged_discs(searched, settings)
+    scene = searched[0].scene
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
@@ -174,52 +171,22 @@ def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[C
     return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
-class Octave(NamedTuple):
-    """An image, or one of reduced size, with the table of the discs that are searched there."""
+class Searched(NamedTuple):
+    """An image with the table of the discs that are searched in it."""
 
     scene: Scene
     table: VoteTable
 
 
-def octaves_of(
+def searched_images(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
-) -> list[Octave]:
-    """The image, then smaller ones in which discs that are large in it are searched.
-
-    In these, the texture of the floor is averaged, and all discs have sizes of which the networks
-    know examples. Parameters as for `detect_circles`.
-    """
-    octaves = [Octave(scene_of(image, camera, table, settings), table)]
-    for factor, smaller, of_smaller in _reduced(camera, vote_shape(settings)):
-        size = smaller.width, smaller.height
-        cut = image[: factor * smaller.height, : factor * smaller.width]
-        reduced = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
-        octaves.append(Octave(scene_of(reduced, smaller, of_smaller, settings), of_smaller))
-    return octaves
-
-
-@lru_cache(maxsize=16)
-def _reduced(camera: Camera, shape: VoteShape) -> tuple[tuple[int, Camera, VoteTable], ...]:
-    """Factors by which images are reduced, until no disc is too large; cameras, and tables."""
-    too_large = largest_disc_px(camera, shape) / shape.largest_px
-    most = min(2.0 * too_large, min(camera.width, camera.height) / _SMALLEST_SIDE_PX)
-    return tuple(_reduced_by(factor, camera, shape) for factor in _FACTORS if factor < most)
-
-
-def _reduced_by(factor: int, camera: Camera, shape: VoteShape) -> tuple[int, Camera, VoteTable]:
-    smaller = replace(
-        camera, width=camera.width // factor, height=camera.height // factor,
-        scale_x=camera.scale_x / factor, scale_y=camera.scale_y / factor,
-        offset_x=(camera.offset_x + 0.5) / factor - 0.5,
-        offset_y=(camera.offset_y + 0.5) / factor - 0.5,
-    )  # fmt: skip
-    larger = replace(
-        shape,
-        border_px=shape.border_px // factor,
-        far_limit_m_per_px=factor * shape.far_limit_m_per_px,
-        smallest_px=0.5 * shape.largest_px,
-    )
-    return factor, smaller, build_vote_table(smaller, larger)
+) -> list[Searched]:
+    """The image, then reduced ones for large discs; parameters as for `detect_circles`."""
+    searched = [Searched(scene_of(image, camera, table, settings), table)]
+    for octave in octaves_of(camera, vote_shape(settings)):
+        scene = scene_of(octave.reduced(image), octave.camera, octave.table, settings)
+        searched.append(Searched(scene, octave.table))
+    return searched
 
 
 def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:
@@ -232,21 +199,21 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 
 def judged_discs(
-    octaves: Sequence[Octave], settings: CircleSettings
+    searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
-    _, judgement = judged_candidates(octaves, settings)
+    _, judgement = judged_candidates(searched, settings)
     log_odds = adjusted_log_odds(judgement, settings)
     best = best_apart(judgement.floor_xy, log_odds, settings.evidence, settings.separation_m)
     return judgement.where(best), log_odds[best]
 
 
 def judged_candidates(
-    octaves: Sequence[Octave], settings: CircleSettings
+    searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[FloatArray, JudgedCandidates]:
     """(N,) scores of all candidates, and their classification."""
-    candidates = [candidates_of(octave.scene, octave.table, settings) for octave in octaves]
-    found = [judged(octave.scene, settings, each) for octave, each in zip(octaves, candidates)]
+    candidates = [candidates_of(*each, settings) for each in searched]
+    found = [judged(each.scene, settings, own) for each, own in zip(searched, candidates)]
     return (
         np.concatenate([each.score for each in candidates]),
         JudgedCandidates._make(map(np.concatenate, zip(*found))),

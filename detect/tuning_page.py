@@ -91,9 +91,10 @@ class TuningSession:
         if frame.image is None or frame.discs is None:
             raise DetectError(str(frame.error))
         found = frame.discs
-        explained = None
+        candidates, suggestions = list[dict[str, Any]](), list[str]()
         if settings.refine:  # otherwise, centres are rejected for their quality only
             explained = explain_discs(frame.image, self.run.camera, settings)
+            candidates, suggestions = explained.records(), list(explained.suggestions)
         rows = zip(found.floor_xy, found.covariance, found.quality, found.evidence, strict=True)
         discs = [
             {
@@ -109,10 +110,9 @@ class TuningSession:
         ]
         rejected = [
             {**row, "outline": self._outline((row["x_m"], row["y_m"]), settings.radius_m)}
-            for row in (explained.records() if explained else ())
+            for row in candidates
             if row["stage"] != "disc"
         ]
-        suggestions = list(explained.suggestions) if explained else []
         return {"discs": discs, "rejected": rejected, "suggestions": suggestions}
 
     def _outline(self, centre_xy: Any, radius_m: float) -> list[list[float]]:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within
-from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
+from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 _CELL_RADII = 0.25  #: Width of a cell, radii.
 _CELL_PX = 0.8  #: Its least length ahead, pixels.
@@ -74,9 +74,13 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     floor_xy = floor_positions(camera)
     foot, radius = np.array(camera.centre[:2]), shape.radius_m
     offset = floor_xy - foot
-    radius_px, visible = _radius_px(floor_xy, shape)
-    usable = visible & (radius_px > shape.smallest_px) & (radius_px <= shape.largest_px)
-    if not usable.any():
+    limits = shape.border_px, shape.far_limit_m_per_px
+    usable = pixels_within(size_down(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
+    if min(usable.shape) >= 3:
+        by_row, by_column = (np.gradient(floor_xy, axis=axis) for axis in (0, 1))
+        size = radius_px(radius, np.stack([by_column, by_row], axis=-1))
+        usable &= (size > shape.smallest_px) & (size <= shape.largest_px)
+    if min(usable.shape) < 3 or not usable.any():
         nothing = np.zeros(0, np.int64)
         return VoteTable(
             floor_xy.astype(np.float32), False, nothing, np.zeros((0, 0, 6), np.float32), nothing,
@@ -145,20 +149,17 @@ def largest_disc_px(camera: Camera, shape: VoteShape) -> float:
     u, v = (np.arange(border, size - border, _SIZED_PX) for size in (camera.width, camera.height))
     jacobian = camera.floor_jacobian(np.stack(np.meshgrid(u, v), axis=-1))
     near = np.hypot(*np.moveaxis(jacobian[..., 1], -1, 0)) <= shape.far_limit_m_per_px
-    area = abs(np.linalg.det(jacobian[near]))  # of a pixel
-    return float(shape.radius_m / np.sqrt(area.min(initial=math.inf)))
+    return float(radius_px(shape.radius_m, jacobian[near]).max(initial=0.0))
 
 
-def _radius_px(floor_xy: FloatArray, shape: VoteShape) -> tuple[FloatArray, BoolArray]:
-    """(H, W) radii of discs in pixels; which pixels are not too far, nor too near the border."""
-    if min(floor_xy.shape[:2]) < 3:
-        return np.zeros(floor_xy.shape[:2]), np.zeros(floor_xy.shape[:2], np.bool_)
-    by_row, by_column = np.gradient(floor_xy, axis=0), np.gradient(floor_xy, axis=1)
-    area = by_row[..., 0] * by_column[..., 1] - by_row[..., 1] * by_column[..., 0]  # of a pixel
-    limits = shape.border_px, shape.far_limit_m_per_px
-    visible = pixels_within(np.hypot(by_row[..., 0], by_row[..., 1]), *limits) & (area != 0.0)
+def radius_px(radius_m: float, floor_jacobian: FloatArray) -> FloatArray:
+    """(...) radii of discs in the image, pixels: the geometric mean along both axes of the image.
+
+    From (..., 2, 2) derivatives of the floor's (X, Y) by (u, v), as of `Camera.floor_jacobian`.
+    """
+    (x_u, x_v), (y_u, y_v) = np.moveaxis(floor_jacobian, (-2, -1), (0, 1))
     with np.errstate(divide="ignore"):
-        return shape.radius_m / np.sqrt(abs(area)), visible
+        return np.asarray(radius_m / np.sqrt(abs(x_u * y_v - x_v * y_u)))
 
 
 def _edges_ahead(ahead: FloatArray, per_row: FloatArray, radius: float) -> FloatArray:

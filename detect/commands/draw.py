@@ -29,6 +29,7 @@ from redetect.storage import demand_place, write_bytes
 from redetect.storage.images import quiet_opencv
 
 Video = Callable[[ByteArray], None]
+_FPS = 10.0  #: Frames per second of a video, by default.
 
 
 def perform(options: Draw) -> int:
@@ -50,10 +51,8 @@ def perform(options: Draw) -> int:
         demand_place(options.video, overwrite=options.force)
     if options.output is not None:
         demand_pictures(run.frames, options.output, overwrite=options.force)
-    force, path = options.force, options.video
-    with (
-        nullcontext() if path is None else mp4(path, options.fps or 10.0, overwrite=force) as video
-    ):
+    force, path, fps = options.force, options.video, options.fps or _FPS
+    with nullcontext() if path is None else mp4(path, fps, overwrite=force) as video:
         drawn, blank, failures = draw_run(run, rows, options.output, video=video, overwrite=force)
     for where in (options.output, options.video):
         if where is not None:

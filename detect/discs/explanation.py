@@ -21,7 +21,7 @@ from detect.circles import (
     adjusted_log_odds,
     detect_circles,
     judged_candidates,
-    octaves_of,
+    searched_images,
     vote_shape,
     within_margins,
 )
@@ -200,7 +200,7 @@ class _Examined:
         """Votes for the candidates of both polarities, and their classification."""
         settings = replace(self.settings, polarity="any")
         image, camera, table, _ = within_margins(self.image, self.camera, self.table, settings)
-        return judged_candidates(octaves_of(image, camera, table, settings), settings)
+        return judged_candidates(searched_images(image, camera, table, settings), settings)
 
     def count(self, at: tuple[float, float] | None) -> int:
         """Number of discs found, near a pixel if one is given."""

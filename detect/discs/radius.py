@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from detect.circles import judged_discs, octaves_of, vote_shape
+from detect.circles import judged_discs, searched_images, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from redetect.array_types import FloatArray, GreyImage
@@ -79,7 +79,9 @@ def _rims(
 ) -> list[FloatArray]:
     """The rims in each image: (N, 4) positions and radii, metres, and log-odds."""
     table = build_vote_table(camera, vote_shape(settings))
-    found = [judged_discs(octaves_of(each, camera, table, settings), settings) for each in images]
+    found = [
+        judged_discs(searched_images(each, camera, table, settings), settings) for each in images
+    ]
     return [np.column_stack([discs.floor_xy, discs.radius, log_odds]) for discs, log_odds in found]
 
 
@@ -117,7 +119,5 @@ def ratio_of_radii(
 
     None for fewer than `LEAST_DISCS` discs.
     """
-    table = build_vote_table(camera, vote_shape(settings))
-    judged = [judged_discs(octaves_of(each, camera, table, settings), settings) for each in images]
-    radii = np.concatenate([np.empty(0), *(discs.radius for discs, _ in judged)])
+    radii = np.concatenate([np.empty((0, 4)), *_rims(images, camera, settings)])[:, 2]
     return float(np.median(radii)) / settings.radius_m if len(radii) >= LEAST_DISCS else None

@@ -64,9 +64,8 @@ def open_source(
     """
     options = options or SourceOptions()
     source = _source(name, options)
-    if (options.wheel_base_m or options.metres_per_tick) and not options.odometry.endswith(
-        ".ticks"
-    ):
+    of_wheels = options.wheel_base_m or options.metres_per_tick
+    if of_wheels and not options.odometry.endswith(".ticks"):
         raise DetectError(
             "--wheel-base-m, --metres-per-tick: expected counts of wheel encoders beside them: "
             "--odometry FILE.ticks"

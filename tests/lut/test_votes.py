@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from camera import Camera
 from detect.circles import detect_circles
 from detect.settings import CircleSettings
-from lut import VoteShape, build_vote_table, cached_vote_table
+from lut import VoteShape, build_vote_table, cached_vote_table, ring
+from lut.votes import radius_px
 from tests.detect.painted_floor import PaintedFloor
 
 SHAPE = VoteShape()
@@ -53,3 +55,12 @@ def test_a_camera_that_looks_straight_down_finds_discs() -> None:
     apart = np.hypot(*np.moveaxis(found.floor_xy[:, None] - places, -1, 0))
     assert len(found) == len(places)
     assert apart.min(axis=0).max() < 2e-3
+
+
+def test_sizes_are_those_of_the_outlines(published_camera: Camera) -> None:
+    pixel = [500.0, 180.0]
+    outline = published_camera.floor_from_pixel(pixel) + ring(0.05, 64)
+    x, y = published_camera.project_floor(outline).T
+    area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+    found = radius_px(0.05, published_camera.floor_jacobian(pixel))
+    assert found == pytest.approx(np.sqrt(area / np.pi), rel=0.01)

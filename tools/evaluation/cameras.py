@@ -13,7 +13,7 @@ from camera import Camera
 from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
-from redetect.array_types import FloatArray
+from lut.votes import radius_px
 from tools.evaluation.disturbed import Stage, Tally, count_found, render_scene
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
@@ -39,12 +39,6 @@ def random_camera(rng: np.random.Generator) -> Camera:
     return Camera(width, height, scale, scale, *centre, distortion, tuple(map(tuple, pose)))
 
 
-def radius_px(camera: Camera, radius_m: float, place: FloatArray) -> float:
-    """Radius of a disc in the image, the geometric mean along both axes."""
-    area = np.linalg.det(camera.floor_jacobian(camera.project_floor(place)))
-    return float(radius_m / math.sqrt(abs(area)))
-
-
 @dataclass(frozen=True)
 class Cameras(Study):
     """Detect discs on floors with texture, seen by random cameras: by their size in the image."""
@@ -67,8 +61,8 @@ class Cameras(Study):
                 image, places = render_scene(stage, "", 0.0, rng)
                 found = detect_circles(image, camera, votes, settings)
                 count_found(every, camera, found, places, radius_m)
-                for place in places:
-                    size = radius_px(camera, radius_m, place)
+                jacobians = camera.floor_jacobian(camera.project_floor(places))
+                for place, size in zip(places, radius_px(radius_m, jacobians), strict=True):
                     tally = tallies[max(low for low in tallies if low <= size)]
                     count_found(tally, camera, found, [place], radius_m)
         table = Table(
