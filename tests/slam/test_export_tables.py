@@ -15,7 +15,7 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between, chain_steps, rotation
-from redetect.slam.commands.conversion import bearing_table, disc_table, odometry_table
+from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.models import bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 

@@ -13,8 +13,8 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.map_file import write_table
 from redetect.plane import between
-from redetect.slam.commands.conversion import odometry_table
 from redetect.slam.formats.g2o import RunGraph, graph_of_run, write_g2o
+from redetect.slam.formats.tables import odometry_table
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import read_recording
 

@@ -1,1 +1,1 @@
-"""Files of other tools: g2o graphs, TUM trajectories, data sets."""
+"""Files of other tools: g2o graphs, TUM trajectories, data sets, comma-separated tables."""
