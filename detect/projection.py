@@ -20,6 +20,8 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import Frame, Step
 from redetect.plane import chain_steps
 
+#: Pitch and roll (rad) that level directions: those of a frame, or the constant lean of a camera
+#: against its calibration.
 Tilt = tuple[float, float]
 
 LEAST_GATE_PX = 3.0  #: Lower bound of the gate in the image, for small discs (px).

@@ -27,6 +27,7 @@ from urllib.parse import parse_qs
 from detect.discs.explanation import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
+from detect.lean import search_of
 from detect.projection import circle_on_floor
 from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
@@ -85,17 +86,24 @@ class TuningSession:
 
     def detect(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         """The discs of a frame with some settings, and the rejected candidates."""
-        settings = checked_settings("circles", values, CircleSettings)
-        plan = FramePlan(self.run.camera, circles=settings, levelling="none")
-        (frame,) = detect_batch([FrameTask(self.frames[number])], plan)
-        if frame.image is None or frame.discs is None:
-            raise DetectError(str(frame.error))
-        found = frame.discs
-        candidates, suggestions = list[dict[str, Any]](), list[str]()
+        settings, camera = checked_settings("circles", values, CircleSettings), self.run.camera
+        candidates, suggestions, lean = list[dict[str, Any]](), list[str](), None
         if settings.refine:  # otherwise, centres are rejected for their quality only
-            explained = explain_discs(frame.image, self.run.camera, settings)
+            explained = explain_discs(self.image(number), camera, settings)
             candidates, suggestions = explained.records(), list(explained.suggestions)
-        rows = zip(found.floor_xy, found.covariance, found.quality, found.evidence, strict=True)
+            lean = explained.lean
+        plan = FramePlan(camera, circles=settings, levelling="none", lean=lean)
+        (frame,) = detect_batch([FrameTask(self.frames[number])], plan)
+        if frame.discs is None:
+            raise DetectError(str(frame.error))
+        found, (leaning, _) = frame.discs, search_of(camera, settings, lean)
+
+        def outline(level_xy: Any) -> list[list[float]]:
+            places = leaning.project_floor(circle_on_floor(level_xy, settings.radius_m, _OUTLINE))
+            return [[float(u), float(v)] for u, v in places if math.isfinite(u)]
+
+        level_xy = leaning.floor_from_pixel(camera.project_floor(found.floor_xy))
+        rows = zip(found.floor_xy, level_xy, found.covariance, found.quality, found.evidence)
         discs = [
             {
                 "x": float(xy[0]),
@@ -103,21 +111,17 @@ class TuningSession:
                 "covariance": [float(c[0, 0]), float(c[0, 1]), float(c[1, 1])],
                 "quality": float(quality),
                 "evidence": float(evidence),
-                "outline": self._outline(xy, settings.radius_m),
+                "outline": outline(level),
                 "ellipse": ellipses(xy, c, _SIGMAS, _OUTLINE).tolist(),
             }
-            for xy, c, quality, evidence in rows
+            for xy, level, c, quality, evidence in rows
         ]
         rejected = [
-            {**row, "outline": self._outline((row["x_m"], row["y_m"]), settings.radius_m)}
+            {**row, "outline": outline((row["x_m"], row["y_m"]))}
             for row in candidates
             if row["stage"] != "disc"
         ]
         return {"discs": discs, "rejected": rejected, "suggestions": suggestions}
-
-    def _outline(self, centre_xy: Any, radius_m: float) -> list[list[float]]:
-        places = self.run.camera.project_floor(circle_on_floor(centre_xy, radius_m, _OUTLINE))
-        return [[float(u), float(v)] for u, v in places if math.isfinite(u)]
 
     def save(self, values: Mapping[str, Any], labels: Mapping[str, Any]) -> list[str]:
         """Write the settings, and the labels of frames by number; returns messages."""

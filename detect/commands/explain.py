@@ -11,6 +11,7 @@ from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, png_of
 from detect.errors import DetectError
 from detect.options import Explain
+from detect.runs.outputs import lean_sentence
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
@@ -51,6 +52,8 @@ def perform(command: Explain) -> int:
 
 def _print(found: DiscExplanation) -> None:
     console = Console()
+    if found.lean is not None:
+        console.print(lean_sentence(found.lean), highlight=False, markup=False)
     if found.place:
         console.print(found.place, highlight=False, markup=False)
     table = Table(box=box.SIMPLE_HEAD, padding=0)

@@ -1,7 +1,7 @@
 """Explains why discs are not found: the candidates of an image, and what rejected each.
 
 The candidates are those of the detector itself (`detect.discs.judgement`) for discs of both
-polarities. Suggestions are tried out: each states what would be found with it.
+polarities, searched with the camera's lean (`detect.lean`) if the image shows one. Suggestions are tried out: each states what would be found with it.
 """
 
 from __future__ import annotations
@@ -27,8 +27,11 @@ from detect.circles import (
 )
 from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, Fate, JudgedCandidates
 from detect.discs.radius import find_radius
+from detect.lean import detect_tilted, search_of
+from detect.lines import detect_lines
+from detect.projection import Tilt
 from detect.settings import CircleSettings
-from lut import VoteTable, build_vote_table, cached_vote_table
+from lut import VoteTable, build_vote_table, cached_vertical_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
 from redetect.json_text import json_text
 from redetect.messages import counted
@@ -53,7 +56,7 @@ class Candidate(NamedTuple):
 
     u: float  # pixel
     v: float
-    x_m: float  # position on the calibrated floor, metres
+    x_m: float  # position on the floor, metres
     y_m: float
     votes: float  # of edges, relative to the mean at the same distance
     contrast: float  # grey levels inside minus outside; NaN if no rim was traced
@@ -90,6 +93,7 @@ class DiscExplanation(Table):
     ----------
     image : (H, W) uint8
     camera : Camera
+        Leaning from its calibration as in the search; positions on the floor are level.
     settings : CircleSettings
     at : (float, float) or None
         The given pixel.
@@ -99,6 +103,8 @@ class DiscExplanation(Table):
         Description of the given pixel; empty without one.
     suggestions : tuple of str
         Flags or settings to try, with their results.
+    lean : (float, float) or None
+        Pitch and roll (rad) by which the camera leans from its calibration, if that finds more.
     """
 
     image: GreyImage
@@ -108,6 +114,7 @@ class DiscExplanation(Table):
     candidates: tuple[Candidate, ...]
     place: str
     suggestions: tuple[str, ...]
+    lean: Tilt | None = None
 
     def columns(self) -> dict[str, Any]:
         """One row per candidate, numbered as in the picture."""
@@ -147,7 +154,13 @@ def explain_discs(
     at : (float, float), optional
         Pixel (u, v) of something that should have been found; only candidates near it are listed.
     """
-    scene = _Examined(image, camera, replace(settings, refine=True))
+    settings = replace(settings, refine=True)
+    tilt = detect_lines(image, cached_vertical_table(camera)).tilt
+    lean = None
+    if tilt is not None:
+        _, lean = detect_tilted(image, camera, settings, (tilt.pitch_rad, tilt.roll_rad))
+    camera, _ = search_of(camera, settings, lean)
+    scene = _Examined(image, camera, settings)
     candidates = list(_candidates(scene))
     place = ""
     if at is not None:
@@ -157,7 +170,7 @@ def explain_discs(
         candidates = [c for c in candidates if math.hypot(c.x_m - x, c.y_m - y) < near]
     candidates.sort(key=lambda c: (not c.is_disc, -c.votes))
     suggestions = tuple(_suggestions(scene, at))
-    return DiscExplanation(image, camera, settings, at, tuple(candidates), place, suggestions)
+    return DiscExplanation(image, camera, settings, at, tuple(candidates), place, suggestions, lean)
 
 
 def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettings) -> str:

@@ -5,7 +5,6 @@ Workers import this module; a process that delegates the work does not need the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,31 +14,29 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, detect_circles, disc_table, scene_of, vote_shape
+from detect.circles import CircleDetections, scene_of, vote_shape
 from detect.discs.fit import working_space
 from detect.discs.identity import ids_of_rows
 from detect.discs.judgement import NO_CANDIDATES
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.discs.placing import place_discs
 from detect.errors import FrameError
-from detect.levelling import as_calibrated, common_covariance, levelled
+from detect.lean import detect_leaning, detect_tilted, search_of, with_exact_tilt
+from detect.levelling import common_covariance, levelled
 from detect.lines import LineDetections, carry_ids, detect_lines
-from detect.projection import leaning_camera
 from detect.run_tilt import smooth_axis
 from detect.runs.plan import (
     FramePlan,
     FrameRows,
     FrameTask,
     KnownOfFrame,
-    Lean,
     json_record,
-    lean_finds_more,
     rows_of_failure,
     time_row,
 )
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
-from lut import DiscTable, VerticalTable, VoteTable, cached_vertical_table, cached_vote_table
+from lut import VerticalTable, cached_vertical_table, cached_vote_table
 from redetect.array_types import GreyImage
 from redetect.interrupts import interrupts_deferred
 from redetect.landmarks import (
@@ -65,7 +62,6 @@ FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgErro
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
-_FRAME_LEAN_DEG = 2.0  #: Steps of the lean of a single frame, degrees.
 PIXELS_AT_ONCE = 1 << 25  #: Largest number of pixels that are decoded at once.
 
 
@@ -81,15 +77,6 @@ class FrameDetections:
     outline_tilt: FrameTilt | None = None  # from the discs, if a run is levelled by all frames
     markers: MarkerDetections | None = None
     error: str | None = None  # why the frame cannot be processed
-
-
-@lru_cache(maxsize=16)
-def search_of(
-    camera: Camera, circles: CircleSettings, lean: Lean | None
-) -> tuple[Camera, VoteTable | DiscTable]:
-    """The camera with its lean, and its table for discs, made or loaded once per process."""
-    leaning = camera if lean is None else leaning_camera(camera, lean)
-    return leaning, disc_table(leaning, circles)
 
 
 #: The table of a camera's verticals, one object per process: `detect.lines` prepares more for it.
@@ -161,21 +148,11 @@ def _search(image: GreyImage, plan: FramePlan, by_frame: FrameTilt | None) -> Ci
     camera, settings = plan.camera, plan.circles
     assert camera is not None
     assert settings is not None
-    fitting = settings
     if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
-        fitting = replace(settings, tilt_sigma_deg=0.0)
-
-    def with_lean(lean: Lean | None) -> CircleDetections:
-        leaning, table = search_of(camera, settings, lean)
-        found = detect_circles(image, leaning, table, fitting)
-        return found if leaning == camera else as_calibrated(found, leaning, camera)
-
-    found = with_lean(plan.lean)
-    if by_frame is None or plan.lean is not None or not settings.refine:
-        return found
-    lean = lean_of_frame(by_frame)
-    leaning = found if lean is None else with_lean(lean)
-    return leaning if lean_finds_more(leaning.evidence.sum(), found.evidence.sum()) else found
+        settings = with_exact_tilt(settings)
+    if by_frame is None or plan.lean is not None:
+        return detect_leaning(image, camera, settings, plan.lean)
+    return detect_tilted(image, camera, settings, (by_frame.pitch, by_frame.roll))[0]
 
 
 def _levelled(
@@ -305,15 +282,6 @@ def _disc_rows(
         for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
             ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
-
-
-def lean_of_frame(tilt: FrameTilt) -> Lean | None:
-    """The lean for a frame's search for discs, from its tilt, in coarse steps: for few tables."""
-    pitch, roll = (
-        math.radians(_FRAME_LEAN_DEG * round(math.degrees(angle) / _FRAME_LEAN_DEG))
-        for angle in (tilt.pitch, tilt.roll)
-    )
-    return (pitch, roll) if pitch or roll else None
 
 
 def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from camera import Camera
 from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
+from detect.projection import Tilt
 from detect.run_tilt import (
     FrameTilts,
     RunTilt,
@@ -19,7 +20,7 @@ from detect.run_tilt import (
     usual_tilt,
 )
 from detect.runs.outputs import RUN_TILT
-from detect.runs.plan import FrameRows, Lean, RunSummary
+from detect.runs.plan import FrameRows, RunSummary
 from detect.settings import LEAST_FRAMES, CircleSettings
 from redetect.array_types import FloatArray
 from redetect.landmarks import (
@@ -41,14 +42,18 @@ _LEAST_SIGMA_RAD = 1e-6
 _LEVELLED_AT_ONCE = 64  #: Number of frames whose discs are levelled at once.
 
 
-def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[RunTilt | None, float]:
-    """The tilt of a run, from the rows of some frames, and the standard deviation of an unknown one
-    (rad). None if few of them have a tilt.
+def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[FloatArray | None, float]:
+    """The lean (2,) that some frames show, and the standard deviation of an unknown tilt (rad).
+
+    The median tilt of the frames with verticals if they are few, None if there are none.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
     common = common_tilt_variance(camera)
     found = tilt_of_run(verticals, outlines, common, camera_pitch_weights(camera))
-    return found, found.usual_rad if found else usual_tilt(verticals, outlines)
+    if found is not None:
+        return found.lean, found.usual_rad
+    known = verticals.tilt[verticals.known]
+    return np.median(known, axis=0) if len(known) else None, usual_tilt(verticals, outlines)
 
 
 def lean_of_outlines(frames: Iterable[FrameRows]) -> FloatArray:
@@ -60,7 +65,7 @@ def lean_of_outlines(frames: Iterable[FrameRows]) -> FloatArray:
     return np.median(known, axis=0) if len(known) >= LEAST_FRAMES else np.zeros(2)
 
 
-def searched_lean(lean: FloatArray) -> Lean | None:
+def searched_lean(lean: FloatArray) -> Tilt | None:
     """The lean (2,) for the search for discs (rad); None if it hardly makes a difference."""
     lean_deg = np.degrees(lean).round(1)  # so that runs of a camera share a cached table
     if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:

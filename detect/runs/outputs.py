@@ -15,7 +15,8 @@ from typing import Any
 
 from camera import Camera
 from detect.errors import EXIT_FRAMES_FAILED
-from detect.runs.plan import FramePlan, Job, Lean, RunSummary
+from detect.projection import Tilt
+from detect.runs.plan import FramePlan, Job, RunSummary
 from detect.settings import CircleSettings
 from detect.sources.interface import ImageRun
 from redetect import __version__
@@ -118,7 +119,7 @@ def _circles_text(job: Job) -> list[str]:
     ]
 
 
-def lean_sentence(lean: Lean) -> str:
+def lean_sentence(lean: Tilt) -> str:
     """A sentence on the camera's lean in the search for discs."""
     pitch, roll = map(math.degrees, lean)
     return (

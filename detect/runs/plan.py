@@ -16,6 +16,7 @@ import numpy as np
 
 from camera import Camera
 from detect.line_settings import LineSettings
+from detect.projection import Tilt
 from detect.settings import CircleSettings, Levelling, MarkerSettings
 from detect.sources.image_files import image_name
 from detect.sources.interface import ImageRun, RunFrame
@@ -41,11 +42,6 @@ from redetect.plane import rotation
 if TYPE_CHECKING:
     from detect.run_tilt import RunTilt
 
-#: Factor by which a search with a lean must find more evidence: a building itself may lean.
-_MORE_EVIDENCE = 1.06
-
-#: Constant tilt of a camera against its calibration: pitch and roll (rad) that level directions.
-Lean = tuple[float, float]
 
 #: Largest distance from the robot at which discs of a map are matched, metres.
 _REACH_M = 20.0
@@ -156,7 +152,7 @@ class FramePlan:
     #: are processed, by that of the run.
     levelling: Levelling = "frame"
     #: Lean of the camera in the search for discs; set by `detect_run`.
-    lean: Lean | None = None
+    lean: Tilt | None = None
     working_folder: Path = field(default_factory=Path.cwd)  # where relative paths start from
 
 
@@ -218,7 +214,7 @@ class RunSummary:
     failures: list[str] = field(default_factory=list)
     images_without_step: int = 0  # missing in the odometry
     known: int = 0  # frames with prior data
-    lean: Lean | None = None  # of the camera in the search for discs
+    lean: Tilt | None = None  # of the camera in the search for discs
     unlevelled_deg: float | None = None  # sigma of pitch and roll, as some frames show
     tilt: RunTilt | None = None  # used for levelling, if that was by the run
 
@@ -236,11 +232,6 @@ class RunSummary:
 def tilts_by_image(path: Path) -> dict[str, FrameTilt]:
     """The tilts of a file by the names of their images; see `redetect.landmarks.read_tilts`."""
     return {image_name(prefix): tilt for prefix, tilt in read_tilts(path).items()}
-
-
-def lean_finds_more(leaning: float, evidence: float) -> bool:
-    """Whether a search with the camera's lean finds clearly more evidence of discs."""
-    return leaning > _MORE_EVIDENCE * evidence
 
 
 def rows_of_failure(task: FrameTask, reason: str) -> FrameRows:

@@ -39,9 +39,8 @@ import numpy as np
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
 from detect.runs.outputs import Output, log_text, outputs_of
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary, lean_finds_more
+from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import WorkerPool, Workers, local_workers
-from detect.settings import LEAST_FRAMES
 from detect.sources.interface import ImageRun, RunFrame, spread_frames
 from redetect import __version__
 from redetect.storage import OutputExistsError
@@ -234,9 +233,10 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     camera, circles = plan.camera, plan.circles
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    if (run.frames.expected or 0) < LEAST_FRAMES or not run.frames.is_recorded:
+    if not run.frames.is_recorded:
         return plan
-    # This loads the compiler.
+    # These load the compiler.
+    from detect.lean import lean_finds_more
     from detect.runs.level_run import lean_of_outlines, searched_lean, tilt_of_some
 
     tasks = [FrameTask(frame) for frame in spread_frames(run.frames, _FIRST_FRAMES, _FIRST_SPACING)]
@@ -246,12 +246,12 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
 
     level = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
     rows = rows_by(level)
-    tilt, usual_rad = tilt_of_some(camera, rows)
-    known = tilt is not None or usual_rad > circles.tilt_sigma_rad
+    mean, usual_rad = tilt_of_some(camera, rows)
+    known = mean is not None or usual_rad > circles.tilt_sigma_rad
     if known and circles.tilt_sigma_deg is None and plan.levelling != "run":
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(usual_rad), 2))
         plan = replace(plan, circles=circles)
-    lean = searched_lean(tilt.lean) if tilt else None
+    lean = None if mean is None else searched_lean(mean)
     evidence = sum(each.evidence for each in rows)
     for _ in range(_FIRST_ROUNDS):
         if lean in (None, plan.lean):

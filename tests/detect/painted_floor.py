@@ -81,6 +81,20 @@ class PaintedFloor:
         self.grey[:, first : first + 80] = DOOR
         return self
 
+    def wall(self, distance_m: float = 12.0, panel_deg: float = 5.0) -> PaintedFloor:
+        """A round wall about the camera, of light and dark panels: their edges are vertical."""
+        n, (height, width) = 4, self.grey.shape
+        fine = (np.arange(n) + 0.5) / n - 0.5
+        u = (np.arange(width)[:, None] + fine).ravel()
+        v = (np.arange(height)[:, None] + fine).ravel()
+        x, y, z = np.moveaxis(self.camera.directions_robot(np.stack(np.meshgrid(u, v), -1)), -1, 0)
+        on_wall = distance_m * z > -self.camera.centre[2] * np.hypot(x, y)
+        panel = np.floor(np.degrees(np.arctan2(x, -y)) / panel_deg) % 2
+        grey = np.where(on_wall, DOOR - 50.0 * panel, np.nan).reshape(height, n, width, n)
+        share = np.isfinite(grey).mean(axis=(1, 3))
+        self.grey = (1.0 - share) * self.grey + np.nan_to_num(grey).mean(axis=(1, 3))
+        return self
+
     def image(self, noise: float = 1.5, seed: int = 0) -> NDArray[np.uint8]:
         noisy = self.grey + np.random.default_rng(seed).normal(0.0, noise, self.grey.shape)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

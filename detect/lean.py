@@ -1,0 +1,86 @@
+"""Searches an image for discs as its camera is mounted: with its lean against the calibration.
+
+Perspective determines the size and flatness of a disc in the image. With a calibration that is
+wrong by two degrees, distant discs look like no discs, and to a low camera near ones as well.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+from camera import Camera
+from detect.circles import CircleDetections, detect_circles, disc_table
+from detect.levelling import as_calibrated
+from detect.projection import Tilt, leaning_camera
+from detect.settings import CircleSettings
+from lut import DiscTable, VoteTable
+from redetect.array_types import GreyImage
+
+#: Factor by which a search with a lean must find more evidence: a building itself may lean.
+_MORE_EVIDENCE = 1.06
+_STEP_RAD = math.radians(1.0)  #: Steps of the lean of a single image, and the least one.
+
+
+def lean_finds_more(leaning: float, evidence: float) -> bool:
+    """Whether a search with the camera's lean finds clearly more evidence of discs."""
+    return leaning > _MORE_EVIDENCE * evidence
+
+
+def lean_of_image(tilt: Tilt) -> Tilt | None:
+    """The lean for the search in an image with this tilt (rad), in steps: for few tables. None if
+    it hardly makes a difference.
+    """
+    if max(map(abs, tilt)) < _STEP_RAD:
+        return None
+    pitch, roll = (_STEP_RAD * round(angle / _STEP_RAD) for angle in tilt)
+    return pitch, roll
+
+
+@lru_cache(maxsize=16)
+def with_exact_tilt(settings: CircleSettings) -> CircleSettings:
+    """The settings for positions whose covariances do not include an error of the tilt."""
+    return replace(settings, tilt_sigma_deg=0.0)
+
+
+def search_of(
+    camera: Camera, settings: CircleSettings, lean: Tilt | None
+) -> tuple[Camera, VoteTable | DiscTable]:
+    """The camera with its lean, and its table for discs, made or loaded once per process."""
+    return _search_of(camera, with_exact_tilt(settings), lean)
+
+
+@lru_cache(maxsize=16)
+def _search_of(
+    camera: Camera, settings: CircleSettings, lean: Tilt | None
+) -> tuple[Camera, VoteTable | DiscTable]:
+    leaning = camera if lean is None else leaning_camera(camera, lean)
+    return leaning, disc_table(leaning, settings)
+
+
+def detect_leaning(
+    image: GreyImage, camera: Camera, settings: CircleSettings, lean: Tilt | None
+) -> CircleDetections:
+    """The discs of an image, searched with a lean, at their places for the calibrated camera.
+
+    Parameters and errors otherwise as for `detect.circles.detect_circles`.
+    """
+    leaning, table = search_of(camera, settings, lean)
+    found = detect_circles(image, leaning, table, settings)
+    return found if lean is None else as_calibrated(found, leaning, camera)
+
+
+def detect_tilted(
+    image: GreyImage, camera: Camera, settings: CircleSettings, tilt: Tilt
+) -> tuple[CircleDetections, Tilt | None]:
+    """The discs of an image, searched with its tilt (rad) if that finds more; and the lean used.
+
+    See `detect_leaning`.
+    """
+    found, lean = detect_leaning(image, camera, settings, None), lean_of_image(tilt)
+    if lean is not None and settings.refine:
+        leaning = detect_leaning(image, camera, settings, lean)
+        if lean_finds_more(leaning.evidence.sum(), found.evidence.sum()):
+            return leaning, lean
+    return found, None
