@@ -1,7 +1,8 @@
 """Explains why discs are not found: the candidates of an image, and what rejected each.
 
 The candidates are those of the detector itself (`detect.discs.judgement`) for discs of both
-polarities, searched with the camera's lean (`detect.lean`) if the image shows one. Suggestions are tried out: each states what would be found with it.
+polarities, searched with the camera's lean (`detect.lean`) if the image shows one. Suggestions are
+tried out: each states what would be found with it.
 """
 
 from __future__ import annotations

@@ -233,7 +233,7 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     camera, circles = plan.camera, plan.circles
     if not (camera and circles and circles.refine and plan.levelling != "none"):
         return plan
-    if not run.frames.is_recorded:
+    if run.frames.expected is None or not run.frames.is_recorded:
         return plan
     # These load the compiler.
     from detect.lean import lean_finds_more

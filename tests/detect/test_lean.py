@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import cv2
@@ -20,9 +20,11 @@ from detect.circles import CircleDetections
 from detect.cli import main
 from detect.lean import lean_of_image
 from detect.levelling import as_calibrated, level_discs
-from detect.projection import leaning_camera
-from detect.settings import LEAST_FRAMES
+from detect.projection import circle_on_floor, leaning_camera
+from detect.settings import LEAST_FRAMES, CircleSettings
 from detect.settings_files import read_settings
+from detect.sources.opening import open_run
+from detect.tuning_page import TuningSession
 from redetect.landmarks import circle_arrays, read_frames, squared_mahalanobis
 from tests.detect.commands import Captured
 from tests.detect.painted_floor import LIGHT, PaintedFloor
@@ -46,6 +48,30 @@ def low_camera(published_camera: Camera) -> Camera:
         published_camera, width=640, height=480, scale_x=420.0, scale_y=420.0, offset_x=319.5,
         offset_y=239.5, robot_from_camera=ahead,
     )  # fmt: skip
+
+
+#: By which that camera leans, and the places of discs in its images.
+LOW_LEAN_DEG = (-2.6, -1.4)
+
+
+def low_places() -> Rows:
+    rng = np.random.default_rng(5)
+    grid = np.stack(np.meshgrid([-0.7, 0.0, 0.7], [-1.8, -2.6, -3.4]), axis=-1).reshape(-1, 2)
+    return [grid + rng.uniform(-0.15, 0.15, grid.shape) for _ in range(3)]
+
+
+@pytest.fixture
+def low_run(published_camera: Camera, tmp_path: Path) -> Path:
+    """Three images of a low camera that leans, within walls."""
+    camera, run = low_camera(published_camera), tmp_path / "run"
+    (run / "images").mkdir(parents=True)
+    write_camera(camera, run / "run.cam")
+    for k, places in enumerate(low_places()):
+        floor = PaintedFloor(wrong_by(camera, LOW_LEAN_DEG)).wall()
+        for xy in places:
+            floor.disc(xy, LIGHT)
+        cv2.imwrite(str(run / "images" / f"{k:02d}.png"), floor.image(seed=k))
+    return run
 
 
 def level_rows(circles: Path) -> Rows:
@@ -188,28 +214,41 @@ def test_an_image_with_a_wrong_calibration_shows_the_same_discs(project_root: Pa
         assert np.hypot(u, v).min(axis=1).max() < 0.5
 
 
-@pytest.mark.parametrize("lean_deg", [(-2.6, -1.4), (2.4, 0.5)])
-def test_a_few_images_show_how_a_low_camera_leans(
-    published_camera: Camera, tmp_path: Path, lean_deg: tuple[float, float]
+def test_explanations_and_the_tuning_page_see_a_low_camera_lean(
+    published_camera: Camera, low_run: Path
 ) -> None:
-    """The run is too short for a common lean; near the floor, 2.6 degrees are a quarter of a disc's
-    distance.
-    """
+    image = low_run / "images" / "00.png"
     camera = low_camera(published_camera)
-    (tmp_path / "run" / "images").mkdir(parents=True)
-    write_camera(camera, tmp_path / "run" / "run.cam")
-    rng = np.random.default_rng(5)
-    grid = np.stack(np.meshgrid([-0.7, 0.0, 0.7], [-1.8, -2.6, -3.4]), axis=-1).reshape(-1, 2)
-    places = [grid + rng.uniform(-0.15, 0.15, grid.shape) for _ in range(3)]
-    for k, place in enumerate(places):
-        floor = PaintedFloor(wrong_by(camera, lean_deg)).wall()
-        for xy in place:
-            floor.disc(xy, LIGHT)
-        cv2.imwrite(str(tmp_path / "run" / "images" / f"{k:02d}.png"), floor.image(seed=k))
-    assert main(["all", str(tmp_path / "run")]) == 0
-    found = level_rows(tmp_path / "run" / "detected.circles")
-    assert [len(rows) for rows in found] == [len(grid)] * len(places)
-    assert found_again(places, found) == 1.0
+    explained = rd.explain(image, camera)
+    assert explained.lean == pytest.approx(np.radians([-3.0, -1.0]))
+    discs = [candidate for candidate in explained.candidates if candidate.is_disc]
+    leaning = wrong_by(camera, LOW_LEAN_DEG)
+    seen = leaning.project_floor(low_places()[0])
+    assert len(discs) == len(seen)
+    far = int(np.argmin(seen[:, 1]))
+    assert rd.explain(image, camera, at=tuple(seen[far])).candidates[0].is_disc
+
+    run = open_run(low_run)
+    session = TuningSession(run, list(run.frames), CircleSettings(), low_run)
+    shown = session.detect(0, asdict(CircleSettings()))["discs"]
+    outlines = np.array([disc["outline"] for disc in shown])
+    off = outlines.mean(axis=1)[:, None] - seen
+    assert np.hypot(*np.moveaxis(off, -1, 0)).min(axis=1).max() < 1.5
+    # They are as wide as the discs.
+    assert np.ptp(outlines[..., 0], axis=1).max() == pytest.approx(
+        np.ptp(leaning.project_floor(circle_on_floor(low_places()[0], 0.1)), axis=1)[:, 0].max(),
+        rel=0.05,
+    )
+
+
+def test_a_few_images_show_how_a_low_camera_leans(low_run: Path) -> None:
+    """The run is too short for the statistics of a lean, which is a quarter of a disc's distance
+    for a camera near the floor.
+    """
+    assert main(["all", str(low_run)]) == 0
+    found = level_rows(low_run / "detected.circles")
+    assert [len(rows) for rows in found] == list(map(len, low_places()))
+    assert found_again(low_places(), found) == 1.0
 
 
 def test_a_slight_tilt_of_a_frame_is_no_lean() -> None:

@@ -26,7 +26,7 @@ def test_who_has_others_work_loads_no_compiler(small_run: Path) -> None:
         "import sys\n"
         "from detect.cli import main\n"
         "if __name__ == '__main__':\n"
-        f"    code = main(['circles', {str(small_run)!r}, '--jobs', '2'])\n"
+        f"    code = main(['circles', {str(small_run)!r}, '--tilt', 'none', '--jobs', '2'])\n"
         "    heavy = {'numba', 'scipy', 'skimage', 'lut'} & set(sys.modules)\n"
         "    print('exit', code, 'heavy', sorted(heavy))\n"
     )
