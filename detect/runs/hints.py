@@ -29,7 +29,8 @@ _MANY = 3
 #: Number of images in which the discs' size is compared with their radius, and the difference of
 #: logarithms that is reported.
 _COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
-_FEWEST_TILTS = 4  #: Images that have to show the camera's lean for it to count in the radius.
+#: Largest standard deviation of the tilts that show the camera's lean, for the radius of discs.
+_SURE_RAD = math.radians(0.5)
 _LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
@@ -51,10 +52,15 @@ def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
     from lut import cached_vertical_table
 
     table = cached_vertical_table(camera)
-    tilts = [tilt for tilt in (detect_lines(image, table).tilt for image in images) if tilt]
-    if 2 * len(tilts) < len(images) or len(tilts) < _FEWEST_TILTS:
+    tilts = (detect_lines(image, table).tilt for image in images)
+    known = [
+        (tilt.pitch_rad, tilt.roll_rad)
+        for tilt in tilts
+        if tilt is not None and np.diag(tilt.covariance).max() < _SURE_RAD**2
+    ]
+    if not known or 2 * len(known) < len(images):
         return camera
-    pitch, roll = np.median([(tilt.pitch_rad, tilt.roll_rad) for tilt in tilts], axis=0).tolist()
+    pitch, roll = np.median(known, axis=0).tolist()
     small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
     return camera if small else leaning_camera(camera, (pitch, roll))
 

@@ -52,8 +52,10 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[FloatArra
     found = tilt_of_run(verticals, outlines, common, camera_pitch_weights(camera))
     if found is not None:
         return found.lean, found.usual_rad
-    known = verticals.tilt[verticals.known]
-    return np.median(known, axis=0) if len(known) else None, usual_tilt(verticals, outlines)
+    usual_rad, known = usual_tilt(verticals, outlines), verticals.tilt[verticals.known]
+    if not len(known):
+        return None, usual_rad
+    return np.median(known, axis=0), max(usual_rad, math.sqrt(np.mean(known**2)))
 
 
 def lean_of_outlines(frames: Iterable[FrameRows]) -> FloatArray:
