@@ -247,6 +247,8 @@ def test_a_few_images_show_how_a_low_camera_leans(low_run: Path) -> None:
     """
     assert main(["all", str(low_run)]) == 0
     found = level_rows(low_run / "detected.circles")
+    assert [len(rows) for rows in found] == list(map(len, low_places()))
+    assert found_again(low_places(), found) == 1.0
     assert main(["circles", str(low_run), "--tilt", "none", "--force"]) == 0
     without = level_rows(low_run / "detected.circles")
     assert 3 * sum(map(len, without)) < sum(map(len, low_places()))
@@ -268,9 +270,7 @@ def test_discs_of_a_few_images_say_how_far_the_lean_may_move_them(
         seen = camera.floor_from_pixel(leaning.project_floor(places))
         nearest = np.hypot(*np.moveaxis(found.xy[:, None] - seen, -1, 0)).argmin(axis=1)
         off = found.xy - places[nearest]
-        assert 0.2 < squared_mahalanobis(off, found.covariance).mean() / 2.0 < 2.0
-    assert [len(rows) for rows in found] == list(map(len, low_places()))
-    assert found_again(low_places(), found) == 1.0
+        assert 0.2 < squared_mahalanobis(off, found.covariance).mean() / 2.0 < 3.0
 
 
 def test_a_slight_tilt_of_a_frame_is_no_lean() -> None:
