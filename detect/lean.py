@@ -20,7 +20,8 @@ from redetect.array_types import GreyImage
 
 #: Factor by which a search with a lean must find more evidence: a building itself may lean.
 _MORE_EVIDENCE = 1.06
-_STEP_RAD = math.radians(1.0)  #: Steps of the lean of a single image, and the least one.
+#: Steps of the lean of a single image, and its least deviation from that of the camera.
+_STEP_RAD = math.radians(1.0)
 
 
 def lean_finds_more(leaning: float, evidence: float) -> bool:
@@ -28,11 +29,12 @@ def lean_finds_more(leaning: float, evidence: float) -> bool:
     return leaning > _MORE_EVIDENCE * evidence
 
 
-def lean_of_image(tilt: Tilt) -> Tilt | None:
+def lean_of_image(tilt: Tilt, usual: Tilt | None = None) -> Tilt | None:
     """The lean for the search in an image with this tilt (rad), in steps: for few tables. None if
-    it hardly makes a difference.
+    it hardly differs from the `usual` one.
     """
-    if max(map(abs, tilt)) < _STEP_RAD:
+    pitch, roll = usual or (0.0, 0.0)
+    if max(abs(tilt[0] - pitch), abs(tilt[1] - roll)) < _STEP_RAD:
         return None
     pitch, roll = (_STEP_RAD * round(angle / _STEP_RAD) for angle in tilt)
     return pitch, roll
@@ -72,15 +74,15 @@ def detect_leaning(
 
 
 def detect_tilted(
-    image: GreyImage, camera: Camera, settings: CircleSettings, tilt: Tilt
-) -> tuple[CircleDetections, Tilt | None]:
-    """The discs of an image, searched with its tilt (rad) if that finds more; and the lean used.
-
-    See `detect_leaning`.
+    image: GreyImage, camera: Camera, settings: CircleSettings, tilt: Tilt,
+    usual: Tilt | None = None,
+) -> tuple[CircleDetections, Tilt | None]:  # fmt: skip
+    """The discs of an image, searched with its own tilt (rad) if that finds more than the usual
+    lean; and the lean that was used. See `detect_leaning`.
     """
-    found, lean = detect_leaning(image, camera, settings, None), lean_of_image(tilt)
+    found, lean = detect_leaning(image, camera, settings, usual), lean_of_image(tilt, usual)
     if lean is not None and settings.refine:
         leaning = detect_leaning(image, camera, settings, lean)
         if lean_finds_more(leaning.evidence.sum(), found.evidence.sum()):
             return leaning, lean
-    return found, None
+    return found, usual

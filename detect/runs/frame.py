@@ -123,14 +123,14 @@ def _path(
         yield
 
         if plan.circles and camera:
-            by_frame = found.tilt if plan.levelling == "frame" else None
-            found.unlevelled = found.discs = _search(image, plan, by_frame)
+            tilt = None if plan.levelling == "none" else found.tilt
+            found.unlevelled = found.discs = _search(image, plan, tilt)
             if plan.levelling == "run":  # levels them later
                 xy, radius_m = found.unlevelled.floor_xy, plan.circles.radius_m
-                if (tilt := tilt_of_outlines(image, camera, xy, radius_m)) is not None:
-                    found.outline_tilt = replace(tilt, prefix=prefix)
+                if (by_discs := tilt_of_outlines(image, camera, xy, radius_m)) is not None:
+                    found.outline_tilt = replace(by_discs, prefix=prefix)
             else:
-                found.discs = _levelled(found.unlevelled, camera, plan.circles, by_frame)
+                found.discs = _levelled(found.unlevelled, camera, plan.circles, tilt)
         yield
 
         if plan.markers:
@@ -141,18 +141,18 @@ def _path(
         found.error = reason_of(error, task)
 
 
-def _search(image: GreyImage, plan: FramePlan, by_frame: FrameTilt | None) -> CircleDetections:
-    """The discs as a level robot sees them, searched with the lean of the run's camera; or with the
-    tilt of the frame, if they will be levelled by that and it finds more.
+def _search(image: GreyImage, plan: FramePlan, tilt: FrameTilt | None) -> CircleDetections:
+    """The discs as a level robot sees them, searched with the lean of the run's camera, or with the
+    tilt of the frame if that finds more.
     """
     camera, settings = plan.camera, plan.circles
     assert camera is not None
     assert settings is not None
-    if by_frame is not None or plan.levelling == "run":  # levelling adds the tilt's error
+    if tilt is not None or plan.levelling == "run":  # levelling adds the tilt's error
         settings = with_exact_tilt(settings)
-    if by_frame is None or plan.lean is not None:
+    if tilt is None or not plan.search_by_frame:
         return detect_leaning(image, camera, settings, plan.lean)
-    return detect_tilted(image, camera, settings, (by_frame.pitch, by_frame.roll))[0]
+    return detect_tilted(image, camera, settings, (tilt.pitch, tilt.roll), plan.lean)[0]
 
 
 def _levelled(

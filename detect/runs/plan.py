@@ -153,6 +153,8 @@ class FramePlan:
     levelling: Levelling = "frame"
     #: Lean of the camera in the search for discs; set by `detect_run`.
     lean: Tilt | None = None
+    #: Whether frames are also searched with their own tilts, if these differ from the lean.
+    search_by_frame: bool = True
     working_folder: Path = field(default_factory=Path.cwd)  # where relative paths start from
 
 

@@ -244,7 +244,9 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
     def rows_by(plan: FramePlan) -> list[FrameRows]:
         return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
 
-    level = replace(plan, lines=plan.lines or LineSettings(), levelling="run")
+    level = replace(
+        plan, lines=plan.lines or LineSettings(), levelling="run", search_by_frame=False
+    )
     rows = rows_by(level)
     mean, usual_rad = tilt_of_some(camera, rows)
     known = mean is not None or usual_rad > circles.tilt_sigma_rad
