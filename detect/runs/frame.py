@@ -5,6 +5,7 @@ Workers import this module; a process that delegates the work does not need the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -62,6 +63,8 @@ FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgErro
 
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
+#: Least difference of a frame's tilt from the lean of a run with which discs are searched again.
+_LEAST_OFF_RAD, _LEAST_OFF_SIGMAS = math.radians(1.5), 5.0
 PIXELS_AT_ONCE = 1 << 25  #: Largest number of pixels that are decoded at once.
 
 
@@ -150,9 +153,23 @@ def _search(image: GreyImage, plan: FramePlan, tilt: FrameTilt | None) -> Circle
     assert settings is not None
     if tilt is not None or plan.levelling == "run":  # levelling adds the tilt's error
         settings = with_exact_tilt(settings)
-    if tilt is None or not plan.search_by_frame:
+    if tilt is None or not _is_searched(tilt, plan):
         return detect_leaning(image, camera, settings, plan.lean)
     return detect_tilted(image, camera, settings, (tilt.pitch, tilt.roll), plan.lean)[0]
+
+
+def _is_searched(tilt: FrameTilt, plan: FramePlan) -> bool:
+    """Whether discs are also searched with the tilt of their frame.
+
+    In a run it must certainly differ from the lean: the verticals of single frames are often wrong.
+    """
+    if plan.levelling != "run":
+        return True
+    pitch, roll = plan.lean or (0.0, 0.0)
+    return plan.search_by_frame and any(
+        abs(off) > max(_LEAST_OFF_RAD, _LEAST_OFF_SIGMAS * math.sqrt(variance))
+        for off, variance in ((tilt.pitch - pitch, tilt.cpp), (tilt.roll - roll, tilt.crr))
+    )
 
 
 def _levelled(
