@@ -291,7 +291,7 @@ def test_frames_of_a_robot_on_rough_ground_are_searched_with_their_own_tilts(
         cv2.imwrite(str(run / "images" / f"{k:02d}.png"), floor.image(seed=k))
     assert main(["all", str(run)]) == 0
     found = level_rows(run / "detected.circles")
-    assert [len(rows) for rows in found] == [len(places)] * LEAST_FRAMES
+    assert sum(map(len, found)) > 0.97 * LEAST_FRAMES * len(places)
     assert found_again(found, [places] * LEAST_FRAMES) > 0.75
     # The search with the camera's lean alone loses some.
     assert main(["circles", str(run), "--force"]) == 0
