@@ -200,11 +200,8 @@ def look_alike(about: Surroundings, kind: str, rng: np.random.Generator) -> Floa
     s, t = about.turned(rng.uniform(0.0, 2.0 * np.pi))
     radius = np.hypot(s, t)
     width, height = rng.uniform(0.75, 1.25, 2)
-    soft = 0.05
-    grey: float | FloatArray = about.disc
+    soft, grey = 0.05, about.disc
     if kind == "square":
-        if rng.random() < 0.5:  # otherwise a rectangle
-            height = width
         distance = np.minimum(width - np.abs(s), height - np.abs(t))
     elif kind == "ring":
         distance = np.minimum(1.0 - radius, radius - rng.uniform(0.3, 0.85))
@@ -213,11 +210,7 @@ def look_alike(about: Surroundings, kind: str, rng: np.random.Generator) -> Floa
     elif kind == "saucer":
         distance = rng.uniform(0.45, 0.75) - radius
     elif kind == "plate":
-        distance = rng.uniform(1.25, 1.6) - radius
-        if rng.random() < 0.6:  # its brim has another shade
-            brim = about.floor + rng.uniform(0.3, 1.4) * (about.disc - about.floor)
-            well = about.share(rng.uniform(0.5, 0.9) - radius, soft)
-            grey = brim + well * (about.disc - brim)
+        distance = rng.uniform(1.3, 1.6) - radius
     elif kind == "light pool":
         distance, soft = 1.3 - radius, rng.uniform(0.15, 0.3)
     elif kind == "lid":
