@@ -9,6 +9,7 @@ from itertools import islice
 import numpy as np
 
 from camera import Camera
+from detect.lean import lean_finds_more
 from detect.levelling import common_covariance, common_tilt_variance, level_discs, tilt_arrays
 from detect.projection import Tilt
 from detect.run_tilt import (
@@ -37,6 +38,7 @@ from redetect.landmarks import (
 _Tilted = tuple[str, int, FrameTilt | None]
 #: Least lean that the search for discs considers, degrees: a slight lean does no harm.
 _LEAST_LEAN_DEG = 0.5
+_ROUNDS = 2  #: How often some frames are searched with a lean.
 #: Standard deviation of a tilt that is known exactly: covariances in files are positive definite.
 _LEAST_SIGMA_RAD = 1e-6
 _LEVELLED_AT_ONCE = 64  #: Number of frames whose discs are levelled at once.
@@ -58,18 +60,41 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[FloatArra
     return np.median(known, axis=0), max(usual_rad, math.sqrt(np.mean(known**2)))
 
 
-def lean_of_outlines(frames: Iterable[FrameRows]) -> FloatArray:
-    """(2,) median pitch and roll that the outlines of discs show in some frames (rad); zero if few
-    frames show any.
+def lean_of_search(
+    mean: FloatArray,
+    rows: Sequence[FrameRows],
+    rows_by: Callable[[Tilt | None], Sequence[FrameRows]],
+) -> Tilt | None:
+    """The lean for the search for discs (rad); None if without one as much is found.
+
+    `rows` are those of some frames, found without a lean, and `mean` (2,) their mean tilt (rad).
+    `rows_by` searches these frames with another lean.
     """
+    used, lean, evidence = None, _rounded(mean), sum(each.evidence for each in rows)
+    for _ in range(_ROUNDS):
+        if lean in (None, used):
+            break
+        rows, before = rows_by(lean), evidence
+        evidence = sum(each.evidence for each in rows)
+        if not lean_finds_more(evidence, before):
+            break
+        # Discs that are found without the lean show less of it.
+        used, lean = lean, _lean_of_outlines(rows)
+    return used
+
+
+def _lean_of_outlines(frames: Iterable[FrameRows]) -> Tilt | None:
+    """The median pitch and roll that the outlines of discs show, if many frames show any."""
     _, _, outlines = _tilts_of(rows.rows for rows in frames)
     known = outlines.tilt[outlines.known]
-    return np.median(known, axis=0) if len(known) >= LEAST_FRAMES else np.zeros(2)
+    return _rounded(np.median(known, axis=0)) if len(known) >= LEAST_FRAMES else None
 
 
-def searched_lean(lean: FloatArray) -> Tilt | None:
-    """The lean (2,) for the search for discs (rad); None if it hardly makes a difference."""
-    lean_deg = np.degrees(lean).round(1)  # so that runs of a camera share a cached table
+def _rounded(lean: FloatArray) -> Tilt | None:
+    """A lean (2,), rounded so that runs of a camera share a cached table; None if it hardly makes a
+    difference.
+    """
+    lean_deg = np.degrees(lean).round(1)
     if np.hypot(*lean_deg) < _LEAST_LEAN_DEG:
         return None
     pitch, roll = np.radians(lean_deg).tolist()

@@ -38,6 +38,7 @@ import numpy as np
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
+from detect.projection import Tilt
 from detect.runs.outputs import Output, log_text, outputs_of
 from detect.runs.plan import FramePlan, FrameRows, FrameTask, Job, RunSummary
 from detect.runs.workers import WorkerPool, Workers, local_workers
@@ -55,7 +56,6 @@ _COMPLETE = "complete"
 #: Largest number of frames from which a run's tilt is estimated first, and their largest spacing.
 _FIRST_FRAMES = 32
 _FIRST_SPACING = 20
-_FIRST_ROUNDS = 2  #: How often they are searched with a lean.
 
 _log = logging.getLogger("redetect")
 
@@ -235,37 +235,24 @@ def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePl
         return plan
     if run.frames.expected is None or not run.frames.is_recorded:
         return plan
-    # These load the compiler.
-    from detect.lean import lean_finds_more
-    from detect.runs.level_run import lean_of_outlines, searched_lean, tilt_of_some
+    from detect.runs.level_run import lean_of_search, tilt_of_some  # loads the compiler
 
     tasks = [FrameTask(frame) for frame in spread_frames(run.frames, _FIRST_FRAMES, _FIRST_SPACING)]
-
-    def rows_by(plan: FramePlan) -> list[FrameRows]:
-        return [rows for chunk in pool.detect_chunks(tasks, plan) for _, rows in chunk]
-
     level = replace(
         plan, lines=plan.lines or LineSettings(), levelling="run", search_by_frame=False
     )
-    rows = rows_by(level)
+
+    def rows_by(lean: Tilt | None) -> list[FrameRows]:
+        chunks = pool.detect_chunks(tasks, replace(level, lean=lean))
+        return [rows for chunk in chunks for _, rows in chunk]
+
+    rows = rows_by(None)
     mean, usual_rad = tilt_of_some(camera, rows)
     known = mean is not None or usual_rad > circles.tilt_sigma_rad
     if known and circles.tilt_sigma_deg is None and plan.levelling != "run":
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(usual_rad), 2))
         plan = replace(plan, circles=circles)
-    lean = None if mean is None else searched_lean(mean)
-    evidence = sum(each.evidence for each in rows)
-    for _ in range(_FIRST_ROUNDS):
-        if lean in (None, plan.lean):
-            break
-        rows, before = rows_by(replace(level, lean=lean)), evidence
-        evidence = sum(each.evidence for each in rows)
-        if not lean_finds_more(evidence, before):
-            break
-        plan = replace(plan, lean=lean)
-        # Discs that are found without the lean show less of it.
-        lean = searched_lean(lean_of_outlines(rows))
-    return plan
+    return plan if mean is None else replace(plan, lean=lean_of_search(mean, rows, rows_by))
 
 
 class RunFiles:
