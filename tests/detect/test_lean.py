@@ -111,7 +111,8 @@ def test_a_run_with_a_wrong_calibration_finds_the_same_discs(
     wrong = level_rows(tmp_path / "wrong" / "detected.circles")
     assert found_again(right, wrong) > 0.96
     assert found_again(wrong, right) > 0.96
-    # `detect circles` searches alike, but for frames that tilt further, and writes rows as they are seen by the calibration.
+    # `detect circles` searches alike, but for frames that tilt further, and writes rows as they are
+    # seen by the calibration.
     assert "not levelled" not in capsys.readouterr().out
     assert main(["circles", *wrongly, "-o", str(tmp_path / "seen.circles")]) == 0
     assert "positions are not levelled: pitch and roll" in capsys.readouterr().out
