@@ -7,19 +7,26 @@ wrong by two degrees, distant discs look like no discs, and to a low camera near
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+
+import numpy as np
 
 from camera import Camera
 from detect.circles import CircleDetections, detect_circles, disc_table
 from detect.levelling import as_calibrated
+from detect.lines import detect_lines
 from detect.projection import Tilt, leaning_camera
 from detect.settings import CircleSettings
-from lut import DiscTable, VoteTable
+from lut import DiscTable, VoteTable, cached_vertical_table
 from redetect.array_types import GreyImage
 
 #: Factor by which a search with a lean must find more evidence: a building itself may lean.
 _MORE_EVIDENCE = 1.06
+#: Largest standard deviation of tilts that show the camera's lean, for the size of its discs, and
+#: the least lean that counts.
+_SURE_RAD, _LEAST_LEAN_RAD = math.radians(0.5), math.radians(1.0)
 #: Steps of the lean of a single image, and its least deviation from that of the camera.
 _STEP_RAD = math.radians(1.0)
 
@@ -86,3 +93,22 @@ def detect_tilted(
         if lean_finds_more(leaning.evidence.sum(), found.evidence.sum()):
             return leaning, lean
     return found, usual
+
+
+def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
+    """The camera with the lean that the verticals show in most of some images.
+
+    Discs look larger or smaller to a camera that leans.
+    """
+    table = cached_vertical_table(camera)
+    tilts = (detect_lines(image, table).tilt for image in images)
+    known = [
+        (tilt.pitch_rad, tilt.roll_rad)
+        for tilt in tilts
+        if tilt is not None and np.diag(tilt.covariance).max() < _SURE_RAD**2
+    ]
+    if not known or 2 * len(known) < len(images):
+        return camera
+    pitch, roll = np.median(known, axis=0).tolist()
+    small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
+    return camera if small else leaning_camera(camera, (pitch, roll))

@@ -103,7 +103,9 @@ class TuningSession:
             return [[float(u), float(v)] for u, v in places if math.isfinite(u)]
 
         level_xy = leaning.floor_from_pixel(camera.project_floor(found.floor_xy))
-        rows = zip(found.floor_xy, level_xy, found.covariance, found.quality, found.evidence)
+        rows = zip(
+            found.floor_xy, level_xy, found.covariance, found.quality, found.evidence, strict=True
+        )
         discs = [
             {
                 "x": float(xy[0]),

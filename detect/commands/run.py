@@ -11,7 +11,7 @@ from detect.drawing import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.row_files import KINDS, RunRows
-from detect.runs.hints import hints, leaning_as, some_images
+from detect.runs.hints import hints, some_images
 from detect.runs.outputs import depth_sentence, frames_tilt_place, lean_sentence
 from detect.runs.plan import (
     FramePlan,
@@ -121,6 +121,7 @@ def _all(command: All, run: Run) -> Job:
 def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     """The settings with the radius estimated from some of the images."""
     from detect.discs.radius import find_radius
+    from detect.lean import leaning_as
 
     images = list(some_images(run))
     found = find_radius(images, leaning_as(images, run.camera), settings)

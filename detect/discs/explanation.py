@@ -115,7 +115,7 @@ class DiscExplanation(Table):
     candidates: tuple[Candidate, ...]
     place: str
     suggestions: tuple[str, ...]
-    lean: Tilt | None = None
+    lean: Tilt | None
 
     def columns(self) -> dict[str, Any]:
         """One row per candidate, numbered as in the picture."""

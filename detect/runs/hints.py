@@ -7,8 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-import numpy as np
-
 from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.projection import leaning_camera
@@ -29,9 +27,6 @@ _MANY = 3
 #: Number of images in which the discs' size is compared with their radius, and the difference of
 #: logarithms that is reported.
 _COMPARED_IMAGES, _OTHER_HEIGHT = 8, 0.07
-#: Largest standard deviation of the tilts that show the camera's lean, for the radius of discs.
-_SURE_RAD = math.radians(0.5)
-_LEAST_LEAN_RAD = math.radians(1.0)  #: A smaller one does not.
 
 
 def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
@@ -43,30 +38,10 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
             yield read_image(frame, run.camera)
 
 
-def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
-    """The camera with the lean that the verticals show in most of the images.
-
-    Discs look larger or smaller to a camera that leans.
-    """
-    from detect.lines import detect_lines
-    from lut import cached_vertical_table
-
-    table = cached_vertical_table(camera)
-    tilts = (detect_lines(image, table).tilt for image in images)
-    known = [
-        (tilt.pitch_rad, tilt.roll_rad)
-        for tilt in tilts
-        if tilt is not None and np.diag(tilt.covariance).max() < _SURE_RAD**2
-    ]
-    if not known or 2 * len(known) < len(images):
-        return camera
-    pitch, roll = np.median(known, axis=0).tolist()
-    small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
-    return camera if small else leaning_camera(camera, (pitch, roll))
-
-
 def _leaning(images: Sequence[GreyImage], camera: Camera, summary: RunSummary) -> Camera:
     """The camera with the lean of the run, or that of the images."""
+    from detect.lean import leaning_as
+
     lean = summary.lean
     return leaning_as(images, camera) if lean is None else leaning_camera(camera, lean)
 
