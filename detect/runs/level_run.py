@@ -47,7 +47,8 @@ _LEVELLED_AT_ONCE = 64  #: Number of frames whose discs are levelled at once.
 def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[FloatArray | None, float]:
     """The lean (2,) that some frames show, and the standard deviation of an unknown tilt (rad).
 
-    The median tilt of the frames with verticals if they are few, None if there are none.
+    If few frames have verticals, it is the median of their tilts, None if there are none; and if
+    they are at least half of all, an unknown tilt is as large as theirs.
     """
     _, verticals, outlines = _tilts_of(rows.rows for rows in frames)
     common = common_tilt_variance(camera)
@@ -57,7 +58,9 @@ def tilt_of_some(camera: Camera, frames: Iterable[FrameRows]) -> tuple[FloatArra
     usual_rad, known = usual_tilt(verticals, outlines), verticals.tilt[verticals.known]
     if not len(known):
         return None, usual_rad
-    return np.median(known, axis=0), max(usual_rad, math.sqrt(np.mean(known**2)))
+    if 2 * len(known) >= len(verticals.tilt):
+        usual_rad = max(usual_rad, math.sqrt(np.mean(known**2)))
+    return np.median(known, axis=0), usual_rad
 
 
 def lean_of_search(

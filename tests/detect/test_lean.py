@@ -21,11 +21,20 @@ from detect.cli import main
 from detect.lean import lean_of_image
 from detect.levelling import as_calibrated, level_discs
 from detect.projection import circle_on_floor, leaning_camera
+from detect.runs.level_run import tilt_of_some
+from detect.runs.plan import FrameRows
 from detect.settings import LEAST_FRAMES, CircleSettings
 from detect.settings_files import read_settings
 from detect.sources.opening import open_run
 from detect.tuning_page import TuningSession
-from redetect.landmarks import circle_arrays, read_frames, squared_mahalanobis
+from redetect.landmarks import (
+    FrameTilt,
+    circle_arrays,
+    format_no_tilt,
+    format_tilt,
+    read_frames,
+    squared_mahalanobis,
+)
 from tests.detect.commands import Captured
 from tests.detect.painted_floor import LIGHT, PaintedFloor
 
@@ -298,6 +307,22 @@ def test_frames_of_a_robot_on_rough_ground_are_searched_with_their_own_tilts(
     assert main(["circles", str(run), "--force"]) == 0
     seen = level_rows(run / "detected.circles")
     assert sum(map(len, seen)) < 0.9 * sum(map(len, found))
+
+
+def test_a_few_wrong_tilts_are_not_the_tilt_of_a_run(published_camera: Camera) -> None:
+    def rows(name: str, tilt_deg: float | None) -> FrameRows:
+        text = format_no_tilt(name, 0)
+        if tilt_deg is not None:
+            text = format_tilt(FrameTilt(name, math.radians(tilt_deg), 0.0, 1e-5, 0.0, 1e-5, 3))
+        return FrameRows(name, {"tilt": text})
+
+    strays = [rows(f"{k}", 7.0 if k < 2 else None) for k in range(32)]
+    assert np.degrees(tilt_of_some(published_camera, strays)[1]) < 0.5
+    together = [rows(f"{k}", 3.0) for k in range(3)]
+    lean, usual_rad = tilt_of_some(published_camera, together)
+    assert lean is not None
+    np.testing.assert_allclose(lean, np.radians([3.0, 0.0]), atol=1e-6)
+    assert np.degrees(usual_rad) == pytest.approx(3.0 / np.sqrt(2.0), rel=0.01)
 
 
 def test_a_slight_tilt_of_a_frame_is_no_lean() -> None:
