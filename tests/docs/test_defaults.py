@@ -56,7 +56,7 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
     ("docs/discs.md", r"the rim is traced in # directions", [DIRECTIONS]),
     ("docs/discs.md", r"at # directions times # pixels", [GLANCED, len(GLANCED_AT)]),
     ("docs/discs.md", r"the best # centres of either polarity", [_MOST_DOUBTFUL]),
-    ("docs/discs.md", r"or #° for fewer images than #", [USUAL_TILT_DEG, LEAST_FRAMES]),
+    ("docs/discs.md", r"at least #°. If fewer than # of them", [USUAL_TILT_DEG, LEAST_FRAMES]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),
     ("docs/markers.md", r"takes #, #, #, # and #", list(MARKERS.thresholds)),
     ("docs/camera.md", r"leave it open by more than #", [_ASPECT_SIGMA]),
