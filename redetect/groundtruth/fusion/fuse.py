@@ -20,7 +20,7 @@ from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas
+from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas, with_sag
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
@@ -59,6 +59,8 @@ _LARGEST_GAP_S = 2.0
 # Odometry that moves less than the first, while measured poses move more than the second, has
 # headings alone (m).
 _STANDS_M, _MOVES_M = 0.01, 1.0
+# Most measurements at the start that are dropped because most of those after them contradict them.
+_MOST_WRONG, _MOST_JUDGES = 5, 10
 _DEFAULT = FuseSettings()
 
 
@@ -151,6 +153,23 @@ class Rejected:
     squared_innovation: float  # Squared normalised innovation
 
 
+def wrong_start(problem: MovementProblem) -> list[Rejected]:
+    """The first measurements that most of those after them contradict.
+
+    The filter would start there, and reject the right ones.
+    """
+    wrong: list[Rejected] = []
+    noise, every = noise_of(problem.settings), np.arange(len(problem.streams))
+    for first in range(min(_MOST_WRONG + 1, len(every) - 1)):
+        found = problem.with_only(every >= first).innovations(noise)
+        judges = slice(1, _MOST_JUDGES + 1)
+        if np.mean(found.accepted[judges]) > 0.5:
+            return wrong
+        squared = float(np.median(found.squared[judges]))
+        wrong.append(Rejected(str(problem.streams[first]), float(problem.measured_s[first]), squared))
+    return []
+
+
 @dataclass(frozen=True)
 class OdometryErrors:
     """Odometry's errors estimated from the measurements."""
@@ -207,8 +226,13 @@ def fuse(
         repaired; if odometry has no distances.
     """
     covered = {name: with_jitter_covered(last_of_each_time(one)) for name, one in streams.items()}
-    streams = {name: stream for name, (stream, _) in covered.items()}
+    own = last_of_each_time(odometry)
+    streams = {name: with_sag(stream, own) for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, settings)
+    at_start = wrong_start(problem)
+    if at_start:
+        later = {n: one.only(one.times_s > at_start[-1].time_s) for n, one in streams.items()}
+        problem = movement_problem(odometry, later, settings)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
     if not len(inside):
@@ -254,7 +278,7 @@ def fuse(
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
-        rejected=tuple(Rejected(*row) for row in zip(*rejected)),
+        rejected=(*at_start, *(Rejected(*row) for row in zip(*rejected))),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
             name: int(np.count_nonzero(innovations.accepted & (problem.streams == name)))

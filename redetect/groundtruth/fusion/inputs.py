@@ -83,6 +83,29 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
     return shares[:, :4].copy(), shares[:, 4:].copy()
 
 
+def with_sag(poses: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
+    """Measured poses with the deviation of the path from odometry's arcs in their covariances.
+
+    Between two samples it is that of a parabola, as speeds before and after them differ.
+    `odometry` has two or more samples at distinct times; in its pauses nothing is added.
+    """
+    if poses.covariances is None or len(odometry) < 3:
+        return poses
+    passed = np.diff(odometry.times_s)
+    rates = log_motion(between(odometry.poses[:-1], odometry.poses[1:])) / passed[:, None]
+    changes = np.pad(np.square(np.diff(rates, axis=0)), ((1, 1), (0, 0)), mode="edge")
+    # Squares of the deviations in the middle of each arc: along the path, across it, of the turn.
+    middle = (0.125 * passed)[:, None] ** 2 * 0.5 * (changes[1:] + changes[:-1])
+    middle[_paused(odometry.times_s)] = 0.0
+    last = len(passed) - 1
+    at = np.clip(np.searchsorted(odometry.times_s, poses.times_s, side="right") - 1, 0, last)
+    share = np.clip((poses.times_s - odometry.times_s[at]) / passed[at], 0.0, 1.0)
+    added = np.square(4.0 * share * (1.0 - share))[:, None] * middle[at]
+    covariances = poses.covariances.copy()
+    np.einsum("kii->ki", covariances)[:] += added[:, [0, 0, 2]] + added[:, [1, 1, 1]] * [1, 1, 0]
+    return PlanarPoses(poses.times_s, poses.poses, covariances)
+
+
 def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[FloatArray, ...]:
     """Sums of steps from a margin before each to a margin after it, and their durations."""
     from_s = np.maximum(times_s[:-1] - margin_s, times_s[0])

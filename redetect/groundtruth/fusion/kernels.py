@@ -298,6 +298,7 @@ def filter_forward(
     m = 0
     rejections = 0
     deviance = 0.0
+    anywhere = POSE + np.sum(np.log(gating.restart_variances))
     for k in range(controls.shape[0]):
         restarted[k] = NO_RESTART
         cut = gating.cuts[k]
@@ -343,7 +344,7 @@ def filter_forward(
                 update(x, p, common, innovation, s_inverse, gain)
             else:
                 rejections += 1
-                deviance += gating.largest_squared + math.log(determinant)
+                deviance += anywhere
             m += 1
         if kept:
             store(filtered, filtered_covariance, k, x, p)

@@ -1,7 +1,6 @@
 """Errors of streams of poses: their jitter from sample to sample, and what all poses share.
 
-Jitter: differences of a high order cancel the motion, and their median is robust against single
-jumps. It is a lower bound of a stream's errors, since those that change slowly are not seen.
+Jitter: differences of a high order cancel the motion; those with gross errors do not count. It is a lower bound of a stream's errors, since those that change slowly are not seen.
 Errors that all poses share, such as those of the scanners' poses, do not average out. So streams
 are fused without them, and they are added to the fused path, which has the same error.
 """
@@ -12,10 +11,11 @@ from math import comb
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from redetect.array_types import FloatArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.files import JsonObject, PathLike
-from redetect.groundtruth.trajectories.streams import PlanarPoses
+from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
 
 # Median of the absolute value of a standard normal number.
 _MEDIAN_OF_NORMAL = 0.6745
@@ -26,6 +26,8 @@ _LEAST_RATE_HZ = 4.0
 _FEWEST = 50
 # Differences over longer gaps, in usual intervals, do not count.
 _LONGEST_INTERVALS = 1.5
+# A gross error is farther from the median of this number of poses than this many deviations.
+_NEIGHBOURS, _GROSS = 7, 6.0
 # Covariances are raised if the jitter exceeds their deviations by more than this factor.
 _BELIEVED = 1.5
 #: Its name in the file beside a stream.
@@ -58,12 +60,30 @@ def jitter_ratio(poses: PlanarPoses) -> float:
     counted = over <= _LONGEST_INTERVALS * _ORDER * usual
     if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
         return 0.0
+    variances = _variances(poses.covariances)
+    gross = _gross_errors(poses.continuous, np.sqrt(variances))
+    counted &= np.convolve(gross, np.ones(_ORDER + 1), "valid") == 0.0
+    if np.count_nonzero(counted) < _FEWEST:
+        return 0.0
     weights = np.array([comb(_ORDER, k) for k in range(_ORDER + 1)], dtype=np.float64)
-    variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
     expected = sum(w**2 * variances[k : k + count] for k, w in enumerate(weights))
     normalised = np.abs(np.diff(poses.continuous, _ORDER, axis=0))
-    normalised /= np.sqrt(np.maximum(expected, 1e-18))
+    normalised /= np.sqrt(expected)
     return float(np.max(np.median(normalised[counted], axis=0)) / _MEDIAN_OF_NORMAL)
+
+
+def _variances(covariances: FloatArray) -> FloatArray:
+    """(N, 3) variances, at least those of rounding."""
+    return np.maximum(np.diagonal(covariances, axis1=1, axis2=2), RAWSEEDS_ROUNDING)
+
+
+def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:
+    """(N,) mask of rows of numbers (N, 3) far from those beside them, in their own deviations and
+    in the stated ones (N, 3).
+    """
+    apart = np.abs(values - median_filter(values, (_NEIGHBOURS, 1), mode="nearest"))
+    usual = np.median(apart, axis=0) / _MEDIAN_OF_NORMAL
+    return np.asarray(np.any(apart > _GROSS * np.maximum(usual, sigmas), axis=1))
 
 
 def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
@@ -74,7 +94,9 @@ def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
     if factor <= _BELIEVED:
         return poses, 1.0
     assert poses.covariances is not None
-    return PlanarPoses(poses.times_s, poses.poses, factor**2 * poses.covariances), factor
+    covariances = poses.covariances.copy()
+    np.einsum("kii->ki", covariances)[:] = _variances(covariances)
+    return PlanarPoses(poses.times_s, poses.poses, factor**2 * covariances), factor
 
 
 def read_common_covariance(stream: PathLike) -> FloatArray:
