@@ -29,6 +29,8 @@ from redetect.messages import counted
 _CONFIDENCE = 1.959964
 #: Share of a stream's poses above which rejections are warned of.
 _MANY_REJECTED = 0.1
+#: Relative error of odometry's turns or distances that is no error of wheels any more.
+_NO_SCALE = 0.3
 
 
 def perform_sync(options: Sync) -> int:
@@ -111,7 +113,7 @@ def perform_fuse(options: Fuse) -> int:
         "left_out": left_out,
         stream_errors.COMMON: common.tolist(),
         "covariances_repaired": fusion.repaired,
-        "deviations_raised": fusion.raised,
+        "jitter_in_deviations": fusion.jitter,
         "slips_s": fusion.slips_s,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
@@ -160,7 +162,7 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
 
 def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
     """Say where odometry, measured poses and their covariances contradict each other."""
-    for name, factor in fusion.raised.items():
+    for name, factor in fusion.jitter.items():
         if factor > 1.0:
             warn(
                 f"the poses of {name} jitter {factor:.1f} times as much as their "
@@ -172,6 +174,15 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
             warn(
                 f"{rejected} of {count + rejected} poses of {name} contradict the others "
                 f"and {options.odometry}: the clock, or the poses, may be wrong"
+            )
+    for scale, moved, advice in (
+        (fusion.odometry.turn_scale, "turned", "are its angles radians, counter-clockwise?"),
+        (fusion.odometry.distance_scale, "moved", "are its positions metres?"),
+    ):
+        if abs(scale) > _NO_SCALE:
+            warn(
+                f"{options.odometry}: the robot {moved} {1.0 + scale:.2f} times as much as it "
+                f"says: {advice}"
             )
     if fusion.slips_s:
         warn(

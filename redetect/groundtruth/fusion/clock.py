@@ -61,7 +61,7 @@ class ClockStatus(StrEnum):
     OK = "ok"
     NO_TURNS = "no turns"  #: It cannot be synchronised: its numbers follow from the others
     JUMP = "jump"  #: Its two halves disagree, since a clock was set
-    AT_A_BOUND = "at a bound"  #: The optimum is at a limit of the search range
+    AT_A_BOUND = "at a bound"  #: The same, since the optimum is at a limit of the search range
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class ClockSegment:
     @property
     def is_determined(self) -> bool:
         """Whether its numbers are its own."""
-        return self.status != ClockStatus.NO_TURNS
+        return self.status not in (ClockStatus.NO_TURNS, ClockStatus.AT_A_BOUND)
 
 
 @dataclass(frozen=True)

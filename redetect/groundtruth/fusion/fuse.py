@@ -25,7 +25,7 @@ from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.fusion.slips import slipped_intervals
-from redetect.groundtruth.fusion.stream_errors import with_jitter_covered
+from redetect.groundtruth.fusion.stream_errors import with_jitter_covered, with_usable_covariances
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -165,8 +165,8 @@ def wrong_start(problem: MovementProblem) -> list[Rejected]:
         judges = slice(1, _MOST_JUDGES + 1)
         if np.mean(found.accepted[judges]) > 0.5:
             return wrong
-        squared = float(np.median(found.squared[judges]))
-        wrong.append(Rejected(str(problem.streams[first]), float(problem.measured_s[first]), squared))
+        squared, time_s = np.median(found.squared[judges]), problem.measured_s[first]
+        wrong.append(Rejected(str(problem.streams[first]), float(time_s), float(squared)))
     return []
 
 
@@ -199,7 +199,9 @@ class Fusion:
     odometry: OdometryErrors  # The estimated errors of odometry
     localisation: LocalisationErrors | None  # Errors of odometry treated as a localisation
     repaired: dict[str, int]  # Number of covariances that were not positive definite, by stream
-    raised: dict[str, float]  # Factor on deviations, by stream, since the poses jitter more
+    # Jitter of the poses in their stated deviations, by stream, 1 if these can be right. Those that
+    # are too small were raised; of those too large, odometry's noise was learned as if lowered.
+    jitter: dict[str, float]
     # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
     # wheels or a reset, and its pauses: the covariances do not rely on it there.
     slips_s: tuple[tuple[float, float], ...]
@@ -225,7 +227,8 @@ def fuse(
         first measurement and the last; if a stream has no covariances, or one of them cannot be
         repaired; if odometry has no distances.
     """
-    covered = {name: with_jitter_covered(last_of_each_time(one)) for name, one in streams.items()}
+    usable = {name: with_usable_covariances(name, one) for name, one in streams.items()}
+    covered = {name: with_jitter_covered(stream) for name, (stream, _) in usable.items()}
     own = last_of_each_time(odometry)
     streams = {name: with_sag(stream, own) for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, settings)
@@ -247,8 +250,12 @@ def fuse(
             "expected distances, too, not headings alone"
         )
     # Odometry's random errors, and its systematic errors as part of the state.
-    noise = maximum_likelihood_noise(problem) if settings.learn_noise else noise_of(settings)
-    inflation = variance_inflation(problem, noise) if settings.learn_noise else 1.0
+    noise, inflation = noise_of(settings), 1.0
+    if settings.learn_noise:
+        least = np.array([min(covered[name][1], 1.0) for name in problem.streams])
+        learn = problem.with_covariances(least[:, None, None] ** 2 * problem.measured.covariances)
+        noise = maximum_likelihood_noise(learn)
+        inflation = variance_inflation(learn, noise)
     smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
@@ -286,8 +293,8 @@ def fuse(
         },
         odometry=OdometryErrors(*np.concatenate(numbers).tolist()),
         localisation=localisation,
-        repaired=problem.repaired,
-        raised={name: factor for name, (_, factor) in covered.items()},
+        repaired={name: count for name, (_, count) in usable.items()},
+        jitter={name: jitter for name, (_, jitter) in covered.items()},
         slips_s=slipped_intervals(problem.times_s, slips),
         pauses_s=tuple(pause for pause in pauses if pause[1] > first and pause[0] < last),
     )

@@ -7,14 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.settings import FuseSettings
-from redetect.groundtruth.trajectories.streams import (
-    RAWSEEDS_ROUNDING,
-    PlanarPoses,
-    last_of_each_time,
-)
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.plane import between, log_motion
 
 #: Noise of a robot at rest, without which covariances would be singular.
@@ -136,22 +132,12 @@ def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArra
 
 def measured_poses(
     odometry: PlanarPoses, streams: Mapping[str, PlanarPoses]
-) -> tuple[PlanarPoses, NDArray[np.str_], dict[str, int]]:
-    """All measurements within the odometry's time, in order, with usable covariances.
-
-    Of several poses at one time in a stream, the last counts. Also returns each measurement's
-    stream (M,), and by stream the number of covariances that had to be increased.
-    """
+) -> tuple[PlanarPoses, NDArray[np.str_]]:
+    """All measurements within the odometry's time, in order, and the stream of each (M,)."""
     found = []
-    repaired = {}
-    for name, all_poses in streams.items():
-        stream = last_of_each_time(all_poses)
-        if stream.covariances is None:
-            raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
-        inside = stream.during(odometry.times_s[0], odometry.times_s[-1])
-        usable, repaired[name] = _usable(name, stream.covariances, np.flatnonzero(inside))
-        names = np.full(len(usable), name)
-        found.append((names, stream.times_s[inside], stream.poses[inside], usable))
+    for name, stream in streams.items():
+        inside = stream.only(stream.during(odometry.times_s[0], odometry.times_s[-1]))
+        found.append((np.full(len(inside), name), inside.times_s, inside.poses, inside.covariances))
     names, times, poses, covariances = (np.concatenate(parts) for parts in zip(*found))
     if not len(names):
         raise GroundTruthError(
@@ -159,22 +145,4 @@ def measured_poses(
             f"({odometry.times_s[0]:.3f} s to {odometry.times_s[-1]:.3f} s)"
         )
     order = np.argsort(times, kind="stable")
-    return PlanarPoses(times[order], poses[order], covariances[order]), names[order], repaired
-
-
-def _usable(name: str, covariances: FloatArray, rows: IntArray) -> tuple[FloatArray, int]:
-    """Covariances of rows made symmetric, and increased if rounding made them singular."""
-    symmetric = 0.5 * (covariances[rows] + np.swapaxes(covariances[rows], 1, 2))
-    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
-    worst = float(smallest.min(initial=0.0))
-    # Three entries of a row may each be off by the rounding.
-    if worst < -3.0 * RAWSEEDS_ROUNDING:
-        at = int(np.argmin(smallest))
-        raise GroundTruthError(
-            f"{name}: pose {rows[at] + 1} has a covariance with eigenvalue {worst:.3g}: expected "
-            "none below what rounding to six decimals makes of 0"
-        )
-    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
-    added = RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])
-    symmetric[weak] += np.eye(3) * added[:, None, None]
-    return symmetric, int(np.count_nonzero(weak))
+    return PlanarPoses(times[order], poses[order], covariances[order]), names[order]

@@ -230,7 +230,9 @@ class Innovations(NamedTuple):
     squared: FloatArray  # (M,): squared normalised innovations
     accepted: BoolArray  # (M,)
     restarted: NDArray[np.int8]  # (N,): whether the filter restarted at a node, and why
-    deviance: float  # Minus twice the log-likelihood of the accepted innovations
+    #: Minus twice the log-likelihood, in which gross errors may be anywhere; so whether there are
+    #: any does not change what it says of odometry's noise.
+    deviance: float
 
 
 def empty_history(nodes: int) -> FilterHistory:
@@ -298,7 +300,6 @@ def filter_forward(
     m = 0
     rejections = 0
     deviance = 0.0
-    anywhere = POSE + np.sum(np.log(gating.restart_variances))
     for k in range(controls.shape[0]):
         restarted[k] = NO_RESTART
         cut = gating.cuts[k]
@@ -337,14 +338,16 @@ def filter_forward(
                     s[i, j] = p[i, j] + measured.covariances[m, i, j]
             squared, determinant = squared_innovation(innovation, s, s_inverse)
             squared_innovations[m] = squared
+            anywhere = float(POSE)
+            for i in range(POSE):
+                anywhere += math.log(gating.restart_variances[i] + measured.covariances[m, i, i])
+            deviance += min(squared + math.log(determinant), anywhere)
             accepted[m] = squared <= gating.largest_squared
             if accepted[m]:
                 rejections = 0
-                deviance += squared + math.log(determinant)
                 update(x, p, common, innovation, s_inverse, gain)
             else:
                 rejections += 1
-                deviance += anywhere
             m += 1
         if kept:
             store(filtered, filtered_covariance, k, x, p)

@@ -115,7 +115,6 @@ class MovementProblem:
     unseen: FloatArray
     measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
-    repaired: dict[str, int]  # Number of covariances that had to be increased, by stream
     settings: FuseSettings
 
     @property
@@ -175,6 +174,10 @@ class MovementProblem:
         nodes, poses, covariances = self.measured
         measured = kernels.MeasuredPoses(nodes[kept], poses[kept], covariances[kept])
         return replace(self, measured=measured, streams=self.streams[kept])
+
+    def with_covariances(self, covariances: FloatArray) -> MovementProblem:
+        """The problem with other covariances of its measurements."""
+        return replace(self, measured=self.measured._replace(covariances=covariances))
 
     def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States (N, 6) and covariances (N, 6, 6) of the forward filter alone, with the variances
@@ -301,7 +304,7 @@ def movement_problem(
     """Combine odometry and measured poses with covariances on common nodes, from the first
     measurement within the odometry's time to the last.
     """
-    found, names, repaired = inputs.measured_poses(odometry, streams)
+    found, names = inputs.measured_poses(odometry, streams)
     assert found.covariances is not None
     odometry = last_of_each_time(odometry)
     inside = odometry.times_s[odometry.during(found.times_s[0], found.times_s[-1])]
@@ -314,6 +317,5 @@ def movement_problem(
         unseen=unseen,
         measured=kernels.MeasuredPoses(nodes, found.poses, found.covariances),
         streams=names,
-        repaired=repaired,
         settings=settings,
     )

@@ -1,8 +1,9 @@
 """Errors of streams of poses: their jitter from sample to sample, and what all poses share.
 
-Jitter: differences of a high order cancel the motion; those with gross errors do not count. It is a lower bound of a stream's errors, since those that change slowly are not seen.
-Errors that all poses share, such as those of the scanners' poses, do not average out. So streams
-are fused without them, and they are added to the fused path, which has the same error.
+Jitter: differences of a high order cancel the motion; those with gross errors do not count. It is a
+lower bound of a stream's errors, since those that change slowly are not seen. Errors that all poses
+share, such as those of the scanners' poses, do not average out. So streams are fused without them,
+and they are added to the fused path, which has the same error.
 """
 
 from __future__ import annotations
@@ -14,8 +15,13 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from redetect.array_types import BoolArray, FloatArray
+from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike
-from redetect.groundtruth.trajectories.streams import RAWSEEDS_ROUNDING, PlanarPoses
+from redetect.groundtruth.trajectories.streams import (
+    RAWSEEDS_ROUNDING,
+    PlanarPoses,
+    last_of_each_time,
+)
 
 # Median of the absolute value of a standard normal number.
 _MEDIAN_OF_NORMAL = 0.6745
@@ -60,7 +66,7 @@ def jitter_ratio(poses: PlanarPoses) -> float:
     counted = over <= _LONGEST_INTERVALS * _ORDER * usual
     if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
         return 0.0
-    variances = _variances(poses.covariances)
+    variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
     gross = _gross_errors(poses.continuous, np.sqrt(variances))
     counted &= np.convolve(gross, np.ones(_ORDER + 1), "valid") == 0.0
     if np.count_nonzero(counted) < _FEWEST:
@@ -72,11 +78,6 @@ def jitter_ratio(poses: PlanarPoses) -> float:
     return float(np.max(np.median(normalised[counted], axis=0)) / _MEDIAN_OF_NORMAL)
 
 
-def _variances(covariances: FloatArray) -> FloatArray:
-    """(N, 3) variances, at least those of rounding."""
-    return np.maximum(np.diagonal(covariances, axis1=1, axis2=2), RAWSEEDS_ROUNDING)
-
-
 def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:
     """(N,) mask of rows of numbers (N, 3) far from those beside them, in their own deviations and
     in the stated ones (N, 3).
@@ -86,17 +87,40 @@ def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:
     return np.asarray(np.any(apart > _GROSS * np.maximum(usual, sigmas), axis=1))
 
 
+def with_usable_covariances(name: str, poses: PlanarPoses) -> tuple[PlanarPoses, int]:
+    """Poses with symmetric covariances, increased where rounding made them singular, and of how
+    many; of several poses at one time, the last.
+
+    Raises `GroundTruthError` if they have none, or some that rounding does not explain; `name` is
+    that of the stream.
+    """
+    poses = last_of_each_time(poses)
+    if poses.covariances is None:
+        raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
+    symmetric = 0.5 * (poses.covariances + np.swapaxes(poses.covariances, 1, 2))
+    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
+    worst = float(smallest.min(initial=0.0))
+    # Three entries of a row may each be off by the rounding.
+    if worst < -3.0 * RAWSEEDS_ROUNDING:
+        raise GroundTruthError(
+            f"{name}: pose {int(np.argmin(smallest)) + 1} has a covariance with eigenvalue "
+            f"{worst:.3g}: expected none below what rounding to six decimals makes of 0"
+        )
+    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
+    added = RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])
+    symmetric[weak] += np.eye(3) * added[:, None, None]
+    return PlanarPoses(poses.times_s, poses.poses, symmetric), int(np.count_nonzero(weak))
+
+
 def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
-    """Poses with covariances raised to their jitter, and the factor of the deviations: the same
-    poses, and 1, if their covariances can be right.
+    """Poses with covariances raised to their jitter, and this in stated deviations, 1 if these can
+    be right. Covariances are not lowered, since errors that change slowly do not jitter.
     """
     factor = jitter_ratio(poses)
     if factor <= _BELIEVED:
-        return poses, 1.0
+        return poses, factor if 0.0 < factor < 1.0 / _BELIEVED else 1.0
     assert poses.covariances is not None
-    covariances = poses.covariances.copy()
-    np.einsum("kii->ki", covariances)[:] = _variances(covariances)
-    return PlanarPoses(poses.times_s, poses.poses, factor**2 * covariances), factor
+    return PlanarPoses(poses.times_s, poses.poses, factor**2 * poses.covariances), factor
 
 
 def read_common_covariance(stream: PathLike) -> FloatArray:

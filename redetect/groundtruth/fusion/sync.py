@@ -84,8 +84,9 @@ def synchronise(
     Returns
     -------
     tuple of ClockSegment
-        In order. Segments without enough turns have the status `no turns`, infinite deviations and
-        an offset interpolated from the others (0 if no segment determines one). A segment in which
+        In order. Segments without enough turns have the status `no turns`, those whose best clock
+        is at a bound the status `at a bound`; both have infinite deviations and an offset
+        interpolated from the others (0 if no segment determines one). A segment in which
         the clock was set is split there: its parts have the status `jump`. If one straight line
         through the session agrees with all segments, they get that line's values.
 
@@ -100,7 +101,9 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
-    groundtruth, _ = stream_errors.with_jitter_covered(groundtruth)
+    if groundtruth.covariances is not None:
+        groundtruth, _ = stream_errors.with_usable_covariances("ground truth", groundtruth)
+        groundtruth, _ = stream_errors.with_jitter_covered(groundtruth)
     slices = segments_between_gaps(groundtruth.times_s, settings.segment_gap_s)
     parts = [groundtruth.only(part) for part in slices]
     search = OffsetSearch(_smoothed(odometry), parts, settings.largest_offset_s)
@@ -169,7 +172,7 @@ def _segment(
     jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
     best = _fit_of_segment(own, jittered, start_s, bounds, measured.covariances is not None)
     if best is None:
-        return [_undetermined(segment, turned, "turns too little to determine the offset")]
+        return [_undetermined(segment, turned, "its turns do not determine the offset")]
     # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, bounds) if jumps_left > 0 else None
     if place is not None:
@@ -182,7 +185,12 @@ def _segment(
     offset_s, drift = best.clock.tolist()
     times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
     angles = measured.poses[:, 2] - np.interp(times_s, own.times_s, own.continuous[:, 2])
-    at_bound = np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest))
+    if np.any(np.abs(best.clock) > _AT_A_BOUND * np.array(bounds.largest)):
+        note = (
+            f"the best offset ({offset_s:+.2f} s beside the expected one) or drift ({drift:+.4f}) "
+            "is at a bound of the search (--largest-offset-s, --largest-drift)"
+        )
+        return [replace(_undetermined(segment, turned, note), status=ClockStatus.AT_A_BOUND)]
     return [
         ClockSegment(
             from_s=float(segment.times_s[0]),
@@ -194,7 +202,6 @@ def _segment(
             sigma_offset_s=float(best.sigmas[0]),
             sigma_rate=float(best.sigmas[1]),
             turned_rad=turned,
-            status=ClockStatus.AT_A_BOUND if at_bound else ClockStatus.OK,
         )
     ]
 

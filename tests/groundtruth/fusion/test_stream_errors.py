@@ -47,7 +47,7 @@ def test_a_fusion_with_covariances_three_times_too_small_is_honest() -> None:
     assert laser.covariances is not None
     laser = PlanarPoses(laser.times_s, laser.poses, laser.covariances / 9.0)
     fusion = fuse(odometry, {"laser": laser})
-    assert fusion.raised["laser"] == pytest.approx(3.0, rel=0.15)
+    assert fusion.jitter["laser"] == pytest.approx(3.0, rel=0.15)
     assert 0.7 < float(np.mean(normalised_error(fusion.poses, truth))) / 3.0 < 1.5
 
 

@@ -50,6 +50,15 @@ def test_the_clock_comes_back_from_anywhere_within_the_bounds(offset: float, dri
     assert abs(found.offset_s - expected) < 4.0 * found.sigma_offset_s
 
 
+def test_a_clock_at_a_bound_is_no_clock() -> None:
+    odometry, truth = simulate(Clocks(offset_s=0.8, drift=0.0), seed=3)
+    (found,) = synchronise(odometry, truth, SyncSettings(largest_offset_s=0.5))
+    assert found.status == ClockStatus.AT_A_BOUND
+    assert not found.is_determined
+    assert "is at a bound" in found.note
+    assert math.isinf(found.sigma_offset_s)
+
+
 def test_slow_ground_truth_is_met_by_samples_not_by_windows() -> None:
     clocks = Clocks(truth_rate_hz=5.0, truth_sigma_rad=0.005)
     (found,) = synchronise(*simulate(clocks, seed=4))
