@@ -38,8 +38,7 @@ from camera.uncertainty import projection_sigma
 from redetect import __version__
 from redetect.array_types import GreyImage
 from redetect.json_text import json_text
-from redetect.storage import demand_place, demand_writable, write_bytes
-from redetect.storage.image_headers import IMAGE_SUFFIXES
+from redetect.storage import IMAGE_SUFFIXES, demand_place, demand_writable, write_bytes
 from redetect.storage.images import opened_video, read_grey
 
 #: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.

@@ -18,8 +18,8 @@ from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, sti
 from redetect.landmarks import read_steps
 from redetect.landmarks.frames import read_times
 from redetect.messages import excerpt
+from redetect.storage import IMAGE_SUFFIXES
 from redetect.storage.bounded import leads_out, link_out
-from redetect.storage.image_headers import IMAGE_SUFFIXES
 
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
 WILDCARDS = frozenset("*?[")

@@ -29,8 +29,7 @@ from detect.errors import DetectError, FrameError
 from redetect.array_types import GreyImage
 from redetect.landmarks import Step
 from redetect.storage.bounded import read_bounded
-from redetect.storage.image_headers import MOST_PIXELS, claimed_size
-from redetect.storage.images import decoded_image
+from redetect.storage.images import MOST_PIXELS, claimed_size, decoded_image
 
 if TYPE_CHECKING:
     from detect.sources.poses import PoseStream

@@ -15,7 +15,7 @@ from detect.sources.interface import Frames, ImageRun, Run, SomeFrames, Source, 
 from detect.sources.poses import FramesAlongPoses, PoseStream, tick_poses, tum_poses, velocity_poses
 from detect.sources.video import LiveCamera, VideoFile
 from redetect.landmarks import LandmarkError, read_steps
-from redetect.storage.image_headers import IMAGE_SUFFIXES
+from redetect.storage import IMAGE_SUFFIXES
 
 #: Extensions of bags that are a single file.
 _BAG_SUFFIXES = frozenset({".bag", ".mcap", ".db3"})

@@ -17,7 +17,7 @@ from redetect.landmarks.records import numbers_of_step
 from redetect.slam.errors import SlamError
 from redetect.slam.models import OdometryNoise, common_tilt_jacobian
 from redetect.slam.options import RunFlags
-from redetect.storage.image_headers import IMAGE_SUFFIXES
+from redetect.storage import IMAGE_SUFFIXES
 
 UNKNOWN_ID = -1
 

@@ -10,3 +10,6 @@ from redetect.storage.parts import demand_writable as demand_writable
 from redetect.storage.parts import write_bytes as write_bytes
 from redetect.storage.parts import write_text as write_text
 from redetect.storage.parts import write_whole as write_whole
+
+#: Suffixes of the image files that are read (`redetect.storage.images`).
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".pgm", ".ppm", ".bmp", ".tif", ".tiff")

@@ -18,8 +18,7 @@ from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
-from redetect.storage.image_headers import without_orientation
-from redetect.storage.images import read_grey
+from redetect.storage.images import read_grey, without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 ON_ITS_HEAD, PORTRAIT = 3, 6

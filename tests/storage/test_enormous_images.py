@@ -16,8 +16,7 @@ from detect.errors import FrameError
 from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, find_boards
-from redetect.storage.image_headers import MOST_PIXELS, claimed_size
-from redetect.storage.images import read_grey
+from redetect.storage.images import MOST_PIXELS, claimed_size, read_grey
 from tests.detect.runs.claimed_images import SIDE, jpeg, png
 
 

@@ -25,8 +25,7 @@ from lut import build_vertical_table
 from lut.cache import cached_vertical_table
 from redetect.landmarks import LandmarkError
 from redetect.landmarks.files import read_head
-from redetect.storage.image_headers import claimed_size
-from redetect.storage.images import read_grey
+from redetect.storage.images import claimed_size, read_grey
 from redetect.storage.parts import left_part
 from tools.fuzz.reader import CAMERA_TEXT, NPZ_WORDS, NUMBERS, Reader, npz
 

@@ -15,7 +15,7 @@ from camera import Camera
 from detect.errors import FrameError
 from detect.sources.interface import RunFrame, bounded_content, decode_gray, read_image
 from redetect.landmarks import Step
-from redetect.storage.image_headers import MOST_PIXELS, claimed_size
+from redetect.storage.images import MOST_PIXELS, claimed_size
 from tests.detect.commands import output_of
 from tests.detect.runs.claimed_images import SIDE, TEXTURE, bmp, jpeg, png, pnm, tiff
 
