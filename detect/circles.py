@@ -13,8 +13,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from camera import Camera
@@ -30,7 +30,6 @@ from detect.discs.candidates import (
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import Fate, JudgedCandidates, judge
-from detect.discs.octaves import octaves_of
 from detect.discs.placing import place_discs
 from detect.discs.positions import pixel_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of, least_first_quality
@@ -48,6 +47,7 @@ from lut import (
     cached_vote_table,
 )
 from lut.outlines import fingerprint, floor_positions
+from lut.votes import largest_disc_px
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.tables import ByContent
 
@@ -61,6 +61,8 @@ _NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
 _EDGE_NOISE = 0.4  #: The same in noise deviations, as a share of `noise_floor`.
 _LEAST_STEP = 5.0  #: Lowest step at a rim, grey levels.
+#: Factors by which images may be reduced, and the smallest side of such an image.
+_FACTORS, _SMALLEST_SIDE_PX = (2, 4, 8, 16, 32), 16
 
 
 #: A camera in the form that kernels take.
@@ -136,7 +138,7 @@ def _by_rims(
     image, camera, table, left = within_margins(image, camera, table, settings)
     searched = searched_images(image, camera, table, settings)
     discs, log_odds = judged_discs(searched, settings)
-    scene = searched[0].scene
+    scene, _ = searched[0]
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
@@ -177,22 +179,49 @@ def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[C
     return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
-class Searched(NamedTuple):
-    """An image with the table of the discs that are searched in it."""
-
-    scene: Scene
-    table: VoteTable
-
-
 def searched_images(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
-) -> list[Searched]:
-    """The image, then reduced ones for large discs; parameters as for `detect_circles`."""
-    searched = [Searched(scene_of(image, camera, table, settings), table)]
-    for octave in octaves_of(camera, vote_shape(settings)):
-        scene = scene_of(octave.reduced(image), octave.camera, octave.table, settings)
-        searched.append(Searched(scene, octave.table))
+) -> list[tuple[Scene, VoteTable]]:
+    """The image, then reduced ones for large discs; parameters as for `detect_circles`.
+
+    With each is the table of the discs that are searched in it.
+    """
+    searched = [(scene_of(image, camera, table, settings), table)]
+    for factor, smaller, own in _octaves(camera, vote_shape(settings)):
+        # Means of squares of pixels.
+        cut = image[: factor * smaller.height, : factor * smaller.width]
+        size = smaller.width, smaller.height
+        reduced = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
+        searched.append((scene_of(reduced, smaller, own, settings), own))
     return searched
+
+
+@lru_cache(maxsize=16)
+def _octaves(camera: Camera, shape: VoteShape) -> tuple[tuple[int, Camera, VoteTable], ...]:
+    """Factors by which images are reduced, with their camera and the table of their discs.
+
+    In a large disc's surroundings, the grains of a carpet have as many edges as the disc, and vote
+    for centres as it does; and the networks know no examples of such sizes. Halved until the disc
+    has a radius of 10 to 20 pixels, an image shows the means of the grains.
+    """
+    too_large = largest_disc_px(camera, shape) / shape.largest_px
+    most = min(2.0 * too_large, min(camera.width, camera.height) / _SMALLEST_SIDE_PX)
+    octaves = []
+    for factor in (factor for factor in _FACTORS if factor < most):
+        smaller = replace(
+            camera, width=camera.width // factor, height=camera.height // factor,
+            scale_x=camera.scale_x / factor, scale_y=camera.scale_y / factor,
+            offset_x=(camera.offset_x + 0.5) / factor - 0.5,
+            offset_y=(camera.offset_y + 0.5) / factor - 0.5,
+        )  # fmt: skip
+        larger = replace(
+            shape,
+            border_px=shape.border_px // factor,
+            far_limit_m_per_px=factor * shape.far_limit_m_per_px,
+            smallest_px=0.5 * shape.largest_px,
+        )
+        octaves.append((factor, smaller, build_vote_table(smaller, larger)))
+    return tuple(octaves)
 
 
 def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings) -> Scene:
@@ -205,7 +234,7 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 
 def judged_discs(
-    searched: Sequence[Searched], settings: CircleSettings
+    searched: Sequence[tuple[Scene, VoteTable]], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
     _, judgement = judged_candidates(searched, settings)
@@ -215,11 +244,11 @@ def judged_discs(
 
 
 def judged_candidates(
-    searched: Sequence[Searched], settings: CircleSettings
+    searched: Sequence[tuple[Scene, VoteTable]], settings: CircleSettings
 ) -> tuple[FloatArray, JudgedCandidates]:
     """(N,) scores of all candidates, and their classification."""
     candidates = [candidates_of(*each, settings) for each in searched]
-    found = [judged(each.scene, settings, own) for each, own in zip(searched, candidates)]
+    found = [judged(scene, settings, own) for (scene, _), own in zip(searched, candidates)]
     return (
         np.concatenate([each.score for each in candidates]),
         JudgedCandidates._make(map(np.concatenate, zip(*found))),

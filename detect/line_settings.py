@@ -129,7 +129,7 @@ class LineSettings:
     #: Images with a median sharpness of edges below this are processed again with a wider filter.
     blurred_sharpness: Share = 0.62
     #: Factors on the filter's widths, of which one is chosen by the blur (see
-    #: `detect.verticals.blur`); none: never.
+    #: `detect.lines`); none: never.
     blurred_widths: Annotated[tuple[float, ...], _WIDTH] = (1.5, 2.0, 3.0, 4.0, 6.0)
     #: Bearings compensated for the tilt, or with the sign of the data set's own rows.
     alpha: BearingConvention = "level"

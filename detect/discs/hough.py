@@ -66,24 +66,15 @@ def hough_candidates(
     for s in range(len(signs)):
         place, score = _peaks(votes[s], table)
         order = np.argsort(-score, kind="mergesort")
-        order = order[: max(_MOST_COMPARED, _clear(score))]
+        order = order[: max(_MOST_COMPARED, np.sum(score >= _CLEAR_SCORE))]
         best = suppress_close(place, order, _APART * radius)
-        for i in best[: max(_MOST_DOUBTFUL, _clear(score[best]))]:
+        for i in best[: max(_MOST_DOUBTFUL, np.sum(score[best] >= _CLEAR_SCORE))]:
             for k in range(2):
                 turned = place[i, 0] * table.turn[0, k] + place[i, 1] * table.turn[1, k]
                 floor_xy[n, k] = turned + table.foot[k]
             height[n], sign_of[n] = score[i], signs[s]
             n += 1
     return HoughCandidates(floor_xy[:n].copy(), height[:n].copy(), sign_of[:n].copy())
-
-
-@kernel()
-def _clear(score: FloatArray) -> int:
-    """Number of clear candidates."""
-    count = 0
-    for value in score:
-        count += value >= _CLEAR_SCORE
-    return count
 
 
 class _Edges(NamedTuple):

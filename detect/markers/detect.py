@@ -172,9 +172,12 @@ def detect_markers(
     hulls = picture.straighten(np.concatenate([np.empty((0, 2)), *(r.hull for r in regions)]))
     ends = np.cumsum([len(region.hull) for region in regions])
     for region, hull in zip(regions, np.split(hulls, ends)):
-        rough = _rough_quadrangle(hull, settings)
-        if isinstance(rough, str):
-            rejected[rough] += 1
+        rough = geometry.rough_corners(hull)
+        if rough is None or not geometry.is_convex(rough):
+            rejected[geometry.NOT_FOUR_CORNERS] += 1
+            continue
+        if geometry.signed_area(rough) < settings.least_square * cv2.contourArea(hull.astype("f4")):
+            rejected[geometry.NO_QUADRANGLE] += 1
             continue
         outline = picture.bend(rough)
         if markers and geometry.covered(rough, np.array([marker.corners for marker in markers])):
@@ -205,17 +208,6 @@ def detect_markers(
         candidates=tuple(candidates),
         rejected=+rejected,
     )
-
-
-def _rough_quadrangle(hull: FloatArray, settings: MarkerSettings) -> FloatArray | str:
-    """Rough corners of a region from its straight hull, or the reason for rejection."""
-    corners = geometry.rough_corners(hull)
-    if corners is None or not geometry.is_convex(corners):
-        return geometry.NOT_FOUR_CORNERS
-    area = cv2.contourArea(hull.astype(np.float32))
-    if geometry.signed_area(corners) < settings.least_square * area:
-        return geometry.NO_QUADRANGLE
-    return corners
 
 
 def _marker_at(

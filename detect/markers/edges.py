@@ -66,31 +66,19 @@ def refine_quadrangle(
     of the rough ones. Three or more parts per edge give the covariance from the residuals of the
     steps. Returns the reason for rejection if there are no edges.
     """
-    found = _refined(picture, rough, border, capture_px, settings, parts, seam=False)
-    if isinstance(found, str) and parts == 2:  # White may be a mere seam.
-        again = _refined(picture, rough, border, capture_px, settings, parts, seam=True)
-        return found if isinstance(again, str) else again
-    return found
-
-
-def _refined(
-    picture: Picture,
-    rough: FloatArray,
-    border: float,
-    capture_px: float,
-    settings: MarkerSettings,
-    parts: int,
-    *,
-    seam: bool,
-) -> RefinedQuadrangle | str:
-    """The edges within `capture_px` of a rough quadrangle's, or the reason for rejection."""
-    found = _edges_near(picture, rough, border, capture_px, settings, parts, seam)
-    if not isinstance(found, str):
-        reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
-        found = _edges_near(picture, found.corners, border, reach, settings, parts, seam)
-    if isinstance(found, str) or np.abs(found.corners - rough).max() <= _LARGEST_MOVE * capture_px:
-        return found
-    return NO_EDGE
+    reasons = []
+    for seam in (False, True)[: 2 if parts == 2 else 1]:  # White may be a mere seam.
+        found = _edges_near(picture, rough, border, capture_px, settings, parts, seam)
+        if not isinstance(found, str):
+            reach = max(_REACH_BLURS * found.blur_px + _REACH_PX, _LEAST_REACH_PX)
+            found = _edges_near(picture, found.corners, border, reach, settings, parts, seam)
+        if isinstance(found, str):
+            reasons.append(found)
+        elif np.abs(found.corners - rough).max() > _LARGEST_MOVE * capture_px:
+            reasons.append(NO_EDGE)
+        else:
+            return found
+    return reasons[0]
 
 
 def _edges_near(

@@ -106,14 +106,11 @@ def _steps_of_folder(folder: Path) -> Path | None:
     for path in (folder / f"{folder.resolve().name}.txt", folder / "map.circles"):
         if path.is_file():
             return path
-    found = [path for path in sorted(folder.glob("*.txt")) if _has_steps(path)]
+    found = []
+    for path in sorted(folder.glob("*.txt")):
+        with suppress(LandmarkError, OSError):
+            found += [path] if next(read_steps(path), None) else []
     return found[0] if len(found) == 1 else None
-
-
-def _has_steps(path: Path) -> bool:
-    with suppress(LandmarkError, OSError):
-        return next(read_steps(path), None) is not None
-    return False
 
 
 def demand_recording(name: Path) -> None:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from detect.line_settings import DEFAULT, PUBLISHED
-from detect.lines import detect_lines
-from detect.verticals.blur import blur_of_sharpness, median_sharpness, widened, width_for
+from detect.lines import blur_of_sharpness, detect_lines, median_sharpness, widened, width_for
 from detect.verticals.refinement import LineFits
 from lut.verticals import build_vertical_table
 from tests.detect.line_scene import Edge, pinhole, render, tilted
