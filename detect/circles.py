@@ -31,8 +31,8 @@ from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import Fate, JudgedCandidates, judge
 from detect.discs.placing import place_discs
-from detect.discs.positions import pixel_positions, refined_covariances
-from detect.discs.quality import Limits, centres_of, least_first_quality
+from detect.discs.positions import published_positions, refined_covariances
+from detect.discs.quality import Limits, centres_of
 from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
 from detect.grey_values import blank_margins, estimate_noise, plain_image, steep_gradient
@@ -295,9 +295,8 @@ def _by_quality(
     if settings.noise_floor > 0.0:
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
-    least_first = least_first_quality(settings.threshold, settings.samples)
     least = math.nextafter(settings.threshold, 1.0)
-    limits = Limits(least, least_first, weakest, _SIGNS[settings.polarity])
+    limits = Limits(least, weakest, _SIGNS[settings.polarity])
     pixels, quality, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
         qualities = np.zeros(image.shape)
@@ -306,7 +305,8 @@ def _by_quality(
         pixels, quality = pixels[keep], quality[keep]
     keep = suppress_published(pixels, quality, table.floor_xy, settings.separation_m)
     pixels, quality = pixels[keep], quality[keep]
-    floor_xy, covariance = published_positions(camera, pixels)
+    numbers, positions = published_camera_numbers(camera), floor_positions(camera)
+    floor_xy, covariance = published_positions(numbers, positions, pixels)
     return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
 
 
@@ -331,16 +331,6 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
         least_pairs=settings.least_pairs, apart_px=settings.apart_px,
         stride_m=settings.stride * (outer - inner),
     )  # fmt: skip
-
-
-def published_positions(camera: Camera, pixels: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Floor positions of (N, 2) pixels (u, v), computed as in the data set.
-
-    Returns (N, 2) positions in the robot frame, metres, NaN if a pixel does not see the floor, and
-    (N, 2, 2) covariances, square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of
-    the position (`Camera.floor_jacobian_published`).
-    """
-    return pixel_positions(published_camera_numbers(camera), floor_positions(camera), pixels)
 
 
 def refined_covariance(

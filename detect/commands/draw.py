@@ -13,13 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from detect.drawing import demand_pictures, picture_name
 from detect.drawing.frame import draw_candidates, draw_rows, draw_tracks, png_of, processed
 from detect.errors import DetectError, FrameError
 from detect.options import Draw
 from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
+from detect.sources.image_files import demand_pictures, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, SomeFrames, read_image
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from detect.drawing import demand_pictures
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
 from detect.row_files import KINDS, RunRows
@@ -25,6 +24,7 @@ from detect.runs.plan import (
 from detect.runs.stream import detect_run
 from detect.runs.workers import Workers, cluster_workers, default_jobs, local_workers
 from detect.settings import CircleSettings
+from detect.sources.image_files import demand_pictures
 from detect.sources.interface import ImageRun, Run
 from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures

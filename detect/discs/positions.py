@@ -39,12 +39,14 @@ def _add_pixels(
 
 
 @kernel()
-def pixel_positions(
+def published_positions(
     camera_numbers: FloatArray, floor_xy: FloatArray, pixels: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Floor positions (N, 2) of (N, 2) pixels (u, v), and the published (N, 2, 2) covariances.
+    """Floor positions (N, 2) of (N, 2) pixels (u, v), and their covariances, as in the data set.
 
-    `camera_numbers` as in `camera.kernels`; `floor_xy` (H, W, 2): floor position of each pixel.
+    These are (N, 2, 2), square metres: (0.04 m)^2 I + 2 px^2 J J^T, where J is the Jacobian of the
+    position (`Camera.floor_jacobian_published`). `camera_numbers` as in `camera.kernels`;
+    `floor_xy` (H, W, 2): floor position of each pixel, NaN if it does not see the floor.
     """
     position, covariance = np.empty((len(pixels), 2)), np.zeros((len(pixels), 2, 2))
     for k in range(len(pixels)):

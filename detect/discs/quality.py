@@ -41,7 +41,6 @@ class Limits(NamedTuple):
     """Limits of the centres that are found."""
 
     quality: float  # minimum; 0 itself is excluded
-    first_quality: float = 0.0  # minimum in the first samples
     contrast: float = 0.0  # has to be exceeded, grey levels, by its absolute value
     sign: int = 0  # 1 for centres lighter than their surroundings, -1 for darker ones, 0 for both
 
@@ -52,11 +51,6 @@ class Centres(NamedTuple):
     pixels: IntArray  # (N, 2) pixels (u, v)
     quality: FloatArray  # (N,)
     contrast: Float32Array  # (N,) mean of the inner outline minus that of the outer, grey levels
-
-
-def least_first_quality(quality: float, samples: int) -> float:
-    """Lower bound of the quality of the first samples if all samples have `quality`."""
-    return 1.0 - (1.0 - quality) * samples / _FIRST
 
 
 @kernel(forceinline=True)
@@ -86,10 +80,11 @@ def _quality_of(
 def _find_centres(
     grey: ByteArray, pixels: NDArray[np.int32], samples: NDArray[np.uint32], limits: Limits
 ) -> Centres:
-    least_first = (1.0 - _ROUNDING) * limits.first_quality
     found_at = np.empty((len(samples), 2), np.int64)
     quality, contrast = np.empty(len(samples)), np.empty(len(samples), np.float32)
     count, found = samples.shape[1], 0
+    # Lower bound of the quality of the first samples.
+    least_first = (1.0 - _ROUNDING) * (1.0 - (1.0 - limits.quality) * count / _FIRST)
     for i in range(len(samples)):
         if count > _FIRST:
             of_first, _, inside = _quality_of(grey, samples, i, _FIRST)

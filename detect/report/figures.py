@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from io import BytesIO
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,15 +38,6 @@ _CORNERS = 32  #: Their number of points.
 _FARTHEST_M = 1e12
 #: Variance on the floor above which discs of different frames are not paired.
 _VAGUE_M2 = 0.05
-
-
-class Repeatability(NamedTuple):
-    """Differences of rows of one disc beyond the step's error: rms, and as the rows state (m)."""
-
-    pairs: int
-    rms_m: float
-    stated_m: float
-    per_dof: float  # mean squared normalised difference with the covariances of rows and steps
 
 
 def rates_figure(least: FloatArray, recall: FloatArray, precision: FloatArray) -> Part:
@@ -230,11 +220,13 @@ def floor_map(rows: Sequence[ImageRows], unmatched: str = "") -> Part | None:
     return _part(f"{words}each frame, {along}.{unmatched}", content, _WIDE)
 
 
-def repeated(rows: Sequence[ImageRows]) -> Repeatability | None:
+def repeated(rows: Sequence[ImageRows]) -> tuple[int, float, float, float] | None:
     """How well discs in successive frames agree, the latter moved by the odometry's step.
 
     Discs are paired within five standard deviations, unless these are too large to identify them.
-    The step's error, common to the pairs of two frames, is estimated. None without pairs or steps.
+    The step's error, common to the pairs of two frames, is estimated. Returns the number of pairs,
+    the rms of their differences beyond that error, and as the rows state (m); and the mean squared
+    normalised difference with the covariances of rows and steps. None without pairs or steps.
     """
     row_residuals, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
     frames = [each.circles for each in rows]
@@ -266,7 +258,7 @@ def repeated(rows: Sequence[ImageRows]) -> Repeatability | None:
     if not len(residuals):
         return None
     rms_m, stated_m = np.sqrt([2.0 * np.mean(residuals**2), 2.0 * variance.mean()]).tolist()
-    return Repeatability(len(residuals) // 2, rms_m, stated_m, squared / len(residuals))
+    return len(residuals) // 2, rms_m, stated_m, squared / len(residuals)
 
 
 def rates_over(comparison: DiscComparison, qualities: ArrayLike) -> tuple[FloatArray, FloatArray]:

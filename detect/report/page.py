@@ -12,7 +12,6 @@ import numpy as np
 from detect.comparison.compare import compare_with_file
 from detect.comparison.report import floor_table, summary_rows, worst_frames_table
 from detect.comparison.result import Comparison, DiscComparison, Kind, LineComparison
-from detect.drawing import picture_name
 from detect.drawing.frame import draw_rows, processed
 from detect.errors import DetectError, FrameError
 from detect.line_settings import LineSettings
@@ -20,7 +19,7 @@ from detect.options import RowFiles
 from detect.projection import DiscProjection, summed_steps
 from detect.report import figures
 from detect.row_files import ImageRows, RunRows, open_rows
-from detect.sources.image_files import image_name
+from detect.sources.image_files import image_name, picture_name
 from detect.sources.interface import ImageRun, Run, RunFrame, read_image
 from redetect import __version__
 from redetect.landmarks import circle_arrays
@@ -199,11 +198,12 @@ def _uncertainty(inputs: ReportInputs) -> list[Part]:
         return []
     parts = [figures.sigma_figure(discs)]
     if (found := figures.repeated(inputs.rows)) is not None:
+        pairs, rms_m, stated_m, per_dof = found
         words = (
-            f"Repeatability: {found.pairs} pairs of rows of one disc in successive frames, chained "
-            f"by the odometry, differ by {1e3 * found.rms_m:.1f} mm (rms) beyond the step's error, "
-            f"with {1e3 * found.stated_m:.1f} mm stated. The mean squared normalised difference is "
-            f"{found.per_dof:.2f}: 1 if covariances are right, less if frames share errors."
+            f"Repeatability: {pairs} pairs of rows of one disc in successive frames, chained "
+            f"by the odometry, differ by {1e3 * rms_m:.1f} mm (rms) beyond the step's error, "
+            f"with {1e3 * stated_m:.1f} mm stated. The mean squared normalised difference is "
+            f"{per_dof:.2f}: 1 if covariances are right, less if frames share errors."
         )
         parts.append(Part("text", words))
     return parts

@@ -18,7 +18,7 @@ from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, sti
 from redetect.landmarks import read_steps
 from redetect.landmarks.frames import read_times
 from redetect.messages import excerpt
-from redetect.storage import IMAGE_SUFFIXES
+from redetect.storage import IMAGE_SUFFIXES, demand_free
 from redetect.storage.bounded import leads_out, link_out
 
 _KINDS = " ".join(sorted(IMAGE_SUFFIXES))
@@ -31,6 +31,19 @@ def image_name(prefix: str) -> str:
     # Image suffixes only: the data set's prefixes end in a number, as in e.0067.
     stem, dot, extension = name.rpartition(".")
     return stem if stem and (dot + extension).lower() in IMAGE_SUFFIXES else name
+
+
+def picture_name(prefix: str) -> str:
+    """Name of an image's picture without its ending, which cannot lead out of a folder."""
+    return image_name(prefix) or "frame"
+
+
+def demand_pictures(frames: Frames, folder: Path, *, overwrite: bool) -> None:
+    """Make the folder for pictures of frames; reject existing pictures if names are known now."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not frames.ships_images:
+        names = (picture_name(frame.step.prefix) for frame in frames)
+        demand_free((folder / f"{name}.png" for name in names), overwrite=overwrite)
 
 
 def last_part(prefix: str) -> str:

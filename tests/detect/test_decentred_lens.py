@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from detect.circles import detect_circles, disc_table, published_positions
+from camera.kernels import published_camera_numbers
+from detect.circles import detect_circles, disc_table
+from detect.discs.positions import published_positions
 from detect.lines import detect_lines
 from detect.markers.geometry import picture_of
 from detect.settings import CircleSettings
 from lut import build_vertical_table
+from lut.outlines import floor_positions
 from tests.detect.line_scene import EDGES, edge_columns, pinhole, render, tilt_of, tilted
 from tests.detect.painted_floor import PaintedFloor
 
@@ -99,7 +102,8 @@ def test_published_positions_are_the_cameras(
     decentred = replace(published_camera, tangential=tangential, polynomial=polynomial)
     rows, columns = np.mgrid[0 : decentred.height : 7, 0 : decentred.width : 5]
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
-    floor_xy, covariance = published_positions(decentred, pixels)
+    numbers, positions = published_camera_numbers(decentred), floor_positions(decentred)
+    floor_xy, covariance = published_positions(numbers, positions, pixels)
     seen = decentred.floor_from_pixel(pixels)
     jacobian = decentred.floor_jacobian_published(pixels)
     expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.swapaxes(-1, -2)

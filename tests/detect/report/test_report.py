@@ -309,9 +309,10 @@ def test_repeatability_is_that_of_the_rows() -> None:
         rows.append(ImageRows(circles=Frame(step, landmarks)))
     found = repeated(rows)
     assert found is not None
-    assert found.pairs == 199 * len(xy)
-    assert found.per_dof == pytest.approx(1.0, abs=0.06)
-    assert found.rms_m == pytest.approx(found.stated_m, rel=0.05)
+    pairs, rms_m, stated_m, per_dof = found
+    assert pairs == 199 * len(xy)
+    assert per_dof == pytest.approx(1.0, abs=0.06)
+    assert rms_m == pytest.approx(stated_m, rel=0.05)
     assert repeated([replace(row, circles=None) for row in rows]) is None
     lost = [
         replace(f, step=replace(f.step, cxx=1e6, cyy=1e6)) for row in rows if (f := row.circles)
