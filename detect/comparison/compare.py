@@ -27,7 +27,6 @@ from detect.comparison.result import (
     Kind,
     LineComparison,
     LinePairs,
-    RunMatch,
     floor_difference,
     normalised_error,
     quantile,
@@ -186,16 +185,14 @@ def compare_frames(
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)
     wanted, found = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    match = partial(match_runs, "circles", wanted, found, options, names, unlisted=unlisted)
-    run = match(projection)
+    match = partial(match_runs, "circles", wanted, found, options, unlisted=unlisted)
+    matches = match(projection)
     if projection is not None and not projection.reference_level:
         # A file need not state that its rows are level: then the matches in the images decide.
         with_level = replace(projection, reference_level=True)
         as_level = match(with_level)
-        if _image_cost(as_level.frames) < _image_cost(run.frames):
-            run, projection = as_level, with_level
-    run = replace(run, on_lookalikes=_on_lookalikes(run.frames, lookalikes, options))
-    matches = run.frames
+        if _image_cost(as_level) < _image_cost(matches):
+            matches, projection = as_level, with_level
     first, second, _, extra = sides = tuple(
         circle_arrays([row for match in matches for row in getattr(match, side)])
         for side in ("wanted", "matched", "missed", "extra")
@@ -211,7 +208,8 @@ def compare_frames(
     error_m = np.linalg.norm(pairs.offset, axis=1)
     farthest_m = np.linalg.norm(second.xy, axis=1).max(initial=0.0)
     return DiscComparison(
-        **vars(run),
+        **_rates(matches, wanted, found, options, names),
+        on_lookalikes=_on_lookalikes(matches, lookalikes, options),
         normalised_error=normalised_error(pairs.offset, second.covariance),
         error_median_m=quantile(error_m),
         error_95_m=quantile(error_m, 0.95),
@@ -258,9 +256,9 @@ def compare_line_frames(
     """Compare the lines of two sets of frames, as `compare_frames`."""
     options = options or CompareOptions()
     sides = frames_by_image(reference, names[0]), frames_by_image(detected, names[1])
-    run = match_runs("lines", *sides, options, names, unlisted=unlisted)
-    first = [row for match in run.frames for row in match.wanted]
-    second = [row for match in run.frames for row in match.matched]
+    matches = match_runs("lines", *sides, options, unlisted=unlisted)
+    first = [row for match in matches for row in match.wanted]
+    second = [row for match in matches for row in match.matched]
 
     def difference(name: str) -> FloatArray:
         return numbers(second, name) - numbers(first, name)
@@ -271,7 +269,8 @@ def compare_line_frames(
     variance = np.where(sigma_rad >= LEAST_SIGMA_RAD, sigma_rad**2, 0.0)
     ends = [np.hypot(difference(f"x{end}"), difference(f"y{end}")) for end in ("top", "bottom")]
     return LineComparison(
-        **vars(run),
+        **_rates(matches, *sides, options, names),
+        on_lookalikes=None,
         normalised_error=normalised_error(error_rad[:, None], variance[:, None, None]),
         bearing_median_deg=quantile(error_deg),
         bearing_95_deg=quantile(error_deg, 0.95),
@@ -334,21 +333,27 @@ def match_runs(
     reference: Mapping[str, Frame],
     detected: Mapping[str, Frame],
     options: CompareOptions,
-    names: tuple[str, str],
     projection: DiscProjection | None = None,
     unlisted: Iterable[Frame] | None = None,
-) -> RunMatch:
-    """Match the rows of two runs, image by image; look-alikes are not known.
+) -> tuple[FrameMatch, ...]:
+    """Match the rows of two runs, image by image.
 
     Images are in the order of the reference; those in only one run are ignored.
     """
-    images = [name for name in reference if name in detected]
     known = {image_name(frame.step.prefix): frame for frame in unlisted or ()}
     matches = []
-    for name in images:
+    for name in (name for name in reference if name in detected):
         frames = reference[name], detected[name]
         of_frame = None if projection is None else projection.for_frame(*frames)
         matches.append(match_frame(kind, name, *frames, options, of_frame, known.get(name)))
+    return tuple(matches)
+
+
+def _rates(
+    matches: tuple[FrameMatch, ...], reference: Mapping[str, Frame], detected: Mapping[str, Frame],
+    options: CompareOptions, names: tuple[str, str],
+) -> dict[str, Any]:  # fmt: skip
+    """The fields of a `Comparison` that count rows and frames."""
     counts: dict[str, int] = {
         name: sum(len(getattr(match, name)) for match in matches)
         for name in ("matched", "joined", "missed", "extra", "set_aside")
@@ -356,21 +361,20 @@ def match_runs(
     matched, extra = counts["matched"], counts["extra"]
     found = matched + counts["joined"]
     wanted = found + counts["missed"]
-    return RunMatch(
-        reference_name=names[0],
-        detected_name=names[1],
-        options=options,
-        reference=wanted,
-        detected=matched + extra,
-        found=found,
+    return {
+        "reference_name": names[0],
+        "detected_name": names[1],
+        "options": options,
+        "reference": wanted,
+        "detected": matched + extra,
+        "found": found,
         **counts,
-        on_lookalikes=None,
-        recall=found / wanted if wanted else None,
-        precision=matched / (matched + extra) if matched + extra else None,
-        frames=tuple(matches),
-        frames_only_in_reference=tuple(name for name in reference if name not in detected),
-        frames_only_in_detected=tuple(name for name in detected if name not in reference),
-    )
+        "recall": found / wanted if wanted else None,
+        "precision": matched / (matched + extra) if matched + extra else None,
+        "frames": matches,
+        "frames_only_in_reference": tuple(name for name in reference if name not in detected),
+        "frames_only_in_detected": tuple(name for name in detected if name not in reference),
+    }
 
 
 def match_frame(

@@ -118,12 +118,16 @@ class LinePairs:
 
 
 @dataclass(frozen=True, eq=False)
-class RunMatch:
-    """Matching rows of two runs, image by image, all discs or all lines.
+class Comparison(Table, ABC):
+    """How a run's detected rows compare with reference rows; figures are None without rows.
 
     Rows are counted as in `FrameMatch`; `found` rows were matched or joined. Recall is the share of
     reference rows that were found, precision the share of detected rows that were matched.
     """
+
+    what: ClassVar[str]  # the landmarks that are compared
+    unit: ClassVar[str]  # of `FrameMatch.largest_error`
+    counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
 
     reference_name: str
     detected_name: str
@@ -139,20 +143,10 @@ class RunMatch:
     on_lookalikes: int | None  # extra rows on known look-alikes; None if unknown
     recall: float | None
     precision: float | None
+    normalised_error: NormalisedError
     frames: tuple[FrameMatch, ...] = field(repr=False)
     frames_only_in_reference: tuple[str, ...] = field(repr=False)
     frames_only_in_detected: tuple[str, ...] = field(repr=False)
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison(RunMatch, Table, ABC):
-    """How a run's detected rows compare with reference rows; figures are None without rows."""
-
-    what: ClassVar[str]  # the landmarks that are compared
-    unit: ClassVar[str]  # of `FrameMatch.largest_error`
-    counts: ClassVar[tuple[str, ...]] = ("matched", "missed", "extra")  # of `FrameMatch`, shown
-
-    normalised_error: NormalisedError
 
     def columns(self) -> dict[str, Any]:
         """One row per frame that is in both files."""
@@ -218,11 +212,7 @@ class Comparison(RunMatch, Table, ABC):
 
         In metres and degrees. The worst frames are listed, and frames that are in only one file.
         """
-        names = [each.name for each in fields(self)]
-        # In files, the normalised error is before the frames.
-        names.insert(names.index("frames"), names.pop(names.index("normalised_error")))
-        figures = {name: getattr(self, name) for name in names}
-        figures |= {
+        figures = {each.name: getattr(self, each.name) for each in fields(self)} | {
             "frames": len(self.frames),
             "pairs": self.matched,
             "worst_frames": [self._row(match) for match in self.worst_frames(WORST_FRAMES)],

@@ -191,7 +191,9 @@ def rows_of_words(stream: BinaryIO, name: str) -> Iterator[tuple[list[bytes], by
         if text.endswith(b"\\") and not text.lstrip().startswith(b"#"):
             text = text[:-1]
             continue
-        yield _words(text), source, first
+        # Without the row's comment.
+        words = takewhile(lambda word: not word.startswith(b"#"), text.split())
+        yield list(words), source, first
         source = text = b""
         first = number + 1
     if source:
@@ -201,11 +203,6 @@ def rows_of_words(stream: BinaryIO, name: str) -> Iterator[tuple[list[bytes], by
 def decode(word: bytes) -> str:
     """A word of a file; bytes that are not UTF-8 become surrogates, as in Python's file names."""
     return word.decode("utf-8", "surrogateescape")
-
-
-def _words(text: bytes) -> list[bytes]:
-    """The words of a row without its comment."""
-    return list(takewhile(lambda word: not word.startswith(b"#"), text.split()))
 
 
 def _record(words: list[bytes]) -> Record | None:

@@ -13,7 +13,7 @@ from itertools import product
 
 import numpy as np
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers import adjustment
 from redetect.groundtruth.markers.pairs import (
@@ -111,7 +111,12 @@ def estimate_rig(
     start = chained_poses(relative, support, len(ids), root)
     kept = np.flatnonzero(np.isfinite(start[:, 0, 0]))
     start = start[kept]
-    left_out = _reasons(ids, kept, seen, settings)
+    seen_at = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]
+    left_out = {
+        ids[k]: f"seen at {seen_at[k]} times, but not {settings.least_support} times in agreement "
+        "with a marker of the rig"
+        for k in np.setdiff1d(np.arange(len(ids)), kept).tolist()
+    }
     renumbered = {old: new for new, old in enumerate(kept.tolist())}
     pairs = {
         (renumbered[a], renumbered[b]): c
@@ -211,18 +216,6 @@ def _root(
             f"marker {reference} cannot be the reference: it was not seen with others often enough"
         )
     return ids.index(reference)
-
-
-def _reasons(
-    ids: tuple[int, ...], kept: IntArray, seen: Sequence[Sequence[View]], settings: RigSettings
-) -> dict[int, str]:
-    """Why markers are left out."""
-    times = [sum(any(v.rig_index == k for v in views) for views in seen) for k in range(len(ids))]
-    return {
-        ids[k]: f"seen at {times[k]} times, but not {settings.least_support} times in agreement "
-        "with a marker of the rig"
-        for k in np.setdiff1d(np.arange(len(ids)), kept).tolist()
-    }
 
 
 def _bundle(

@@ -22,7 +22,7 @@ from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
+from redetect.slam.recording import UNKNOWN_ID, camera_xy_of, joined, landmark_files
 from redetect.storage import demand_free
 
 #: Labels (n,) of a file's rows, by the kind of the rows.
@@ -70,7 +70,13 @@ def perform(options: Associate) -> int:
         print(f"{target}: {_counted(rows, labels)}")
     for run, own in zip(runs, of_discs):
         if 2 * np.count_nonzero(own < 0) > len(own):
-            print(_doubt(run), file=sys.stderr)
+            way, reach = files.lengths_of(run)
+            print(
+                "most rows match no disc that is seen again: do rows and odometry fit each other? "
+                f"Steps are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; "
+                "expected metres, radians, and the axes of the robot, X left and Y backward",
+                file=sys.stderr,
+            )
     content = {
         "version": __version__,
         "run": str(options.run),
@@ -121,16 +127,6 @@ def _counted(rows: Sequence[Row], labels: Labels) -> str:
             if np.any(own < 0):
                 parts[-1] += f" and {np.count_nonzero(own < 0)} rows that match none of them"
     return ", ".join(parts) or "no landmarks"
-
-
-def _doubt(run: Recording) -> str:
-    """What may be wrong with a run most of whose rows of discs match none."""
-    way, reach = files.lengths_of(run)
-    return (
-        "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
-        f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
-        "radians, and the axes of the robot, X left and Y backward"
-    )
 
 
 def _target(options: Associate, run: int, source: Path, several: bool) -> Path:
