@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -138,7 +139,7 @@ def _by_rims(
     image, camera, table, left = within_margins(image, camera, table, settings)
     searched = searched_images(image, camera, table, settings)
     discs, log_odds = judged_discs(searched, settings)
-    scene, _ = searched[0]
+    scene = searched[0].scene
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
     # If the centre is outside the image, too little of the disc is visible to locate it.
@@ -179,20 +180,24 @@ def _cropped(camera: Camera, left: int, right: int, shape: VoteShape) -> tuple[C
     return camera, build_vote_table(camera, shape)  # not kept on disk: there may be one per image
 
 
+class Searched(NamedTuple):
+    """An image with the table of the discs that are searched in it."""
+
+    scene: Scene
+    table: VoteTable
+
+
 def searched_images(
     image: GreyImage, camera: Camera, table: VoteTable, settings: CircleSettings
-) -> list[tuple[Scene, VoteTable]]:
-    """The image, then reduced ones for large discs; parameters as for `detect_circles`.
-
-    With each is the table of the discs that are searched in it.
-    """
-    searched = [(scene_of(image, camera, table, settings), table)]
+) -> list[Searched]:
+    """The image, then reduced ones for large discs; parameters as for `detect_circles`."""
+    searched = [Searched(scene_of(image, camera, table, settings), table)]
     for factor, smaller, own in _octaves(camera, vote_shape(settings)):
         # Means of squares of pixels.
         cut = image[: factor * smaller.height, : factor * smaller.width]
         size = smaller.width, smaller.height
         reduced = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), np.uint8)
-        searched.append((scene_of(reduced, smaller, own, settings), own))
+        searched.append(Searched(scene_of(reduced, smaller, own, settings), own))
     return searched
 
 
@@ -234,7 +239,7 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
 
 
 def judged_discs(
-    searched: Sequence[tuple[Scene, VoteTable]], settings: CircleSettings
+    searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
     _, judgement = judged_candidates(searched, settings)
@@ -244,11 +249,11 @@ def judged_discs(
 
 
 def judged_candidates(
-    searched: Sequence[tuple[Scene, VoteTable]], settings: CircleSettings
+    searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[FloatArray, JudgedCandidates]:
     """(N,) scores of all candidates, and their classification."""
     candidates = [candidates_of(*each, settings) for each in searched]
-    found = [judged(scene, settings, own) for (scene, _), own in zip(searched, candidates)]
+    found = [judged(each.scene, settings, own) for each, own in zip(searched, candidates)]
     return (
         np.concatenate([each.score for each in candidates]),
         JudgedCandidates._make(map(np.concatenate, zip(*found))),

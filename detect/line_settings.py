@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, NamedTuple, get_type_hints
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -149,54 +149,39 @@ class LineSettings:
 
 DEFAULT = LineSettings()
 
-# The settings that kernels need, stage by stage, since each field takes time at each call.
-TrackingNumbers = namedtuple(
-    "TrackingNumbers", "threshold border_rows gap_rows guided_pull guided_reach_px"
-)
-JudgementNumbers = namedtuple(
-    "JudgementNumbers",
+# Numbers of `LineSettings` for kernels, and some that follow from them.
+LineNumbers = namedtuple(
+    "LineNumbers",
+    # Tracking.
+    "threshold border_rows gap_rows guided_pull guided_reach_px "
+    # Judgement of tracks, and the tilt.
     "least_points least_evidence least_sharpness soft_evidence largest_horizon_gap_px "
     "largest_scatter_px largest_shift_px largest_noise_px bend_px lean_noise building_deg "
-    "largest_lean_deg largest_lean_sigmas largest_lean_px weight_limit same_edge_px",
-)
-TiltNumbers = namedtuple(
-    "TiltNumbers", "largest_tilt_deg tilt_prior_deg proposers least_lines stray_share"
-)
-JoiningNumbers = namedtuple(
-    "JoiningNumbers",
-    "building_deg same_edge_px join_px join_rad join_share joined_equally shoulder_px "
-    "shoulder_share sigma_px level",
+    "largest_lean_deg largest_lean_sigmas largest_lean_px weight_limit same_edge_px "
+    "largest_tilt_deg tilt_prior_deg proposers least_lines stray_share "
+    # Joining, and the bearings.
+    "join_px join_rad join_share joined_equally shoulder_px shoulder_share sigma_px level",
 )
 
 
-class LineNumbers(NamedTuple):
-    """The numbers of some settings for kernels: fields of `LineSettings`."""
-
-    tracking: TrackingNumbers
-    judgement: JudgementNumbers
-    tilt: TiltNumbers
-    joining: JoiningNumbers
-
-    @classmethod
-    def of(cls, settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
-        """Those of some settings, for rows of some height in pixel widths."""
-        # Kernels are compiled for 1 and 1.0 separately: each number gets its default's type.
-        given = {
-            name: type(usual)(getattr(settings, name))
-            for name, usual in vars(DEFAULT).items()
-            if usual is not None
-        }
-        given |= {
-            "join_rad": math.nan if settings.join_rad is None else settings.join_rad,
-            "least_points": settings.least_points(row_aspect),
-            "joined_equally": settings.joined == "equal",
-            "level": settings.alpha == "level",
-        }
-        if not settings.guided:
-            # Any curve, and not only lines.
-            given |= {"guided_pull": 1.0, "guided_reach_px": 1.0}
-        stages = get_type_hints(cls).values()
-        return cls(*(stage(**{name: given[name] for name in stage._fields}) for stage in stages))
+def numbers_of(settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
+    """The numbers of some settings, for rows of some height in pixel widths."""
+    # Kernels are compiled for 1 and 1.0 separately: each number gets its default's type.
+    given = {
+        name: type(usual)(getattr(settings, name))
+        for name, usual in vars(DEFAULT).items()
+        if usual is not None
+    }
+    given |= {
+        "join_rad": math.nan if settings.join_rad is None else settings.join_rad,
+        "least_points": settings.least_points(row_aspect),
+        "joined_equally": settings.joined == "equal",
+        "level": settings.alpha == "level",
+    }
+    if not settings.guided:
+        # Any curve, and not only lines.
+        given |= {"guided_pull": 1.0, "guided_reach_px": 1.0}
+    return LineNumbers(**{name: given[name] for name in LineNumbers._fields})
 
 
 #: Reproduces the data set's own rows as far as these are known (docs/verticals.md).

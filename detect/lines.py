@@ -26,7 +26,13 @@ import numpy as np
 
 from detect.errors import DetectError
 from detect.grey_values import plain_image
-from detect.line_settings import DEFAULT, WIDEST_FILTER_PX, LineNumbers, LineSettings
+from detect.line_settings import (
+    DEFAULT,
+    WIDEST_FILTER_PX,
+    LineNumbers,
+    LineSettings,
+    numbers_of,
+)
 from detect.verticals.joining import Lines, lines_of_tracks
 from detect.verticals.judgement import FATES, JudgedTracks, fit_and_judge
 from detect.verticals.refinement import LineFits, StepFilters, step_filters
@@ -92,7 +98,7 @@ def _prepared(
     table: VerticalTable, settings: LineSettings
 ) -> tuple[Strip, LineFilter, StartBand, StepFilters, LineNumbers]:
     """Quantities that depend on the table and the settings only."""
-    band, numbers = start_band(table, settings), LineNumbers.of(settings, table.row_aspect)
+    band, numbers = start_band(table, settings), numbers_of(settings, table.row_aspect)
     return strip_of(table), line_filter(settings), band, step_filters(settings), numbers
 
 
@@ -128,19 +134,19 @@ def detect_lines(
     strip, window, band, steps, numbers = _prepared(table, settings)
     response = band_response(image, band, settings.regulariser)
     starts = line_starts(response, band, settings.threshold)
-    tracks = follow_edges(image, strip, window, starts, numbers.tracking, NOTHING_BEFORE)
+    tracks = follow_edges(image, strip, window, starts, numbers, NOTHING_BEFORE)
     judged = fit_and_judge(image, strip, tracks, steps, numbers)
     sharpness = median_sharpness(judged.fits)
     if settings.blurred_widths and sharpness < settings.blurred_sharpness:
         return detect_lines(image, table, widened(settings, width_for(sharpness, settings)))
     if settings.guided and judged.tilt is not None and judged.doubtful.any():
         before = Before(tracks, judged.doubtful, (judged.tilt.pitch_rad, judged.tilt.roll_rad))
-        tracks = follow_edges(image, strip, window, starts, numbers.tracking, before)
+        tracks = follow_edges(image, strip, window, starts, numbers, before)
         judged = fit_and_judge(image, strip, tracks, steps, numbers, judged)
     if judged.tilt is not None:
-        error = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
+        error = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
         judged = judged._replace(tilt=error)
-    return LineDetections(lines_of_tracks(strip, tracks, judged, numbers.joining), tracks, judged)
+    return LineDetections(lines_of_tracks(strip, tracks, judged, numbers), tracks, judged)
 
 
 def blur_of_sharpness(sharpness: float, fine_px: float, coarse_px: float) -> float:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import JoiningNumbers
+from detect.line_settings import LineNumbers
 from detect.verticals.judgement import Fate, JudgedTracks, accepted_tracks
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
@@ -43,7 +43,7 @@ class Lines(NamedTuple):
 
 
 def lines_of_tracks(
-    strip: Strip, tracks: LineTracks, judged: JudgedTracks, numbers: JoiningNumbers
+    strip: Strip, tracks: LineTracks, judged: JudgedTracks, numbers: LineNumbers
 ) -> Lines:
     """Lines of accepted tracks; updates the fates of tracks that are suppressed or joined."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
@@ -55,7 +55,7 @@ def lines_of_tracks(
 @kernel()
 def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
-    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: JoiningNumbers,
+    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: LineNumbers,
 ) -> Lines:  # fmt: skip
     chosen = accepted_tracks(fate)
     chosen = chosen[strongest_first(evidence[chosen])]
@@ -102,7 +102,7 @@ def _join(
 
 
 @kernel()
-def _reach(pixel_rad: FloatArray, numbers: JoiningNumbers) -> FloatArray:
+def _reach(pixel_rad: FloatArray, numbers: LineNumbers) -> FloatArray:
     """Bearings of lines with these widths of a pixel are joined if closer than this (rad)."""
     reach = np.full(len(pixel_rad), numbers.join_rad)
     if math.isnan(numbers.join_rad):
@@ -117,7 +117,7 @@ def _wrapped(angle: float) -> float:
 
 @kernel()
 def _bearings(
-    fits: LineFits, tracks: IntArray, tilt: tuple[float, float], numbers: JoiningNumbers
+    fits: LineFits, tracks: IntArray, tilt: tuple[float, float], numbers: LineNumbers
 ) -> tuple[FloatArray, FloatArray]:
     """Levelled bearings of some tracks, and their standard deviations due to noise.
 
@@ -144,7 +144,7 @@ def _bearings(
 @kernel()
 def _leave_out(
     tracks: IntArray, alpha: FloatArray, polarity: FloatArray, fits: LineFits,
-    evidence: FloatArray, numbers: JoiningNumbers, fate: NDArray[np.int8],
+    evidence: FloatArray, numbers: LineNumbers, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Suppress tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast, reach = fits.pixel_rad, fits.contrast, _reach(fits.pixel_rad, numbers)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import JudgementNumbers, LineNumbers
+from detect.line_settings import LineNumbers
 from detect.verticals.refinement import LineFits, StepFilters, fit_lines
 from detect.verticals.response import Strip
 from detect.verticals.tilt import (
@@ -85,16 +85,15 @@ def fit_and_judge(
 
     If only the doubtful tracks of an earlier pass were tracked again, only these are fitted.
     """
-    limits = numbers.judgement
-    least = limits.least_points, limits.least_evidence / strip.row_aspect
+    least = numbers.least_points, numbers.least_evidence / strip.row_aspect
     if before is None:
         fits = fit_lines(image, strip, tracks, filters, least, 0)
     else:
         kept = np.flatnonzero(~before.doubtful)
         new = fit_lines(image, strip, tracks, filters, least, len(kept))
         fits = LineFits(*map(np.concatenate, zip((old[kept] for old in before.fits), new)))
-    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, limits)
-    tilt, agrees = agree_on_tilt(lines, numbers.tilt)
+    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
+    tilt, agrees = agree_on_tilt(lines, numbers)
     fate[accepted[~agrees]] = Fate.NOT_VERTICAL
     consensus = tilt if tilt.lines > 0 else None
     return JudgedTracks(fits, evidence, fate, doubtful, consensus, lines, edge)
@@ -105,7 +104,7 @@ def fit_and_judge(
 
 @kernel()
 def _judge(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers
 ) -> tuple[FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray]:
     """Evidence and individual fates of tracks, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
@@ -133,7 +132,7 @@ def _judge(
 
 @kernel()
 def _judge_each(
-    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: JudgementNumbers,
+    strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers,
     evidence: FloatArray, fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Evidence of each track, and whether it can individually be a vertical."""
@@ -178,7 +177,7 @@ def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
 
 @kernel()
 def _reject_soft(
-    fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: JudgementNumbers,
+    fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: LineNumbers,
     fate: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint compared to the other accepted ones."""
@@ -208,7 +207,7 @@ def _quantile(values: FloatArray, chosen: IntArray, share: float) -> float:
 
 @kernel()
 def _weigh(
-    fits: LineFits, accepted: IntArray, votes: FloatArray, numbers: JudgementNumbers
+    fits: LineFits, accepted: IntArray, votes: FloatArray, numbers: LineNumbers
 ) -> Verticals:
     """The tilt's constraints by accepted lines, with their votes."""
     count = len(accepted)

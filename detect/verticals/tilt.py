@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from detect.line_settings import TiltNumbers
+from detect.line_settings import LineNumbers
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
@@ -90,7 +90,7 @@ class Verticals(NamedTuple):
 
 
 def with_error(
-    tilt: TiltEstimate, lines: Verticals, edge: IntArray, numbers: TiltNumbers
+    tilt: TiltEstimate, lines: Verticals, edge: IntArray, numbers: LineNumbers
 ) -> TiltEstimate:
     """The tilt with its mean square error as covariance, unless the settings disable that.
 
@@ -118,7 +118,7 @@ def strongest_first(strength: FloatArray) -> IntArray:
 
 
 @kernel()
-def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate, BoolArray]:
+def agree_on_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[TiltEstimate, BoolArray]:
     """Estimate the tilt from the largest consistent set of lines.
 
     Its covariance is that of least squares; `lines` is 0 if too few agree. Also returns (N,)
@@ -140,7 +140,7 @@ def agree_on_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[TiltEstimate,
 
 
 @kernel()
-def _vote_for_tilt(lines: Verticals, numbers: TiltNumbers) -> tuple[float, float]:
+def _vote_for_tilt(lines: Verticals, numbers: LineNumbers) -> tuple[float, float]:
     """Pitch and roll on which lines of the largest total weight agree; of equal ones the first.
 
     Each pair of proposing lines gives the tilt that makes both vertical; a line votes for it with

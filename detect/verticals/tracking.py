@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.line_settings import TrackingNumbers
+from detect.line_settings import LineNumbers
 from detect.verticals.response import STRIPE_ROWS, LineFilter, Strip, Stripe, empty_stripe, respond
 from detect.verticals.starts import LineStarts
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray
@@ -96,7 +96,7 @@ class _Edge(NamedTuple):
 @kernel()
 def follow_edges(
     image: GreyImage, strip: Strip, window: LineFilter, starts: LineStarts,
-    numbers: TrackingNumbers, before: Before,
+    numbers: LineNumbers, before: Before,
 ) -> LineTracks:  # fmt: skip
     """Follow edges up and down from starts; starts on edges already followed are skipped.
 
@@ -208,7 +208,7 @@ def _take_chain(
 
 @kernel(inline="always")
 def _follow(
-    image: GreyImage, strip: Strip, stripe: Stripe, numbers: TrackingNumbers,
+    image: GreyImage, strip: Strip, stripe: Stripe, numbers: LineNumbers,
     start: tuple[int, int, np.float32], edge: _Edge, column: FloatArray, score: Float32Array,
 ) -> tuple[int, _Edge]:  # fmt: skip
     """Follow an edge of some polarity from a row on in one direction; also returns the last row."""

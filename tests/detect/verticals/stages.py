@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from detect.line_settings import DEFAULT, LineNumbers, LineSettings
+from detect.line_settings import DEFAULT, LineSettings, numbers_of
 from detect.verticals import starts
 from detect.verticals.judgement import JudgedTracks, fit_and_judge
 from detect.verticals.refinement import step_filters
@@ -39,7 +39,7 @@ def line_tracks(
     image: NDArray[np.uint8], starts: LineStarts, table: VerticalTable, settings: LineSettings
 ) -> LineTracks:
     """Edges followed from starts."""
-    numbers = LineNumbers.of(settings, table.row_aspect).tracking
+    numbers = numbers_of(settings, table.row_aspect)
     return follow_edges(
         image, strip_of(table), line_filter(settings), starts, numbers, NOTHING_BEFORE
     )
@@ -50,7 +50,7 @@ def tracks_again(
     tilt_rad: tuple[float, float], table: VerticalTable, settings: LineSettings,
 ) -> LineTracks:  # fmt: skip
     """Some of the tracks followed again along the verticals of a tilt."""
-    numbers = LineNumbers.of(settings, table.row_aspect).tracking
+    numbers = numbers_of(settings, table.row_aspect)
     window, strip = line_filter(settings), strip_of(table)
     return follow_edges(image, strip, window, starts, numbers, Before(tracks, again, tilt_rad))
 
@@ -64,12 +64,12 @@ def judge_tracks(
     before: JudgedTracks | None = None,
 ) -> JudgedTracks:
     """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
-    numbers = LineNumbers.of(settings, table.row_aspect)
+    numbers = numbers_of(settings, table.row_aspect)
     filters = step_filters(replace(settings, refine_steps_px=settings.refine_steps_px[:steps]))
     judged = fit_and_judge(image, strip_of(table), tracks, filters, numbers, before)
     if judged.tilt is None:
         return judged
-    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers.tilt)
+    tilt = with_error(judged.tilt, judged.verticals, judged.edge, numbers)
     return judged._replace(tilt=tilt)
 
 
@@ -88,7 +88,7 @@ def consensus(
     lines: Verticals, settings: LineSettings = DEFAULT
 ) -> tuple[TiltEstimate | None, NDArray[np.bool_]]:
     """The tilt by lines that are edges of their own, with its error, and which agree with it."""
-    numbers = LineNumbers.of(settings).tilt
+    numbers = numbers_of(settings)
     tilt, consistent = agree_on_tilt(lines, numbers)
     if tilt.lines == 0:
         return None, consistent

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from detect.line_settings import DEFAULT, LineNumbers
+from detect.line_settings import DEFAULT, numbers_of
 from detect.lines import detect_lines
 from detect.verticals.judgement import share_edges
 from detect.verticals.tilt import (
@@ -144,7 +144,7 @@ def test_lines_of_one_edge_tell_as_much_as_one() -> None:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         lines = verticals(normal, 1e-6, 0.015, 2.0)
         share_edges(lines, edges_at(place, evidence))
-        tilt, _ = agree_on_tilt(lines, LineNumbers.of(DEFAULT).tilt)
+        tilt, _ = agree_on_tilt(lines, numbers_of(DEFAULT))
         assert tilt.lines > 0
         assert lines.weight.sum() == pytest.approx(16.0)
         return np.array([tilt.pitch_rad, tilt.roll_rad]), tilt.covariance

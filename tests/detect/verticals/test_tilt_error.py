@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from detect.line_settings import DEFAULT, LineNumbers
+from detect.line_settings import DEFAULT, numbers_of
 from detect.verticals.tilt import (
     SCATTER_RAD,
     SCATTER_SHARE,
@@ -37,7 +37,7 @@ def stated_error(
     settings = replace(DEFAULT, tilt_prior_deg=float(np.degrees(0.035)), stray_share=share)
     lines = verticals(normal, variance, 1.0, weight)
     estimate = TiltEstimate(*tilt, np.eye(2), len(weight))
-    return with_error(estimate, lines, edge, LineNumbers.of(settings).tilt).covariance
+    return with_error(estimate, lines, edge, numbers_of(settings)).covariance
 
 
 def building(
