@@ -101,9 +101,9 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
     wrong = [m for m, count in sorted(left_out.items()) if count > _MOST_LEFT_OUT * seen[m]]
     named = wrong and sum(left_out[m] for m in wrong) > _OF_THE_WRONG * total
     first = f"the pose of marker {', '.join(map(str, wrong))}, or else " if named else ""
+    some = f"{total} of {seen.total()} markers disagree with others; " if seen else ""
     outputs.warn(
-        f"{total} of {seen.total()} markers disagree with others, and {failed} times "
-        f"have no pose since they do: {first}poses or widths of markers, in {rig_path}, or poses "
+        f"{some}{counted(failed, 'time')} without a pose, since the markers disagree: {first}poses or widths of markers, in {rig_path}, or poses "
         f"of cameras, in {network_path}, may be wrong"
     )
 
