@@ -103,8 +103,9 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
     first = f"the pose of marker {', '.join(map(str, wrong))}, or else " if named else ""
     some = f"{total} of {seen.total()} markers disagree with others; " if seen else ""
     outputs.warn(
-        f"{some}{counted(failed, 'time')} without a pose, since the markers disagree: {first}poses or widths of markers, in {rig_path}, or poses "
-        f"of cameras, in {network_path}, may be wrong"
+        f"{some}{counted(failed, 'time')} without a pose, since the markers disagree: "
+        f"{first}poses or widths of markers, in {rig_path}, or poses of cameras, in "
+        f"{network_path}, may be wrong"
     )
 
 
