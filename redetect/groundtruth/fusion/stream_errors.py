@@ -34,6 +34,8 @@ _FEWEST = 50
 _LONGEST_INTERVALS = 1.5
 # A gross error is farther from the median of this number of poses than this many deviations.
 _NEIGHBOURS, _GROSS = 7, 6.0
+# Least gross error that is removed (m, rad): a turning point of a robot is none.
+_LEAST_GROSS = 0.12
 # Covariances are raised if the jitter exceeds their deviations by more than this factor.
 _BELIEVED = 1.5
 #: Its name in the file beside a stream.
@@ -80,11 +82,18 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
 def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:
     """(N,) mask of rows of numbers (N, 3) far from those beside them, in their own deviations and
-    in the stated ones (N, 3).
+    in those stated, (N, 3) or (3,).
     """
     apart = np.abs(values - median_filter(values, (_NEIGHBOURS, 1), mode="nearest"))
     usual = np.median(apart, axis=0) / _MEDIAN_OF_NORMAL
     return np.asarray(np.any(apart > _GROSS * np.maximum(usual, sigmas), axis=1))
+
+
+def without_gross_errors(poses: PlanarPoses) -> PlanarPoses:
+    """Poses without those that are far from the ones beside them; all of few or slow ones."""
+    if len(poses) < _FEWEST or np.median(np.diff(poses.times_s)) > 1.0 / _LEAST_RATE_HZ:
+        return poses
+    return poses.only(~_gross_errors(poses.continuous, np.full(3, _LEAST_GROSS / _GROSS)))
 
 
 def with_usable_covariances(name: str, poses: PlanarPoses) -> tuple[PlanarPoses, int]:

@@ -101,6 +101,7 @@ def synchronise(
             raise GroundTruthError(
                 f"{name} has {len(poses)} poses: expected {_FEWEST_SAMPLES} or more"
             )
+    groundtruth = stream_errors.without_gross_errors(groundtruth)
     if groundtruth.covariances is not None:
         groundtruth, _ = stream_errors.with_usable_covariances("ground truth", groundtruth)
         groundtruth, _ = stream_errors.with_jitter_covered(groundtruth)

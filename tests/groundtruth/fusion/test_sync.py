@@ -50,6 +50,19 @@ def test_the_clock_comes_back_from_anywhere_within_the_bounds(offset: float, dri
     assert abs(found.offset_s - expected) < 4.0 * found.sigma_offset_s
 
 
+def test_gross_errors_of_the_ground_truth_do_not_hide_the_clock() -> None:
+    clocks = Clocks(offset_s=0.4, drift=0.0)
+    odometry, truth = simulate(clocks, seed=6)
+    rng = np.random.default_rng(6)
+    gross = rng.random(len(truth)) < 0.2
+    poses = truth.poses + gross[:, None] * rng.normal(0.0, [2.0, 2.0, 0.7], (len(truth), 3))
+    (found,) = synchronise(odometry, PlanarPoses(truth.times_s, poses, truth.covariances))
+    (clean,) = synchronise(odometry, truth.only(~gross))
+    assert found.status == ClockStatus.OK
+    assert abs(found.offset_s - 0.4) < 4.0 * found.sigma_offset_s
+    assert found.sigma_offset_s < 1.5 * clean.sigma_offset_s
+
+
 def test_a_clock_at_a_bound_is_no_clock() -> None:
     odometry, truth = simulate(Clocks(offset_s=0.8, drift=0.0), seed=3)
     (found,) = synchronise(odometry, truth, SyncSettings(largest_offset_s=0.5))

@@ -209,8 +209,8 @@ def test_a_marker_in_another_place_than_the_rig_says_is_named(
     groups = group_by_time(frames_of(np.arange(15.0), poses, rig=rig), 0.005)
     for used, widths, expected in (
         (rig, 1.0, ""),
-        (wrong, 1.0, f"they do: the pose of marker {rig.ids[2]}, or else "),
-        (rig, 1.05, "they do: poses or widths of markers, in rig.json"),
+        (wrong, 1.0, f"disagree: the pose of marker {rig.ids[2]}, or else "),
+        (rig, 1.05, "disagree: poses or widths of markers, in rig.json"),
     ):
         used = replace(used, widths_m=widths * used.widths_m)
         # Markers that are 5 % larger and as much farther apart: a rig of another scale.
