@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_s
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
-from redetect.groundtruth.fusion.slips import slipped_intervals
+from redetect.groundtruth.fusion.slips import UNMEASURED_S, slipped_intervals
 from redetect.groundtruth.fusion.stream_errors import with_jitter_covered, with_usable_covariances
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
@@ -59,8 +60,9 @@ _LARGEST_GAP_S = 2.0
 # Odometry that moves less than the first, while measured poses move more than the second, has
 # headings alone (m).
 _STANDS_M, _MOVES_M = 0.01, 1.0
-# Most measurements at the start that are dropped because most of those after them contradict them.
-_MOST_WRONG, _MOST_JUDGES = 5, 10
+# Most measurements at a start that are rejected because most of those after them contradict them,
+# and numbers of these.
+_MOST_WRONG, _FEWEST_JUDGES, _MOST_JUDGES = 6, 3, 10
 _DEFAULT = FuseSettings()
 
 
@@ -153,21 +155,26 @@ class Rejected:
     squared_innovation: float  # Squared normalised innovation
 
 
-def wrong_start(problem: MovementProblem) -> list[Rejected]:
-    """The first measurements that most of those after them contradict.
+def wrong_starts(problem: MovementProblem) -> FloatArray:
+    """(M,) squared innovations of measurements at the start, or after a gap, that most of those
+    after them contradict; 0 of others.
 
-    The filter would start there, and reject the right ones.
+    The filter would begin there, and reject the right ones.
     """
-    wrong: list[Rejected] = []
-    noise, every = noise_of(problem.settings), np.arange(len(problem.streams))
-    for first in range(min(_MOST_WRONG + 1, len(every) - 1)):
-        found = problem.with_only(every >= first).innovations(noise)
-        judges = slice(1, _MOST_JUDGES + 1)
-        if np.mean(found.accepted[judges]) > 0.5:
-            return wrong
-        squared, time_s = np.median(found.squared[judges]), problem.measured_s[first]
-        wrong.append(Rejected(str(problem.streams[first]), float(time_s), float(squared)))
-    return []
+    squared, times_s = np.zeros(len(problem.streams)), problem.measured_s
+    noise, every = noise_of(problem.settings), np.arange(len(times_s))
+    starts = [0, *(np.flatnonzero(np.diff(times_s) > UNMEASURED_S) + 1), len(times_s)]
+    for start, end in pairwise(starts):
+        for first in range(start, min(start + _MOST_WRONG, end - _FEWEST_JUDGES)):
+            judged = (every >= first) & (every <= min(first + _MOST_JUDGES, end - 1))
+            (part,) = problem.with_only(judged).split(math.inf)
+            found = part.innovations(noise)
+            if np.mean(found.accepted[1:]) > 0.5:
+                break
+            squared[first] = np.median(found.squared[1:])
+        else:
+            squared[start:end] = 0.0  # Those after them do not agree either.
+    return squared
 
 
 @dataclass(frozen=True)
@@ -232,10 +239,11 @@ def fuse(
     own = last_of_each_time(odometry)
     streams = {name: with_sag(stream, own) for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, settings)
-    at_start = wrong_start(problem)
-    if at_start:
-        later = {n: one.only(one.times_s > at_start[-1].time_s) for n, one in streams.items()}
-        problem = movement_problem(odometry, later, settings)
+    wrong = wrong_starts(problem)
+    at_start = zip(
+        problem.streams[wrong > 0.0], problem.measured_s[wrong > 0.0], wrong[wrong > 0.0]
+    )
+    problem = problem.with_only(wrong == 0.0)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
     if not len(inside):
@@ -278,14 +286,15 @@ def fuse(
         if found is not None:
             path, localisation = found
             restarted[:] = False
-    columns = (problem.streams, problem.measured_s, innovations.squared)
-    rejected = (column[~innovations.accepted].tolist() for column in columns)
+    out = ~innovations.accepted
+    in_filter = zip(problem.streams[out], problem.measured_s[out], innovations.squared[out])
+    rejected = [Rejected(str(name), float(t), float(d)) for name, t, d in (*at_start, *in_filter)]
     numbers = [smoothed[-1, 3:], _systematic_deviations(spread), noise, np.array([inflation])]
     pauses = pauses_of(last_of_each_time(odometry))
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),
-        rejected=(*at_start, *(Rejected(*row) for row in zip(*rejected))),
+        rejected=tuple(sorted(rejected, key=lambda one: one.time_s)),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
             name: int(np.count_nonzero(innovations.accepted & (problem.streams == name)))
