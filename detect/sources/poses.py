@@ -26,7 +26,11 @@ from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), so that products of two remain finite.
 FARTHEST = 1e12
-LARGEST_GAP_S = 1.0  #: Longest interval between poses that is interpolated (s).
+LARGEST_GAP_S = 1.0  #: Longest interval between poses that is interpolated (s),
+#: except that slow poses may be farther apart: this many times as far as those before, up to (s).
+_USUAL_GAPS, _SLOWEST_S = 1.5, 2.0
+#: Later times since 1970 are not in seconds.
+_LATEST_S = 1e11
 # A movement that is faster (m/s), and this many times as long as the one before, is a jump of the
 # odometry, as if it was reset. Steps over it have this covariance.
 _FASTEST_M_S, _LONGER = 50.0, 100.0
@@ -37,6 +41,8 @@ DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0],
 # A step's covariance is invalid if its smallest eigenvalue is below one of these shares:
 _INDEFINITE = 1e-8  # of its largest
 _ROUNDING = 1e-12  # of the pose's own covariance: rounding errors
+# Variance of the rounding of a step's numbers, which files have with five decimals.
+_ROUNDED = 1e-10 / 12.0
 _UNIT = 1e-2  # Tolerance of the length of a trajectory's quaternions.
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
@@ -46,7 +52,8 @@ _END_SLACK_S = 1e-3
 class TimedPose:
     """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
-    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown. `is_guessed`
+    means that of the movement since the pose before, nothing was measured.
     """
 
     time_s: float
@@ -54,6 +61,7 @@ class TimedPose:
     y: float
     theta: float
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    is_guessed: bool = False
 
 
 class PoseStream(NamedTuple):
@@ -82,7 +90,7 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     scale = float(np.abs(after.covariance).max())
     if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
         to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
-        c = to_dataset @ grown @ to_dataset.T
+        c = to_dataset @ grown @ to_dataset.T + _ROUNDED * np.eye(3)
     return Step(prefix, *pose.tolist(), *c[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist())
 
 
@@ -115,7 +123,7 @@ class PosesOverTime:
         self._poses = poses
         self._name = name
         self.jumps = self.jumped = False  # now, and since the last step
-        self._way_m = 0.0
+        self._way_m, self._longest_s = 0.0, LARGEST_GAP_S
         self._before: TimedPose | None = None
         self._after = next(poses, None)
         if self._after is None:
@@ -124,6 +132,9 @@ class PosesOverTime:
     def at(self, time_s: float) -> TimedPose | None:
         """The pose at a time; None if unknown, or if a later one was requested before."""
         while self._after is not None and self._after.time_s < time_s:
+            if self._before is not None:
+                usual_s = _USUAL_GAPS * (self._after.time_s - self._before.time_s)
+                self._longest_s = min(max(usual_s, LARGEST_GAP_S), _SLOWEST_S)
             self._before, self._after = self._after, next(self._poses, None)
             if self._after is None:
                 break
@@ -134,7 +145,13 @@ class PosesOverTime:
                     f"{self._name}: the pose of {self._after.time_s:.6f} s comes after that of "
                     f"{self._before.time_s:.6f} s: expected times in order"
                 )
-            self.jumps = way_m > max(_FASTEST_M_S * max(seconds, 1e-3), _LONGER * self._way_m)
+            if not self._after.time_s < _LATEST_S:
+                raise DetectError(
+                    f"{self._name}: the time {self._after.time_s:.0f}: expected seconds, not "
+                    "nanoseconds"
+                )
+            fastest_m = max(_FASTEST_M_S * max(seconds, 1e-3), _LONGER * self._way_m)
+            self.jumps = self._after.is_guessed or way_m > fastest_m
             self.jumped, self._way_m = self.jumped or self.jumps, way_m
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one
@@ -142,7 +159,7 @@ class PosesOverTime:
             return end if end and abs(end.time_s - time_s) <= _END_SLACK_S else None
         if after.time_s == time_s:
             return after
-        if time_s < before.time_s or after.time_s - before.time_s > LARGEST_GAP_S:
+        if time_s < before.time_s or after.time_s - before.time_s > self._longest_s:
             return None
         return pose_between(before, after, time_s)
 
@@ -177,17 +194,21 @@ def velocity_poses(path: Path) -> Generator[TimedPose, None, None]:
 
     Their noise is white and, for positions, the same in all directions; sigmas are the standard
     deviations of its integral over one second (DLR Spatial Cognition data set report, equation 1).
+    Over rows that are much farther apart than those before, the movement is unknown.
     """
 
     def arcs() -> Iterator[_Arc]:
         columns = "t v omega sigma_v sigma_omega"
         last: list[float] = []
+        usual_s = LARGEST_GAP_S
         for place, row in rows_of_numbers(path, "file of velocities", columns, DetectError):
-            time_s, speed, turning, *sigmas = last or row
+            time_s, speed, turning, sigma_m, sigma_rad = last or row
             seconds = row[0] - time_s
-            deviations = (math.sqrt(max(seconds, 0.0)) * sigma for sigma in sigmas)
-            yield _Arc(place, row[0], seconds * speed, seconds * turning, *deviations)
-            last = row
+            root = math.sqrt(max(seconds, 0.0))
+            guessed = seconds > _USUAL_GAPS * max(usual_s, LARGEST_GAP_S)
+            movement = (seconds * speed, seconds * turning, root * sigma_m, root * sigma_rad)
+            yield _Arc(place, row[0], *movement, guessed)
+            last, usual_s = row, seconds
 
     return _poses_along(arcs())
 
@@ -201,11 +222,12 @@ class _Arc(NamedTuple):
     turn_rad: float
     sigma_m: float = 0.0  # of either coordinate
     sigma_rad: float = 0.0  # of the heading
+    is_guessed: bool = False
 
 
 def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
     pose = TimedPose(0.0, 0.0, 0.0, 0.0)
-    for place, time_s, *movement in arcs:
+    for place, time_s, *movement, is_guessed in arcs:
         if not max(map(abs, movement)) <= FARTHEST:
             raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
         way_m, turn_rad, sigma_m, sigma_rad = movement
@@ -216,7 +238,7 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
         by_heading = np.array([[-0.5 * dy, 0.5 * dx, 1.0], [-dy, dx, 0.0] / np.sqrt(12.0)])
         errors = np.vstack([sigma_m * np.eye(2, 3), sigma_rad * by_heading])
         covariance = carried(pose.covariance, pose, after) + errors.T @ errors
-        pose = replace(after, covariance=covariance)
+        pose = replace(after, covariance=covariance, is_guessed=is_guessed)
         yield pose
 
 
@@ -253,7 +275,8 @@ class FramesAlongPoses(Frames):
         self.ships_images, self.expected = source.ships_images, source.expected
         self.is_recorded = source.is_recorded
         self.why_left_out = (
-            f"images without a time or a pose of {stream.name}, or not in order: left out"
+            f"images without a time or a pose of {stream.name}, or not in order, or between poses "
+            "far apart: left out"
         )
 
     def __iter__(self) -> Generator[RunFrame, None, None]:

@@ -139,6 +139,7 @@ def test_rows_and_images_without_each_other(small_run: Path, tmp_path: Path) -> 
         ("1 0 0 0 0 0 0 2\n", r"a\.tum:1: qx qy qz qw: expected a unit quaternion"),
         ("", r"a\.tum: no pose in it: expected odometry"),
         (tum_row(100.1, 0, 0, 0) + tum_row(100, 0, 0, 0), "comes after that of 100.1"),
+        (tum_row(1, 0, 0, 0) + tum_row(1.7e18, 0, 0, 0), "expected seconds, not nanoseconds"),
     ],
 )
 def test_malformed_trajectories(timed_run: Path, tmp_path: Path, content: str, told: str) -> None:
@@ -200,6 +201,41 @@ def test_velocities_give_steps_with_covariances(timed_run: Path, tmp_path: Path)
     assert (arc.dx, arc.dy) == pytest.approx((0.5 * (1 - math.cos(0.4)), -0.5 * math.sin(0.4)))
     assert arc.dphi == pytest.approx(0.4)
     assert arc.cphiphi == 0.0  # not stated
+
+
+def test_a_gap_of_velocities_is_no_movement_at_the_last_one(
+    timed_run: Path, tmp_path: Path
+) -> None:
+    rows = [(99.0 + 0.1 * k, 0.5, 0.2, 0.01, 0.01) for k in range(15)]
+    rows += [(rows[-1][0] + 5.0 + 0.1 * k, 0.0, 0.0, 0.01, 0.01) for k in range(5)]
+    path = tmp_path / "a.velocities"
+    np.savetxt(path, rows)
+    times = [format_time(PREFIXES[k], at) for k, at in enumerate((100.0, 100.4, 105.5))]
+    (timed_run / "s.times").write_text("\n".join(times) + "\n")
+    options = SourceOptions(odometry=str(path))
+    _, before, over = [frame.step for frame in open_source(timed_run, None, options).frames]
+    assert before.cxx < 1e-3
+    assert over.cxx == 1e6  # nothing is known of it
+
+
+def test_poses_a_second_apart_are_near_enough(timed_run: Path, tmp_path: Path) -> None:
+    times = [98.99, 100.0, 101.02, 102.01]
+    (tmp_path / "a.tum").write_text("".join(tum_row(t, t - 98.0, 0.0, 0.0) for t in times))
+    run = open_source(timed_run, None, SourceOptions(odometry=str(tmp_path / "a.tum")))
+    assert [frame.step.prefix for frame in run.frames] == PREFIXES
+
+
+def test_a_tiny_variance_stays_positive_in_the_file(timed_run: Path, tmp_path: Path) -> None:
+    """A gyroscope of 8e-7 rad per root second: what rounding to five decimals adds is more."""
+    path = tmp_path / "a.velocities"
+    path.write_text("100 0.6 0 1e-3 8e-7\n101 0 0 1e-3 8e-7\n102 0 0 1e-3 8e-7\n")
+    options = SourceOptions(odometry=str(path))
+    for frame in list(open_source(timed_run, None, options).frames)[1:]:
+        s = frame.step
+        rounded = np.round(
+            [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]], 12
+        )
+        assert np.linalg.eigvalsh(rounded)[0] > 1e-12
 
 
 def test_the_covariance_of_velocities_is_what_random_drives_show(tmp_path: Path) -> None:
