@@ -202,6 +202,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
     stretches: list[list[loops.Stretch]] = []
+    places: list[FloatArray] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # a part begins with its own start, not with the end of the one before
@@ -211,12 +212,16 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         own = run._replace(recording=part)
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        length, least = closed.stretch_frames, ANYWHERE.least_agreeing
-        stretches.append(own.stretches(closed.at, length, overlapping=False, least=least))
+        limits = {"least": ANYWHERE.least_agreeing, "most": loops.MOST_COMPARED}
+        compared = own.stretches(closed.at, closed.stretch_frames, overlapping=False, **limits)
+        stretches.append(compared)
+        places.append(np.full_like(closed.at.xy, np.nan))
+        for stretch in compared:  # the others are mostly clutter
+            places[-1][stretch.labels] = stretch.xy
     if len(parts) == 1:
         return parts[0]
     run.report("registering the parts")
-    motions, pairs, left = register_maps([part.at.xy for part in parts], stretches)
+    motions, pairs, left = register_maps(places, stretches)
     if left:
         raise SlamError(
             f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "

@@ -16,6 +16,7 @@ from redetect.array_types import IntArray
 from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.messages import is_quiet
+from redetect.slam.association.loop_closing import unrecognised_return
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import Scores, score_run
 from redetect.slam.commands import files
@@ -71,6 +72,10 @@ def perform(options: Associate) -> int:
     for run, own in zip(runs, of_discs):
         if 2 * np.count_nonzero(own < 0) > len(own):
             print(_doubt(run), file=sys.stderr)
+    if result.path is not None and len(recording.circles) and not result.matches:
+        back = unrecognised_return(recording, result.circle_labels, result.path)
+        if back is not None:
+            print(_not_closed(recording, *back), file=sys.stderr)
     content = {
         "version": __version__,
         "run": str(options.run),
@@ -130,6 +135,15 @@ def _doubt(run: Recording) -> str:
         "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
         f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
         "radians, and the axes of the robot, X left and Y backward"
+    )
+
+
+def _not_closed(recording: Recording, earlier: int, later: int) -> str:
+    """That no loop is closed, and where odometry leads back to a place."""
+    return (
+        f"no loop is closed, although by odometry {recording.prefixes[later]} is at the place of "
+        f"{recording.prefixes[earlier]}: its discs are too few, too regular or among too much "
+        "clutter to be recognised"
     )
 
 
