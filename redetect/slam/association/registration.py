@@ -73,7 +73,7 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
 
 
 def _merged(xy: FloatArray) -> FloatArray:
-    """(n, 2) means of rows close to each other."""
+    """(n, 2) means of rows close to each other, without clutter (`loops.enough_rows`)."""
     means: list[FloatArray] = []
     counts: list[int] = []
     for row in xy:
@@ -85,7 +85,8 @@ def _merged(xy: FloatArray) -> FloatArray:
         else:
             means.append(row)
             counts.append(1)
-    return np.array(means).reshape(-1, 2)
+    rows = np.array(counts, dtype=np.int64)
+    return np.array(means).reshape(-1, 2)[rows >= loops.enough_rows(rows)]
 
 
 def located(
