@@ -4,7 +4,8 @@ The factor of a map, chi-squared over its expectation, may be near 1 although od
 than its covariances state: most numbers are those of rows. So the expectation is divided: that of
 odometry is the sum of its redundancies, the share of each number that the others check (W.
 Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, chapter 4). Systematic errors of all
-steps, as of a wheel's radius or a unit, are further unknowns, from the minimum without them.
+steps, as of a wheel's radius or a unit, are further unknowns, from the minimum without them. They
+change with the adjusted steps: the errors of the measured ones would hide them, or look like them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import by_shared, diagonal_blocks
 from redetect.least_squares.solver import normal_equations
+from redetect.plane import between
 from redetect.slam.mapping.graph_terms import errors, linearise
 from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.models import between_jacobians
@@ -56,9 +59,9 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
     border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
-        by_change = np.zeros((count, 3, 3))
-        by_change[:, :2, 0] = -graph.steps[:, :2]
-        by_change[:, 2, 1] = -np.hypot(graph.steps[:, 0], graph.steps[:, 1])
+        by_change, along = np.zeros((count, 3, 3)), _without_errors(graph.steps, estimate.poses)
+        by_change[:, :2, 0] = -along
+        by_change[:, 2, 1] = -np.hypot(*along.T)
         by_change[1:-1, :, 2] = 0.5 * (graph.steps[:-2] - graph.steps[2:])
         border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 3)
         problem = problem._replace(border=border[:, :2])
@@ -94,3 +97,13 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
         outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
         worst_step=int(np.argmax(of_steps)),
     )
+
+
+def _without_errors(steps: FloatArray, poses: FloatArray) -> FloatArray:
+    """(N, 2) ways of the steps (N, 3) of odometry (m), with its scale but without random errors:
+    those of adjusted `poses` (N + 1, 3) times the scale.
+    """
+    adjusted = between(poses[:-1], poses[1:])[:, :2]
+    squared = float(np.sum(adjusted**2))
+    scale = float(np.sum(adjusted * steps[:, :2])) / squared if squared > 0.0 else 0.0
+    return scale * adjusted
