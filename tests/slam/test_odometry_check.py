@@ -95,6 +95,12 @@ def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
     run = _run(2)
     assert np.isnan(_check(run.part(0, 6)).odometry_factor)
     assert np.isnan(_check(run.part(0, 1)).odometry_factor)
+    # Of a first frame that many discs are seen in, numbers of no meaning may be large.
+    for seed in range(4):
+        discs = np.random.default_rng(seed).uniform(-2.0, 2.0, (25, 2))
+        one = _check(drive(chain_steps(np.array([[0.0, -0.3, 0.05]])), discs, NO_LINES, seed))
+        numbers = (one.odometry_factor, one.rows_factor, one.length, one.length_sigma)
+        assert np.all(np.isnan([*numbers, one.lag_frames, one.lag_frames_sigma]))
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.3])  # intervals by which odometry is later

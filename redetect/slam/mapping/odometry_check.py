@@ -35,7 +35,8 @@ class OdometryCheck:
     """Errors of odometry and of rows, and systematic errors of odometry.
 
     The latter are corrections by which its steps would fit the rows, with standard deviations; NaN
-    if the camera's mounting is unknown, since its height has the scale of odometry.
+    if they are not determined, or the camera's mounting is unknown, since its height has the scale
+    of odometry.
     """
 
     odometry_factor: float  # chi-squared of odometry over its expectation; NaN without redundancy
@@ -79,11 +80,17 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     of_steps = np.sum(error.odometry**2, axis=1)
-    change, sigma = np.full(3, math.nan), np.full(3, math.nan)
+    change, variance = np.full(3, math.nan), np.full(3, math.nan)
     if not weighting.calibrate:
         with_lag = normal_equations(problem._replace(border=border))
         change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
-        sigma = np.sqrt(np.append(np.diag(spread), by_shared(with_lag)[1][2, 2]))
+        variance = np.append(np.diag(spread), by_shared(with_lag)[1][2, 2])
+    # Without redundancy, the systematic errors are not determined, and nothing else is checked.
+    if mapped.table.expected <= 0 or np.any(variance < 0.0):
+        odometry = rows = 0.0
+        variance[:] = math.nan
+    sigma = np.sqrt(np.where(variance > 0.0, variance, math.nan))
+    change = np.where(np.isnan(sigma), math.nan, change)
     (length, turn, lag), (length_sigma, turn_sigma, lag_sigma) = change.tolist(), sigma.tolist()
     return OdometryCheck(
         odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
