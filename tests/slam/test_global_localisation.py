@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply, compose, invert
 from redetect.slam.association.registration import localise_globally
@@ -27,15 +28,16 @@ def drive(
     steps: int = 40,
     clutter_rows: float = 0.1,
     slower: int = 1,
+    bias_sigmas: FloatArray | float = 0.0,
 ) -> Recording:
     """Discs within 4 m, noisy, and rows of nothing in some frames; the odometry errs as it says.
 
-    A `slower` robot takes that many steps for each.
+    A `slower` robot takes that many steps for each. All steps err by `bias_sigmas` besides.
     """
     step, step_sigma = STEP / slower, STEP_SIGMA / np.sqrt(slower)
     steps *= slower
     rng = np.random.default_rng(seed)
-    measured = step + step_sigma * rng.standard_normal((steps, 3))
+    measured = step + step_sigma * (bias_sigmas + rng.standard_normal((steps, 3)))
     pose, rows = start, []
     for k in range(steps):
         pose = compose(pose, step)
@@ -83,6 +85,21 @@ def test_the_pose_is_found_among_more_clutter_than_discs() -> None:
         off = compose(invert(start), located.pose)
         assert np.hypot(off[0], off[1]) < 0.4
         assert located.agreeing > 0.6 * located.discs
+
+
+def test_systematic_errors_of_odometry_are_in_the_covariance_of_the_start() -> None:
+    squares = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        disc_xy = rng.uniform(0.0, 20.0, (160, 2))
+        start = np.array([*rng.uniform(6.0, 14.0, 2), rng.uniform(-3.0, 3.0)])
+        bias = 1.5 * np.array([0.0, *rng.choice([-1.0, 1.0], 2)])
+        located = localise_globally(drive(disc_xy, start, seed, bias_sigmas=bias), disc_xy)
+        assert located is not None
+        difference = located.pose - start
+        difference[2] = wrap_angle(difference[2])
+        squares.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
+    assert np.mean(squares) < 1.1
 
 
 def test_where_the_building_repeats_itself_nothing_is_certain() -> None:

@@ -25,6 +25,7 @@ from redetect.plane import apply, between, chain_steps, compose, invert, log_mot
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     STRETCH_FRAMES,
+    SYSTEMATIC_SIGMAS,
     Match,
     Stretch,
     shared_landmarks,
@@ -40,10 +41,8 @@ SAME_PLACE = 0.999
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
-# Largest squared error of a loop with random errors of odometry; largest systematic error of each
-# step, in standard deviations.
+# Largest squared error of a loop with random errors of odometry.
 _MOST_SQUARED = float(chdtri(3, 1e-6))
-_SYSTEMATIC_SIGMAS = 2.0
 # Weight of a lost step: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
 # Tolerance of least squares.
@@ -206,7 +205,7 @@ def consistent_matches(
         there = _about(path[frames[k, 1] + 1])
         spread = there @ (until[high] - until[low]).sum(axis=1) @ there.T + 2.0 * across
         gap = log_motion(compose(invert(other_motion), motion[k])) @ there.T
-        systematic = _SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
+        systematic = SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
         return np.asarray(squared_mahalanobis(gap, spread) - systematic - _MOST_SQUARED)
 
     # A single match forms a loop with the trivial one of its earlier frame with itself.

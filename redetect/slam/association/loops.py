@@ -45,6 +45,8 @@ _LONG_AGO = 4
 MOST_COMPARED = 80
 # Labels with fewer rows than this share of what a typical row's label has are mostly clutter.
 _LEAST_SHARE = 0.2
+#: Largest systematic error of each step of odometry, in standard deviations.
+SYSTEMATIC_SIGMAS = 2.0
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 

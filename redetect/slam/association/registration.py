@@ -127,8 +127,13 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
 
 
 def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> FloatArray:
-    """Covariance added by odometry along the way: all discs are moved, and rotated together."""
-    total = step_covariance.sum(axis=0)
+    """Covariance added by odometry along the way: all discs are moved, and rotated together.
+
+    Errors of steps are random, and systematic ones add up: discs are seen after half of the way on
+    average.
+    """
+    sigmas = np.sqrt(np.diagonal(step_covariance, axis1=1, axis2=2)).sum(axis=0)
+    total = step_covariance.sum(axis=0) + np.diag((0.5 * loops.SYSTEMATIC_SIGMAS * sigmas) ** 2)
     from_discs = rotation(pose[2]) @ -discs.mean(axis=0)
     turned = np.array([-from_discs[1], from_discs[0], 1.0])
     moved = np.diag([1.0, 1.0, 0.0]) * 0.5 * (total[0, 0] + total[1, 1])
