@@ -176,7 +176,7 @@ def test_labels_with_few_rows_are_compared_only_where_others_have_few() -> None:
         labels = np.repeat(np.arange(len(rows)), rows)
         xy = np.stack([np.arange(float(len(rows))), np.zeros(len(rows))], axis=1)
         (found,) = stretches_of(np.zeros(len(labels), np.int64), labels, xy, 9, least=1, most=80)
-        return found.labels.tolist()
+        return [int(label) for label in found.labels]
 
     assert compared([20, 1, 30, 2, 25, 1, 1, 1, 1, 5]) == [0, 2, 4, 9]
     assert compared([2, 1, 3, 1]) == [0, 1, 2, 3]

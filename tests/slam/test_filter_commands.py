@@ -241,6 +241,17 @@ def test_lines_need_a_calibration(run: Path, capsys: pytest.CaptureFixture[str])
     assert main(["ekf", str(run)]) == 0
 
 
+def test_a_wrong_start_is_a_reason_for_large_errors(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", str(run)]) == 0
+    localize = ["localize", str(run), "--map", str(run / "slam" / "map.csv"), "--force"]
+    assert main(localize) == 0
+    assert "--start" not in capsys.readouterr().out
+    assert main([*localize, "--start", "1", "0", "0.5"]) == 0
+    assert "larger than stated: is --start where the run begins?" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("first", "last", "each", "said"),
     [

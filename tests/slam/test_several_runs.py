@@ -144,7 +144,7 @@ def test_a_run_of_another_building_is_refused(
         for k, run in ((1, runs[0]), (2, other))
     ]
     assert main(["associate", *files, "-o", str(tmp_path / "found.circles")]) == 1
-    assert "the frames from start (" in capsys.readouterr().err
+    assert f"{files[1]}: the frames from start on cannot be" in capsys.readouterr().err
     assert not list(tmp_path.glob("found*"))
     assert main(["map", *files, "-o", str(tmp_path / "map")]) == 1
     said = capsys.readouterr().err

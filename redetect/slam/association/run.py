@@ -42,7 +42,7 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.registration import ANYWHERE, register_maps
-from redetect.slam.errors import SlamError
+from redetect.slam.errors import UnregisteredError
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.settings import AssociateSettings
@@ -90,7 +90,8 @@ def associate_run(
     """Find which rows show the same landmark, ignoring IDs in the file.
 
     Only bearings of lines need the camera's centre in the robot frame, `camera_xy` (2,) (m).
-    `progress` is called with a description of the current stage.
+    `progress` is called with a description of the current stage. Raises `UnregisteredError` if the
+    run consists of parts, one of which has no certain place among the others.
     """
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
@@ -223,9 +224,11 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     run.report("registering the parts")
     motions, pairs, left = register_maps(places, stretches)
     if left:
-        raise SlamError(
-            f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "
-            "cannot be registered with the others: expected common landmarks"
+        frame = starts[left[0]]
+        raise UnregisteredError(
+            f"the frames from {recording.prefixes[frame]} on cannot be registered with the others: "
+            "expected common landmarks",
+            frame,
         )
     counts = np.cumsum([0, *(len(part.at.xy) for part in parts)])
     together = np.concatenate([part.at.labels + count for part, count in zip(parts, counts)])

@@ -20,10 +20,17 @@ from redetect.slam.association.loop_closing import unrecognised_return
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import Scores, score_run
 from redetect.slam.commands import files
-from redetect.slam.errors import SlamError
+from redetect.slam.errors import SlamError, UnregisteredError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, Recording, camera_xy_of, joined, landmark_files
+from redetect.slam.recording import (
+    UNKNOWN_ID,
+    Recording,
+    camera_xy_of,
+    first_poses,
+    joined,
+    landmark_files,
+)
 from redetect.storage import demand_free
 
 #: Labels (n,) of a file's rows, by the kind of the rows.
@@ -52,7 +59,11 @@ def perform(options: Associate) -> int:
         noisy = with_relative_noise(recording, factor, options.seed) if factor else recording
         # The rows' own gate grows with their covariances.
         began = time.perf_counter()
-        found = associate_run(noisy, settings, camera_xy=camera_xy, progress=_progress)
+        try:
+            found = associate_run(noisy, settings, camera_xy=camera_xy, progress=_progress)
+        except UnregisteredError as error:
+            k = int(np.searchsorted(first_poses(runs), error.frame + 1, side="right")) - 1
+            raise SlamError(f"{options.runs[k]}: {error}") from None
         seconds = time.perf_counter() - began
         _progress("")
         scores = score_run(recording, found)

@@ -58,11 +58,15 @@ def perform(command: Localize | Ekf) -> int:
         run, landmark_map, said = _mapped(command, recording)
         source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
     seconds = time.perf_counter() - began
+    placed = isinstance(command, Localize) and not command.lost
     if command.association != "known":
-        hint = isinstance(command, Localize) and not command.lost
-        said += [line + " (--lost finds the start)" * hint for line in lost_lines(run, recording)]
+        hint = " (--lost finds the start)" if placed else ""
+        said += [line + hint for line in lost_lines(run, recording)]
     elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
-        said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
+        start = "is --start where the run begins? " if placed else ""
+        said.append(
+            f"errors are much larger than stated: {start}`slam audit` finds wrong identifiers"
+        )
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     distance = None
     if reference is not None:
