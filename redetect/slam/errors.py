@@ -10,3 +10,11 @@ class SlamError(OneLineError, ValueError):
 
     The message names the file, step, landmark or setting, its value and what was expected.
     """
+
+
+class UnregisteredError(SlamError):
+    """Frames of a run, from number `frame` on, have no certain place among the others."""
+
+    def __init__(self, message: str, frame: int) -> None:
+        super().__init__(message)
+        self.frame = frame

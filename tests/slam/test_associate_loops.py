@@ -171,6 +171,17 @@ def test_stretches_that_are_compared_hold_what_was_seen_most() -> None:
     assert found.xy[:, 0].tolist() == [1.0, 2.0, 4.0]
 
 
+def test_labels_with_few_rows_are_compared_only_where_others_have_few() -> None:
+    def compared(rows: list[int]) -> list[int]:
+        labels = np.repeat(np.arange(len(rows)), rows)
+        xy = np.stack([np.arange(float(len(rows))), np.zeros(len(rows))], axis=1)
+        (found,) = stretches_of(np.zeros(len(labels), np.int64), labels, xy, 9, least=1, most=80)
+        return [int(label) for label in found.labels]
+
+    assert compared([20, 1, 30, 2, 25, 1, 1, 1, 1, 5]) == [0, 2, 4, 9]
+    assert compared([2, 1, 3, 1]) == [0, 1, 2, 3]
+
+
 @given(
     rows=st.lists(st.tuples(st.integers(0, 6), st.integers(0, 7)), min_size=1, max_size=25),
     pairs=st.lists(st.tuples(st.integers(0, 7), st.integers(0, 7)), max_size=12),

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.landmarks import wrap_angle
+from redetect.landmarks import wrap_angle, write_frames
 from redetect.plane import between, chain_steps
 from redetect.slam.association.frame_to_frame import associate_locally
 from redetect.slam.association.run import associate_run, without_clutter
 from redetect.slam.association.scoring import score_association
+from redetect.slam.cli import main
 from redetect.slam.models import OdometryNoise, bearing_of_vertical, disc_in_robot, tilt_jacobian
-from redetect.slam.recording import CircleRows, LineRows, Recording
+from redetect.slam.recording import CircleRows, LineRows, Recording, frames_of_discs
 from redetect.slam.settings import AssociateSettings, Method
 from tests.slam.ekf_rows import circle_rows
 
@@ -323,3 +326,52 @@ def test_a_dozen_discs_round_which_the_robot_drives_slowly_are_found_again(seed:
     assert score.pair_precision == 1.0
     assert score.splits == 0
     assert score.found_landmarks == score.true_landmarks
+
+
+def slow_circuit(laps: float) -> FloatArray:
+    """Round a small square, in steps of 0.05 m."""
+    fast = circuit(laps, 3.0)
+    return chain_steps(np.repeat(0.25 * between(fast[:-1], fast[1:]), 4, axis=0))
+
+
+def slow_drive(path: FloatArray, discs: FloatArray) -> Recording:
+    return drive(path, discs, NO_LINES, 1, OdometryNoise().covariance(between(path[:-1], path[1:])))
+
+
+def test_loops_are_closed_where_most_labels_are_clutter() -> None:
+    """A slow robot sees a disc dozens of times: a tenth of clutter gives more labels than discs."""
+    recording = slow_drive(slow_circuit(1.6), scattered(1, 40, 0.4, 3.0))
+    cluttered = with_clutter(recording, len(recording.circles) // 8, 2)
+    found = associate_run(cluttered)
+    local = np.unique(found.local_circle_labels[cluttered.circles.ids < 0])
+    assert len(local) > 3 * 40
+    assert len(found.matches) > 20
+    score = score_association(found.circle_labels, ids_of(cluttered))
+    assert score.pair_precision == 1.0
+    assert score.pair_recall > 0.93
+
+
+@pytest.mark.parametrize("recognised", [False, True])
+def test_a_return_without_a_closed_loop_is_said(
+    recognised: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each lap has discs of its own, or the same ones."""
+    path = slow_circuit(2.0)
+    middle = len(path) // 2
+    laps = [
+        slow_drive(part, scattered(1 if recognised else seed, 30, 0.4, 3.0))
+        for seed, part in ((1, path[: middle + 1]), (2, path[middle:]))
+    ]
+    first, second = (lap.circles for lap in laps)
+    second = replace(second, frame=second.frame + middle)
+    rows = CircleRows(*map(np.concatenate, zip(vars(first).values(), vars(second).values())))
+    run = replace(slow_drive(path, np.zeros((0, 2))), circles=rows)
+    for name, part in (("once", run.part(0, middle - 20)), ("twice", run)):
+        write_frames(tmp_path / f"{name}.circles", frames_of_discs(part))
+        file = str(tmp_path / f"{name}.circles")
+        assert main(["associate", file, "-o", str(tmp_path / f"found_{name}.circles")]) == 0
+        said = capsys.readouterr().err
+        assert ("no loop is closed" in said) == (name == "twice" and not recognised)
+    if not recognised:
+        later, earlier = re.findall(r"s\.(\d+)", said)
+        assert int(later) - int(earlier) == pytest.approx(middle, abs=20)

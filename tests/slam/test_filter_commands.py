@@ -241,16 +241,36 @@ def test_lines_need_a_calibration(run: Path, capsys: pytest.CaptureFixture[str])
     assert main(["ekf", str(run)]) == 0
 
 
-@pytest.mark.parametrize(("first", "last", "said"), [(15, 37, True), (15, 33, False)])
-def test_where_the_pose_is_lost_is_said(first: int, last: int, said: bool) -> None:
-    seen = [k for k in range(40) if k % 10]  # every tenth frame shows none
-    names = tuple(f"f{k}" for k in range(40))
+def test_a_wrong_start_is_a_reason_for_large_errors(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["map", str(run)]) == 0
+    localize = ["localize", str(run), "--map", str(run / "slam" / "map.csv"), "--force"]
+    assert main(localize) == 0
+    assert "--start" not in capsys.readouterr().out
+    assert main([*localize, "--start", "1", "0", "0.5"]) == 0
+    assert "larger than stated: is --start where the run begins?" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "each", "said"),
+    [
+        (15, 37, 100, "only 0 of 20 rows in 20 frames with discs, from f15 on"),
+        (15, 30, 100, ""),
+        (10, 60, 4, "only 10 of 45 rows in 45 frames with discs, from f11 on"),
+        (10, 60, 2, ""),
+    ],
+)
+def test_where_the_pose_is_lost_is_said(first: int, last: int, each: int, said: str) -> None:
+    """Where few discs match: a lost robot among many discs is near some of them by chance."""
+    count = 60
+    seen = [k for k in range(count) if k % 10]  # every tenth frame shows none
+    names = tuple(f"f{k}" for k in range(count))
     rows = circle_rows((k, (0.0, -2.0), np.eye(2), -1) for k in seen)
-    none = np.tile(np.eye(3), (40, 1, 1))
-    recording = Recording(names, np.zeros((40, 3)), none, rows, LineRows.of())
-    matched = np.array([-1 if first <= k < last else 5 for k in seen])
-    path = Path2D(("start", *names), np.zeros((41, 3)))
+    none = np.tile(np.eye(3), (count, 1, 1))
+    recording = Recording(names, np.zeros((count, 3)), none, rows, LineRows.of())
+    matched = np.array([-1 if first <= k < last and k % each else 5 for k in seen])
+    path = Path2D(("start", *names), np.zeros((count + 1, 3)))
     found = lost_lines(FilterRun(path, RowCount(), matched, ()), recording)
-    assert bool(found) == said
-    if said:
-        assert "20 frames with discs, from f15 on" in found[0]
+    assert bool(found) == bool(said)
+    assert not said or said in found[0]

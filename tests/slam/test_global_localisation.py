@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
+from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply, compose, invert
 from redetect.slam.association.registration import localise_globally
@@ -20,22 +21,35 @@ STEP = np.array([0.0, -0.25, 0.05])
 STEP_SIGMA = np.array([0.01, 0.02, 0.01])
 
 
-def drive(disc_xy: FloatArray, start: FloatArray, seed: int, steps: int = 40) -> Recording:
-    """Discs within 4 m, noisy, and some rows of nothing; the odometry errs as it says."""
+def drive(
+    disc_xy: FloatArray,
+    start: FloatArray,
+    seed: int,
+    steps: int = 40,
+    clutter_rows: float = 0.1,
+    slower: int = 1,
+    bias_sigmas: FloatArray | float = 0.0,
+) -> Recording:
+    """Discs within 4 m, noisy, and rows of nothing in some frames; the odometry errs as it says.
+
+    A `slower` robot takes that many steps for each. All steps err by `bias_sigmas` besides.
+    """
+    step, step_sigma = STEP / slower, STEP_SIGMA / np.sqrt(slower)
+    steps *= slower
     rng = np.random.default_rng(seed)
-    measured = STEP + STEP_SIGMA * rng.standard_normal((steps, 3))
+    measured = step + step_sigma * (bias_sigmas + rng.standard_normal((steps, 3)))
     pose, rows = start, []
     for k in range(steps):
-        pose = compose(pose, STEP)
+        pose = compose(pose, step)
         seen = apply(invert(pose), disc_xy)
         near = seen[(np.hypot(*seen.T) < 4.0) & (seen[:, 1] < -0.5)]
-        clutter = rng.uniform([-3.0, -4.0], [3.0, -1.0], (int(rng.random() < 0.1), 2))
+        clutter = rng.uniform([-3.0, -4.0], [3.0, -1.0], (int(rng.random() < clutter_rows), 2))
         for xy in (*(near + SIGMA_M * rng.standard_normal(near.shape)), *clutter):
             rows.append((k, xy))
     return Recording(
         tuple(f"f{k}" for k in range(steps)),
         measured,
-        np.tile(np.diag(STEP_SIGMA**2), (steps, 1, 1)),
+        np.tile(np.diag(step_sigma**2), (steps, 1, 1)),
         circle_rows((k, xy, SIGMA_M**2 * np.eye(2), -1) for k, xy in rows),
         LineRows.of(),
     )
@@ -57,6 +71,35 @@ def test_the_pose_is_found_in_a_large_map() -> None:
         squares.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
         assert located.agreeing >= 0.5 * located.discs
     assert 0.05 < np.mean(squares) < 1.5
+
+
+def test_the_pose_is_found_among_more_clutter_than_discs() -> None:
+    """A slow robot sees a disc dozens of times, and rows of nothing at another place each time."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        disc_xy = rng.uniform(0.0, 15.0, (60, 2))
+        start = np.array([*rng.uniform(4.0, 11.0, 2), rng.uniform(-3.0, 3.0)])
+        seen = drive(disc_xy, start, seed, clutter_rows=0.7, slower=5)
+        located = localise_globally(seen, disc_xy)
+        assert located is not None
+        off = compose(invert(start), located.pose)
+        assert np.hypot(off[0], off[1]) < 0.4
+        assert located.agreeing > 0.6 * located.discs
+
+
+def test_systematic_errors_of_odometry_are_in_the_covariance_of_the_start() -> None:
+    squares = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        disc_xy = rng.uniform(0.0, 20.0, (160, 2))
+        start = np.array([*rng.uniform(6.0, 14.0, 2), rng.uniform(-3.0, 3.0)])
+        bias = 1.5 * np.array([0.0, *rng.choice([-1.0, 1.0], 2)])
+        located = localise_globally(drive(disc_xy, start, seed, bias_sigmas=bias), disc_xy)
+        assert located is not None
+        difference = located.pose - start
+        difference[2] = wrap_angle(difference[2])
+        squares.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
+    assert np.mean(squares) < 1.1
 
 
 def test_where_the_building_repeats_itself_nothing_is_certain() -> None:

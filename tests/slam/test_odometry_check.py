@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from redetect.landmarks import write_frames
+from redetect.plane import chain_steps
 from redetect.slam.cli import main
+from redetect.slam.commands.map import doubts_of
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import map_run
 from redetect.slam.recording import LineRows, Recording, frames_of_discs
 from tests.slam.small_run import small_run
+from tests.slam.test_associate_runs import NO_LINES, drive
 
 
 def _run(seed: int) -> Recording:
@@ -56,10 +59,48 @@ def test_wrong_lengths_and_turns_of_odometry_are_found() -> None:
     assert abs(found.lag_frames) < 4.0 * found.lag_frames_sigma
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.9])
+def test_random_errors_of_odometry_neither_hide_systematic_ones_nor_look_like_them(
+    scale: float,
+) -> None:
+    rough = np.diag([0.12, 0.12, 0.05]) ** 2
+    checks = []
+    for seed in range(4):
+        run = _run(seed)
+        error = np.random.default_rng(seed).multivariate_normal(np.zeros(3), rough, len(run))
+        steps = (run.steps + error) * [scale, scale, 1.0]
+        covariance = run.step_covariance + rough
+        checks.append(_check(replace(run, steps=steps, step_covariance=covariance)))
+    sigma = checks[0].length_sigma
+    off = np.mean([check.length for check in checks]) - (1.0 / scale - 1.0)
+    assert abs(off) < 2.0 * sigma
+    assert sigma < 0.04
+    turns = [check.turn_per_metre / check.turn_per_metre_sigma for check in checks]
+    assert np.max(np.abs(turns)) < 4.0
+
+
+def test_a_robot_that_turns_on_the_spot_has_no_systematic_error_of_length() -> None:
+    """All of its ways are random errors."""
+    path = chain_steps(np.tile([0.0, 0.0, 0.1], (126, 1)))
+    covariance = np.tile(np.diag([0.02, 0.02, 0.01]) ** 2, (126, 1, 1))
+    for seed in range(4):
+        discs = np.random.default_rng(seed).uniform(-3.5, 3.5, (25, 2))
+        mapped = map_run(drive(path, discs, NO_LINES, seed, covariance))
+        check = check_odometry(mapped)
+        assert abs(check.length) < 4.0 * check.length_sigma
+        assert not any("odometry does not fit" in line for line in doubts_of(check, mapped))
+
+
 def test_rows_alone_and_one_step_have_no_factor_of_odometry() -> None:
     run = _run(2)
     assert np.isnan(_check(run.part(0, 6)).odometry_factor)
     assert np.isnan(_check(run.part(0, 1)).odometry_factor)
+    # Of a first frame that many discs are seen in, numbers of no meaning may be large.
+    for seed in range(4):
+        discs = np.random.default_rng(seed).uniform(-2.0, 2.0, (25, 2))
+        one = _check(drive(chain_steps(np.array([[0.0, -0.3, 0.05]])), discs, NO_LINES, seed))
+        numbers = (one.odometry_factor, one.rows_factor, one.length, one.length_sigma)
+        assert np.all(np.isnan([*numbers, one.lag_frames, one.lag_frames_sigma]))
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.3])  # intervals by which odometry is later

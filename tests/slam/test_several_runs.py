@@ -14,10 +14,20 @@ from redetect.landmarks.map_file import read_map, read_path, with_joint_covarian
 from redetect.plane import apply, between, invert
 from redetect.slam.association.loops import Stretch
 from redetect.slam.association.registration import register_maps
+from redetect.slam.association.run import associate_run
+from redetect.slam.association.scoring import score_association
 from redetect.slam.cli import main
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, frames_of_discs, joined, read_recording
-from tests.slam.test_associate_runs import LINE_SIGMA, NO_LINES, circuit, drive, scattered
+from tests.slam.test_associate_runs import (
+    LINE_SIGMA,
+    NO_LINES,
+    circuit,
+    drive,
+    ids_of,
+    scattered,
+    with_clutter,
+)
 
 DEMO = Path(__file__).parents[2] / "images" / "e"
 DISCS = scattered(3, 45, 0.5, 5.0)
@@ -82,6 +92,15 @@ def test_runs_without_identifiers_get_one_set_and_one_map(
     check_map(tmp_path / "map", true_ids)
 
 
+def test_runs_are_registered_though_most_labels_are_clutter(runs: list[Recording]) -> None:
+    cluttered = joined([with_clutter(run, len(run.circles) // 3, 7) for run in runs])
+    found = associate_run(cluttered)
+    assert len(np.unique(found.local_circle_labels)) > 4 * len(DISCS)
+    score = score_association(found.circle_labels, ids_of(cluttered))
+    assert score.pair_precision > 0.999
+    assert score.pair_recall > 0.9
+
+
 def test_runs_whose_identifiers_agree_are_mapped_at_once(
     runs: list[Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -125,7 +144,7 @@ def test_a_run_of_another_building_is_refused(
         for k, run in ((1, runs[0]), (2, other))
     ]
     assert main(["associate", *files, "-o", str(tmp_path / "found.circles")]) == 1
-    assert "the frames from start (" in capsys.readouterr().err
+    assert f"{files[1]}: the frames from start on cannot be" in capsys.readouterr().err
     assert not list(tmp_path.glob("found*"))
     assert main(["map", *files, "-o", str(tmp_path / "map")]) == 1
     said = capsys.readouterr().err

@@ -19,11 +19,13 @@ from scipy.spatial import KDTree
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import squared_mahalanobis
+from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.least_squares.solver import Block, normal_equations, stack
 from redetect.plane import apply, between, chain_steps, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
+    STRETCH_FRAMES,
+    SYSTEMATIC_SIGMAS,
     Match,
     Stretch,
     shared_landmarks,
@@ -39,14 +41,14 @@ SAME_PLACE = 0.999
 # Standard deviations of a step of the path and of a match of two stretches (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
-# Largest squared error of a loop with random errors of odometry; largest systematic error of each
-# step, in standard deviations.
+# Largest squared error of a loop with random errors of odometry.
 _MOST_SQUARED = float(chdtri(3, 1e-6))
-_SYSTEMATIC_SIGMAS = 2.0
 # Weight of a lost step: just enough to keep the equations solvable.
 _LOST_WEIGHT = 1e-3
 # Tolerance of least squares.
 _TOLERANCE = 1e-4
+# Poses of one place turned by less than this see the same discs (rad).
+_ONE_VIEW_RAD = 0.4
 # Labels farther apart than this are not compared.
 _FARTHEST_M = 0.35
 
@@ -188,11 +190,7 @@ def consistent_matches(
     Takes new matches and those already `closed` in the path, `path` (N + 1, 3), `step_covariance`
     (N, 3, 3).
     """
-    # A step's error moves everything after it, and rotates it about the pose after the step.
-    by_error = np.zeros((len(path) - 1, 3, 3))
-    by_error[:, :2, :2] = rotation(path[:-1, 2])
-    by_error[:, :, 2] = np.stack([path[1:, 1], -path[1:, 0], np.ones(len(path) - 1)], axis=1)
-    until = np.cumsum(by_error @ step_covariance @ by_error.swapaxes(1, 2), axis=0)
+    until = _accumulated(path, step_covariance)
     across = np.diag(np.square([_MATCH_SIGMA[1], _MATCH_SIGMA[1], _MATCH_SIGMA[0]]))
 
     both = [*closed, *matches]
@@ -204,11 +202,10 @@ def consistent_matches(
         """Excess of the squared errors of the loops of match k with others over the bound."""
         low, high = np.minimum(frames[k], other_frames), np.maximum(frames[k], other_frames)
         # The loop begins and ends with the later frame.
-        x, y = path[frames[k, 1] + 1, :2]
-        there = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        there = _about(path[frames[k, 1] + 1])
         spread = there @ (until[high] - until[low]).sum(axis=1) @ there.T + 2.0 * across
         gap = log_motion(compose(invert(other_motion), motion[k])) @ there.T
-        systematic = _SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
+        systematic = SYSTEMATIC_SIGMAS**2 * (high - low).sum(axis=1)
         return np.asarray(squared_mahalanobis(gap, spread) - systematic - _MOST_SQUARED)
 
     # A single match forms a loop with the trivial one of its earlier frame with itself.
@@ -220,6 +217,56 @@ def consistent_matches(
     for k in sorted(alone, key=alone.__getitem__):
         taken[k] = alone[k] <= 0.0 and np.all(excess(k, frames[taken], motion[taken]) <= 0.0)
     return [match for match, right in zip(matches, taken[len(closed) :]) if right]
+
+
+def _accumulated(path: FloatArray, step_covariance: FloatArray) -> FloatArray:
+    """(N, 3, 3) covariances of the motions about the origin by the errors of all steps so far.
+
+    A step's error moves everything after it, and rotates it about the pose after the step.
+    """
+    by_error = np.zeros((len(path) - 1, 3, 3))
+    by_error[:, :2, :2] = rotation(path[:-1, 2])
+    by_error[:, :, 2] = np.stack([path[1:, 1], -path[1:, 0], np.ones(len(path) - 1)], axis=1)
+    return np.asarray(np.cumsum(by_error @ step_covariance @ by_error.swapaxes(1, 2), axis=0))
+
+
+def _about(pose: FloatArray) -> FloatArray:
+    """(3, 3) turns a small motion about the origin into one about a pose."""
+    return np.array([[1.0, 0.0, -pose[1]], [0.0, 1.0, pose[0]], [0.0, 0.0, 1.0]])
+
+
+def unrecognised_return(
+    recording: Recording, labels: IntArray, path: FloatArray
+) -> tuple[int, int] | None:
+    """Frames, the earlier first, between which the robot left a place and came back to it, by its
+    path and the random errors of odometry, but around which it saw discs without a common label.
+
+    It is at one place within half the median distance of discs and `_ONE_VIEW_RAD`, including two
+    standard deviations of both. Takes `labels` (n,), -1 for none, and the `path` (N + 1, 3).
+    """
+    frames, numbers = recording.circles.frame[labels >= 0], labels[labels >= 0]
+    until = _accumulated(path, recording.step_covariance)
+    view = np.array([0.5 * np.median(np.hypot(*recording.circles.xy.T)), _ONE_VIEW_RAD])
+
+    def seen(frame: int) -> IntArray:
+        near = [frame - STRETCH_FRAMES // 2, frame + STRETCH_FRAMES // 2]
+        return numbers[slice(*np.searchsorted(frames, near))]
+
+    for later in range(0, len(path) - 1, STRETCH_FRAMES // 5):
+        off = path[1 : later + 1] - path[later + 1]
+        apart = np.stack([np.hypot(*off[:, :2].T), np.abs(wrap_angle(off[:, 2]))], axis=1)
+        away = (apart / view).max(axis=1)
+        before = away[: np.flatnonzero(away > 2.0).max(initial=0)]
+        if len(before) == 0:
+            continue
+        earlier = int(before.argmin())
+        there = _about(path[later + 1])
+        sigma = np.sqrt(np.diag(there @ (until[later] - until[earlier]) @ there.T))
+        certain = apart[earlier] + 2.0 * np.array([np.hypot(*sigma[:2]), sigma[2]]) < view
+        one, other = seen(earlier), seen(later)
+        if certain.all() and len(one) and len(other) and not np.isin(one, other).any():
+            return earlier, later
+    return None
 
 
 def closed_path(path: FloatArray, matches: Sequence[Match], lost: IntArray) -> FloatArray:

@@ -41,8 +41,12 @@ STRETCH_FRAMES, _OVERLAPPING = 50, 5
 # A stretch that shares landmarks with one this many lengths earlier is part of the map already.
 _LONG_AGO = 4
 #: Most landmarks of a constellation that is compared with others, at the cost of their number to
-#: the fourth power. Beyond these, most labels of a stretch are clutter, or parts of one landmark.
+#: the fourth power. Beyond these, most labels of a stretch are parts of one landmark.
 MOST_COMPARED = 80
+# Labels with fewer rows than this share of what a typical row's label has are mostly clutter.
+_LEAST_SHARE = 0.2
+#: Largest systematic error of each step of odometry, in standard deviations.
+SYSTEMATIC_SIGMAS = 2.0
 #: Stretches that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 
@@ -195,6 +199,17 @@ class Match:
     log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
+def enough_rows(rows: IntArray) -> float:
+    """Number of rows from which a label is hardly clutter, from those of the labels (n,) around it.
+
+    It is a share of the number that the label of the median row has. So slow robots, which see each
+    disc dozens of times, leave out clutter, and fast ones keep what they see once.
+    """
+    ordered = np.sort(rows)
+    middle = np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())
+    return float(_LEAST_SHARE * ordered[middle]) if len(rows) else 0.0
+
+
 def stretches_of(
     frames: IntArray,
     labels: IntArray,
@@ -208,14 +223,18 @@ def stretches_of(
 ) -> list[Stretch]:
     """The constellations with enough landmarks along a run of `count` frames.
 
-    They consist of `length` frames; if overlapping, one begins each fifth of it. Of more landmarks
-    than `most`, those with most rows count. `frames, labels` (n,), `xy` (M, 2).
+    They consist of `length` frames; if overlapping, one begins each fifth of it. With `most`, they
+    are for comparing places: those with most rows count, without clutter (`enough_rows`).
+    `frames, labels` (n,), `xy` (M, 2).
     """
     found, stride = [], length // _OVERLAPPING if overlapping else length
+    in_all = np.bincount(labels)
     for start in range(0, max(count - length // 2, 1), stride):
         first, last = np.searchsorted(frames, [start, start + length])
         seen, rows = np.unique(labels[first:last], return_counts=True)
         known = np.isfinite(xy[seen, 0])
+        if most is not None:
+            known &= in_all[seen] >= enough_rows(rows)
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:

@@ -73,7 +73,7 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
 
 
 def _merged(xy: FloatArray) -> FloatArray:
-    """(n, 2) means of rows close to each other."""
+    """(n, 2) means of rows close to each other, without clutter (`loops.enough_rows`)."""
     means: list[FloatArray] = []
     counts: list[int] = []
     for row in xy:
@@ -85,7 +85,8 @@ def _merged(xy: FloatArray) -> FloatArray:
         else:
             means.append(row)
             counts.append(1)
-    return np.array(means).reshape(-1, 2)
+    rows = np.array(counts, dtype=np.int64)
+    return np.array(means).reshape(-1, 2)[rows >= loops.enough_rows(rows)]
 
 
 def located(
@@ -126,8 +127,13 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
 
 
 def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> FloatArray:
-    """Covariance added by odometry along the way: all discs are moved, and rotated together."""
-    total = step_covariance.sum(axis=0)
+    """Covariance added by odometry along the way: all discs are moved, and rotated together.
+
+    Errors of steps are random, and systematic ones add up: discs are seen after half of the way on
+    average.
+    """
+    sigmas = np.sqrt(np.diagonal(step_covariance, axis1=1, axis2=2)).sum(axis=0)
+    total = step_covariance.sum(axis=0) + np.diag((0.5 * loops.SYSTEMATIC_SIGMAS * sigmas) ** 2)
     from_discs = rotation(pose[2]) @ -discs.mean(axis=0)
     turned = np.array([-from_discs[1], from_discs[0], 1.0])
     moved = np.diag([1.0, 1.0, 0.0]) * 0.5 * (total[0, 0] + total[1, 1])

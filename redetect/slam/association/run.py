@@ -42,7 +42,7 @@ from redetect.slam.association.loop_closing import (
     solve_path,
 )
 from redetect.slam.association.registration import ANYWHERE, register_maps
-from redetect.slam.errors import SlamError
+from redetect.slam.errors import UnregisteredError
 from redetect.slam.models import bearing_of_vertical, disc_in_robot, tilt_jacobian
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.settings import AssociateSettings
@@ -90,7 +90,8 @@ def associate_run(
     """Find which rows show the same landmark, ignoring IDs in the file.
 
     Only bearings of lines need the camera's centre in the robot frame, `camera_xy` (2,) (m).
-    `progress` is called with a description of the current stage.
+    `progress` is called with a description of the current stage. Raises `UnregisteredError` if the
+    run consists of parts, one of which has no certain place among the others.
     """
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
@@ -202,6 +203,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
     stretches: list[list[loops.Stretch]] = []
+    places: list[FloatArray] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # a part begins with its own start, not with the end of the one before
@@ -211,16 +213,22 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         own = run._replace(recording=part)
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        length, least = closed.stretch_frames, ANYWHERE.least_agreeing
-        stretches.append(own.stretches(closed.at, length, overlapping=False, least=least))
+        limits = {"least": ANYWHERE.least_agreeing, "most": loops.MOST_COMPARED}
+        compared = own.stretches(closed.at, closed.stretch_frames, overlapping=False, **limits)
+        stretches.append(compared)
+        places.append(np.full_like(closed.at.xy, np.nan))
+        for stretch in compared:  # the others are mostly clutter
+            places[-1][stretch.labels] = stretch.xy
     if len(parts) == 1:
         return parts[0]
     run.report("registering the parts")
-    motions, pairs, left = register_maps([part.at.xy for part in parts], stretches)
+    motions, pairs, left = register_maps(places, stretches)
     if left:
-        raise SlamError(
-            f"the frames from {recording.prefixes[starts[left[0]]]} ({starts[left[0]] + 1}) on "
-            "cannot be registered with the others: expected common landmarks"
+        frame = starts[left[0]]
+        raise UnregisteredError(
+            f"the frames from {recording.prefixes[frame]} on cannot be registered with the others: "
+            "expected common landmarks",
+            frame,
         )
     counts = np.cumsum([0, *(len(part.at.xy) for part in parts)])
     together = np.concatenate([part.at.labels + count for part, count in zip(parts, counts)])

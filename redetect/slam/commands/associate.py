@@ -16,13 +16,21 @@ from redetect.array_types import IntArray
 from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.messages import is_quiet
+from redetect.slam.association.loop_closing import unrecognised_return
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import Scores, score_run
 from redetect.slam.commands import files
-from redetect.slam.errors import SlamError
+from redetect.slam.errors import SlamError, UnregisteredError
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.options import Associate
-from redetect.slam.recording import UNKNOWN_ID, camera_xy_of, joined, landmark_files
+from redetect.slam.recording import (
+    UNKNOWN_ID,
+    Recording,
+    camera_xy_of,
+    first_poses,
+    joined,
+    landmark_files,
+)
 from redetect.storage import demand_free
 
 #: Labels (n,) of a file's rows, by the kind of the rows.
@@ -51,7 +59,11 @@ def perform(options: Associate) -> int:
         noisy = with_relative_noise(recording, factor, options.seed) if factor else recording
         # The rows' own gate grows with their covariances.
         began = time.perf_counter()
-        found = associate_run(noisy, settings, camera_xy=camera_xy, progress=_progress)
+        try:
+            found = associate_run(noisy, settings, camera_xy=camera_xy, progress=_progress)
+        except UnregisteredError as error:
+            k = int(np.searchsorted(first_poses(runs), error.frame + 1, side="right")) - 1
+            raise SlamError(f"{options.runs[k]}: {error}") from None
         seconds = time.perf_counter() - began
         _progress("")
         scores = score_run(recording, found)
@@ -70,13 +82,11 @@ def perform(options: Associate) -> int:
         print(f"{target}: {_counted(rows, labels)}")
     for run, own in zip(runs, of_discs):
         if 2 * np.count_nonzero(own < 0) > len(own):
-            way, reach = files.lengths_of(run)
-            print(
-                "most rows match no disc that is seen again: do rows and odometry fit each other? "
-                f"Steps are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; "
-                "expected metres, radians, and the axes of the robot, X left and Y backward",
-                file=sys.stderr,
-            )
+            print(_doubt(run), file=sys.stderr)
+    if result.path is not None and len(recording.circles) and not result.matches:
+        back = unrecognised_return(recording, result.circle_labels, result.path)
+        if back is not None:
+            print(_not_closed(recording, *back), file=sys.stderr)
     content = {
         "version": __version__,
         "run": str(options.run),
@@ -127,6 +137,25 @@ def _counted(rows: Sequence[Row], labels: Labels) -> str:
             if np.any(own < 0):
                 parts[-1] += f" and {np.count_nonzero(own < 0)} rows that match none of them"
     return ", ".join(parts) or "no landmarks"
+
+
+def _doubt(run: Recording) -> str:
+    """What may be wrong with a run most of whose rows of discs match none."""
+    way, reach = files.lengths_of(run)
+    return (
+        "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
+        f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
+        "radians, and the axes of the robot, X left and Y backward"
+    )
+
+
+def _not_closed(recording: Recording, earlier: int, later: int) -> str:
+    """That no loop is closed, and where odometry leads back to a place."""
+    return (
+        f"no loop is closed, although by odometry {recording.prefixes[later]} is at the place of "
+        f"{recording.prefixes[earlier]}: its discs are too few, too regular or among too much "
+        "clutter to be recognised"
+    )
 
 
 def _target(options: Associate, run: int, source: Path, several: bool) -> Path:

@@ -24,8 +24,8 @@ from redetect.slam.scoring import map_distance, path_distance
 from redetect.storage import demand_free, write_bytes
 
 ERROR_PICTURE = "errors.png"
-# The pose is lost if this many frames with discs in succession match none of them.
-_LOST_FRAMES = 20
+# The pose is lost if less than this share of the rows of so many frames with discs match.
+_LOST_SHARE, _LOST_FRAMES = 0.3, 20
 # Factor of innovations with known identifiers above which some are wrong, or covariances too small.
 _MOST_FACTOR = 2.5
 
@@ -58,10 +58,15 @@ def perform(command: Localize | Ekf) -> int:
         run, landmark_map, said = _mapped(command, recording)
         source, title = f"{command.run}", "EKF-SLAM, poses as they were at the time, map at the end"
     seconds = time.perf_counter() - began
+    placed = isinstance(command, Localize) and not command.lost
     if command.association != "known":
-        said += lost_lines(run, recording)
+        hint = " (--lost finds the start)" if placed else ""
+        said += [line + hint for line in lost_lines(run, recording)]
     elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
-        said.append("errors are much larger than stated: `slam audit` finds wrong identifiers")
+        start = "is --start where the run begins? " if placed else ""
+        said.append(
+            f"errors are much larger than stated: {start}`slam audit` finds wrong identifiers"
+        )
     said.append(f"time              {seconds:.2f} s, {len(recording) / seconds:.0f} steps/s")
     distance = None
     if reference is not None:
@@ -118,18 +123,23 @@ def _localized(command: Localize, recording: Recording) -> _Result:
 
 
 def lost_lines(run: FilterRun, recording: Recording) -> list[str]:
-    """The longest stretch of frames with discs that match none, in words, if it is long."""
+    """The longest stretch of frames with discs of which few rows match, in words, if it is long."""
     frames, of_row = np.unique(recording.circles.frame, return_inverse=True)
-    matched = np.flatnonzero(np.bincount(of_row[run.disc_ids >= 0], minlength=len(frames)))
-    ends = np.concatenate([[-1], matched, [len(frames)]])
-    without = np.diff(ends) - 1
-    longest = int(np.argmax(without))
-    if without[longest] < _LOST_FRAMES:
+    matched = np.bincount(of_row[run.disc_ids >= 0], minlength=len(frames))
+    counts = np.stack([matched, np.bincount(of_row)], axis=1)
+    before = np.concatenate([[[0, 0]], np.cumsum(counts, axis=0)])
+    several = before[_LOST_FRAMES:] - before[:-_LOST_FRAMES]
+    lost = np.flatnonzero(several[:, 0] < _LOST_SHARE * several[:, 1])
+    if len(lost) == 0:
         return []
-    first = frames[ends[longest] + 1]
+    longest = max(np.split(lost, np.flatnonzero(np.diff(lost) > 1) + 1), key=len)
+    part = np.arange(longest[0], longest[-1] + _LOST_FRAMES)
+    few = part[matched[part] < _LOST_SHARE * counts[part, 1]]
+    part = np.arange(few[0], few[-1] + 1)
+    fitting, rows = counts[part].sum(axis=0)
     return [
-        f"lost              {without[longest]} frames with discs, from {recording.prefixes[first]} "
-        "on, match none of the map: poses from there on may be wrong"
+        f"lost              only {fitting} of {rows} rows in {len(part)} frames with discs, from "
+        f"{recording.prefixes[frames[few[0]]]} on, match the map: poses from there on may be wrong"
     ]
 
 

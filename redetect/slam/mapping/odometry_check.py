@@ -4,7 +4,8 @@ The factor of a map, chi-squared over its expectation, may be near 1 although od
 than its covariances state: most numbers are those of rows. So the expectation is divided: that of
 odometry is the sum of its redundancies, the share of each number that the others check (W.
 Foerstner, B. P. Wrobel, Photogrammetric Computer Vision, 2016, chapter 4). Systematic errors of all
-steps, as of a wheel's radius or a unit, are further unknowns, from the minimum without them.
+steps, as of a wheel's radius or a unit, are further unknowns, from the minimum without them. They
+change with the adjusted steps: the errors of the measured ones would hide them, or look like them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import by_shared, diagonal_blocks
 from redetect.least_squares.solver import normal_equations
+from redetect.plane import between
 from redetect.slam.mapping.graph_terms import errors, linearise
 from redetect.slam.mapping.run_map import MappedRun
 from redetect.slam.models import between_jacobians
@@ -32,7 +35,8 @@ class OdometryCheck:
     """Errors of odometry and of rows, and systematic errors of odometry.
 
     The latter are corrections by which its steps would fit the rows, with standard deviations; NaN
-    if the camera's mounting is unknown, since its height has the scale of odometry.
+    if they are not determined, or the camera's mounting is unknown, since its height has the scale
+    of odometry.
     """
 
     odometry_factor: float  # chi-squared of odometry over its expectation; NaN without redundancy
@@ -56,9 +60,9 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
     border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
-        by_change = np.zeros((count, 3, 3))
-        by_change[:, :2, 0] = -graph.steps[:, :2]
-        by_change[:, 2, 1] = -np.hypot(graph.steps[:, 0], graph.steps[:, 1])
+        by_change, along = np.zeros((count, 3, 3)), _without_errors(graph.steps, estimate.poses)
+        by_change[:, :2, 0] = -along
+        by_change[:, 2, 1] = -np.hypot(*along.T)
         by_change[1:-1, :, 2] = 0.5 * (graph.steps[:-2] - graph.steps[2:])
         border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 3)
         problem = problem._replace(border=border[:, :2])
@@ -76,11 +80,17 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     error = errors(graph, estimate, weighting)
     squared = [float(np.sum(part**2)) for part in (error.odometry, error.discs, error.lines)]
     of_steps = np.sum(error.odometry**2, axis=1)
-    change, sigma = np.full(3, math.nan), np.full(3, math.nan)
+    change, variance = np.full(3, math.nan), np.full(3, math.nan)
     if not weighting.calibrate:
         with_lag = normal_equations(problem._replace(border=border))
         change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
-        sigma = np.sqrt(np.append(np.diag(spread), by_shared(with_lag)[1][2, 2]))
+        variance = np.append(np.diag(spread), by_shared(with_lag)[1][2, 2])
+    # Without redundancy, the systematic errors are not determined, and nothing else is checked.
+    if mapped.table.expected <= 0 or np.any(variance < 0.0):
+        odometry = rows = 0.0
+        variance[:] = math.nan
+    sigma = np.sqrt(np.where(variance > 0.0, variance, math.nan))
+    change = np.where(np.isnan(sigma), math.nan, change)
     (length, turn, lag), (length_sigma, turn_sigma, lag_sigma) = change.tolist(), sigma.tolist()
     return OdometryCheck(
         odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
@@ -94,3 +104,13 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
         outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
         worst_step=int(np.argmax(of_steps)),
     )
+
+
+def _without_errors(steps: FloatArray, poses: FloatArray) -> FloatArray:
+    """(N, 2) ways of the steps (N, 3) of odometry (m), with its scale but without random errors:
+    those of adjusted `poses` (N + 1, 3) times the scale.
+    """
+    adjusted = between(poses[:-1], poses[1:])[:, :2]
+    squared = float(np.sum(adjusted**2))
+    scale = float(np.sum(adjusted * steps[:, :2])) / squared if squared > 0.0 else 0.0
+    return scale * adjusted

@@ -382,7 +382,8 @@ def _check_usable(
         )
     if not np.any(recording.circles.identified) and not np.any(recording.lines.identified):
         raise SlamError(
-            f"{name}: no row has an identifier: expected a run with IDs (slam associate gives them)"
+            f"{name}: no row has an identifier: expected a run with IDs; slam associate gives them "
+            "to discs with three rows or more (--fewest-rows)"
         )
     if camera is None and (weighting.calibrate or len(recording.lines)):
         needs = "the camera's mounting" if weighting.calibrate else "lines"
