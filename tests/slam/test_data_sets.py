@@ -97,7 +97,8 @@ def test_the_response_of_a_robot_to_its_commands_is_found(
     assert learned == [None, None]
     distance, depth = (np.hypot(*run.circles.xy.T) for run in (recording, raw))
     bearing = np.arctan2(raw.circles.xy[:, 0], -raw.circles.xy[:, 1])
-    np.testing.assert_allclose(distance * found.depth * np.cos(bearing), depth)
+    # Rows are linearised near the landmark, not at its bearing as measured.
+    np.testing.assert_allclose(distance * found.depth * np.cos(bearing), depth, rtol=2e-3)
     off = [
         np.abs(wrap_angle(chain_steps(run.steps, true[0])[:, 2] - true[:, 2])).max()
         for run in (recording, raw)

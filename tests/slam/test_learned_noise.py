@@ -11,7 +11,8 @@ from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.plane import between
 from redetect.slam.filters.localizer import localize_run
-from redetect.slam.formats.ranges import Noise, Sightings, estimate_noise
+from redetect.slam.formats.ranges import Noise, Sightings, estimate_noise, with_noise
+from redetect.slam.mapping.run_map import map_run
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 
@@ -68,6 +69,18 @@ def test_the_noise_of_ranges_bearings_and_steps_is_learned(
     assert noise.ranges_alike < 0.1
     assert noise.bearings_alike < 0.1
     assert noise.wrong == 0
+
+
+def test_vague_ranges_do_not_shrink_the_map() -> None:
+    """Bearings fit the better the nearer a landmark is, unless rows are linearised where it is."""
+    run, seen, poses, places = _run(np.random.default_rng(8), 0.5, 1.0, 1.0)
+    near = disc_in_robot(poses[seen.frame + 1], places[seen.ids - 6])
+    run = replace(run, step_covariance=100.0 * ASSUMED.covariance(run.steps))
+    vague, right = Noise(ranges=20.0, ranges_alike=1.0), np.ones(len(seen.ids), dtype=np.bool_)
+    for at, least, most in ((None, 0.8, 0.95), (near, 0.99, 1.01)):
+        found = map_run(with_noise(run, seen, _stated(seen), vague, right, at)).estimate.disc_xy
+        sizes = [np.mean(np.hypot(*(xy[:, None] - xy).T)) for xy in (found, places)]
+        assert least < sizes[0] / sizes[1] < most
 
 
 def test_errors_of_a_landmark_that_are_alike_are_found() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import wrap_angle
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph_terms import Weighting
@@ -73,20 +73,31 @@ USUAL = Noise()
 
 
 def discs_of_ranges(
-    range_m: ArrayLike, bearing_rad: ArrayLike, sigma_m: ArrayLike, sigma_rad: ArrayLike
+    range_m: ArrayLike,
+    bearing_rad: ArrayLike,
+    sigma_m: ArrayLike,
+    sigma_rad: ArrayLike,
+    near: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Landmarks measured by range and bearing, as positions in the robot frame.
 
     Takes `range_m, bearing_rad` (n,) and their standard deviations, (n,) or one each; returns `xy`
-    (n, 2), `covariance` (n, 2, 2).
+    (n, 2), `covariance` (n, 2, 2). They are linearised `near` (n, 2), where that is not NaN, else
+    as measured: then bearings seem to fit better the nearer a landmark is, which shrinks a map of
+    vague ranges by the square of their relative error.
     """
-    distance = np.asarray(range_m, dtype=np.float64)
-    sin, cos = np.sin(bearing_rad), np.cos(bearing_rad)
-    direction = np.stack([sin, -cos], axis=-1)
-    sigma_across = np.asarray(sigma_rad, dtype=np.float64) * distance
-    across = sigma_across[..., None] * np.stack([cos, sin], axis=-1)
-    root = np.stack([np.asarray(sigma_m)[..., None] * direction, across], axis=-1)
-    return distance[..., None] * direction, root @ np.swapaxes(root, -1, -2)
+    distance, angle = np.asarray(range_m, np.float64), np.asarray(bearing_rad, np.float64)
+    far, at = distance, angle
+    if near is not None:
+        known = np.isfinite(near).all(axis=1)
+        far = np.where(known, np.hypot(*near.T), distance)
+        at = np.where(known, np.arctan2(near[:, 0], -near[:, 1]), angle)
+    direction = np.stack([np.sin(at), -np.cos(at)], axis=-1)
+    across = far[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
+    spread = np.asarray(sigma_rad, np.float64)[..., None] * across
+    root = np.stack([np.asarray(sigma_m)[..., None] * direction, spread], axis=-1)
+    xy = distance[..., None] * direction + wrap_angle(angle - at)[..., None] * across
+    return xy, root @ np.swapaxes(root, -1, -2)
 
 
 def with_noise(
@@ -94,19 +105,23 @@ def with_noise(
     seen: Sightings,
     sigma: FloatArray,
     noise: Noise = USUAL,
-    ids: IntArray | None = None,
+    right: BoolArray | None = None,
+    near: FloatArray | None = None,
 ) -> Recording:
     """A run with rows of some noise, by default the usual one; parameters as in `estimate_noise`.
 
-    The n rows of a visit, with a correlation c, have the weight of n / (1 + (n - 1) c). Some may
-    have lost their identifiers: `ids` (n,).
+    The n rows of a visit, with a correlation c, have the weight of n / (1 + (n - 1) c). Those that
+    are not `right` (n,) lose their identifiers; the others are linearised `near` (n, 2).
     """
     visits = _visits(seen)
     others = np.bincount(visits)[visits, None] - 1.0
     together = 1.0 + others * [noise.ranges_alike, noise.bearings_alike]
     sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigmas.T)
-    return replace(run, circles=CircleRows(seen.frame, *rows, seen.ids if ids is None else ids))
+    ids = seen.ids if right is None else np.where(right, seen.ids, UNKNOWN_ID)
+    if near is not None and right is not None:
+        near = np.where(right[:, None], near, np.nan)
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigmas[:, 0], sigmas[:, 1], near)
+    return replace(run, circles=CircleRows(seen.frame, *rows, ids))
 
 
 def estimate_noise(run: Recording, seen: Sightings, sigma: FloatArray) -> tuple[Recording, Noise]:
@@ -137,13 +152,15 @@ def _with_own_noise(
     """
     _demand_shown(2 * (len(seen.ids) - len(np.unique(seen.ids))) >= _FEWEST_NUMBERS)
     noise, visits, steps, longer, turn = USUAL, _visits(seen), run.steps, 0.0, 0.0
-    error = _errors(map_run(run, weighting=Weighting(loss="geman-mcclure")), seen) / sigma
+    near = _predicted(map_run(run, weighting=Weighting(loss="geman-mcclure")), seen)
+    error = _errors(near, seen) / sigma
     squared = np.sum(error**2, axis=1)
     right = squared <= max(1.0, float(np.nanmedian(squared)) / _MEDIAN) * _WRONG
-    run = with_noise(run, seen, sigma, noise, np.where(right, seen.ids, UNKNOWN_ID))
+    run = with_noise(run, seen, sigma, noise, right, near)
     for _ in range(_ROUNDS):
         mapped = map_run(run)
-        error = _errors(mapped, seen) / sigma
+        near = _predicted(mapped, seen)
+        error = _errors(near, seen) / sigma
         right = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1) <= _WRONG
         table, check = mapped.table, check_odometry(mapped)
         # Factors are NaN if there are too few numbers.
@@ -165,7 +182,7 @@ def _with_own_noise(
         corrected[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
         spread = noise.steps**2 * ASSUMED.covariance(steps) + further
         run = replace(run, steps=corrected, step_covariance=spread)
-        run = with_noise(run, seen, sigma, noise, np.where(right, seen.ids, UNKNOWN_ID))
+        run = with_noise(run, seen, sigma, noise, right, near)
     return run, noise
 
 
@@ -174,10 +191,15 @@ def _demand_shown(shown: bool | np.bool_) -> None:
         raise SlamError("the run does not show its noise")
 
 
-def _errors(mapped: MappedRun, seen: Sightings) -> FloatArray:
-    """(n, 2) errors of ranges (m) and bearings (rad) in a map; NaN if a landmark is not in it."""
+def _predicted(mapped: MappedRun, seen: Sightings) -> FloatArray:
+    """(n, 2) positions in the robot frame by a map; NaN if a landmark is not in it."""
     place = places_of(seen.ids, mapped.graph.disc_ids, mapped.estimate.disc_xy)
-    x, y = disc_in_robot(mapped.estimate.poses[seen.frame + 1], place).T
+    return np.asarray(disc_in_robot(mapped.estimate.poses[seen.frame + 1], place))
+
+
+def _errors(predicted: FloatArray, seen: Sightings) -> FloatArray:
+    """(n, 2) errors of ranges (m) and bearings (rad) for predicted positions (n, 2)."""
+    x, y = predicted.T
     off = wrap_angle(seen.bearing_rad - np.arctan2(x, -y))
     return np.stack([seen.range_m - np.hypot(x, y), off], axis=1)
 
