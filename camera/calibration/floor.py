@@ -24,6 +24,8 @@ from redetect.array_types import FloatArray
 from redetect.storage.bounded import rows_of_numbers
 
 _FEWEST_POINTS = 4
+#: Prior of the noise of a coordinate, pixels, and its degrees of freedom.
+_PRIOR_PX, _PRIOR_FREEDOM = 0.15, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,11 @@ def place_on_floor(
     _, pixels_by_intrinsics, pixels_by_pose = project_estimate(estimate, points)
     gain = np.linalg.pinv(pixels_by_pose.reshape(-1, 6)) @ pixels_by_intrinsics.reshape(-1, COUNT)
     by_intrinsics = -to_pose @ gain
-    covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T
+    # The noise that few points show is vague: with its prior, the variance's posterior mean.
+    freedom = 2 * len(pixels) - 6
+    variance = freedom * fit.sigma_px**2 + _PRIOR_FREEDOM * _PRIOR_PX**2
+    variance /= freedom + _PRIOR_FREEDOM - 2
+    covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T * (variance / fit.sigma_px**2)
     if intrinsics_covariance is not None:
         covariance = covariance + by_intrinsics @ intrinsics_covariance @ by_intrinsics.T
     warnings = []
