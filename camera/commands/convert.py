@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from camera.errors import ConversionError
 from camera.formats import files
 from camera.formats.models import ForeignCamera
 from camera.model import Camera
 from camera.options import Convert
+from camera.uncertainty import pixel_grid
 from redetect.storage import demand_place, write_bytes
+
+#: Rays farther off the axis, degrees, are beyond the model of ``.cam`` files.
+_WIDEST_DEG = 80.0
 
 
 def perform(options: Convert) -> int:
@@ -30,9 +36,17 @@ def perform(options: Convert) -> int:
         f"{converted.deviation_px:.3g} px, at ({u:.0f}, {v:.0f})"
     )
     if not converted.deviation_px <= options.limit_px:
+        advice = "choose another --model or format, or raise the limit"
+        if isinstance(camera, Camera):
+            rays = source.undistort(pixel_grid(source.width, source.height))
+            if (off := float(np.degrees(np.arctan(np.nanmax(np.hypot(*rays.T)))))) > _WIDEST_DEG:
+                advice = (
+                    f"the lens sees {off:.0f} degrees off its axis, {_WIDEST_DEG:g} of which .cam "
+                    "files describe well: crop its images"
+                )
         raise ConversionError(
             f"{options.target}: not written, since {converted.deviation_px:.3g} px is above "
-            f"--limit-px {options.limit_px:g}: choose another --model or format, or raise the limit"
+            f"--limit-px {options.limit_px:g}: {advice}"
         )
     if isinstance(camera, Camera) and camera.seen_share < 1.0:
         unseen = 100.0 * (1.0 - camera.seen_share)

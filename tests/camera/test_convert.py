@@ -312,6 +312,17 @@ def test_no_text_does_worse_than_an_error(text: str) -> None:
             parse(text)
 
 
+def test_a_lens_too_wide_for_cam_files_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = ForeignCamera("fisheye", 752, 480, 308.0, 308.0, 376.0, 240.0, (0.0,) * 4)
+    source = tmp_path / "wide.kalibr.yaml"
+    source.write_text(format_kalibr(wide))
+    assert main(["convert", str(source), str(tmp_path / "wide.cam")]) == 1
+    assert "the lens sees 83 degrees off its axis, 80 of which" in capsys.readouterr().err
+    assert not (tmp_path / "wide.cam").exists()
+
+
 def test_the_command_converts_and_refuses(
     tmp_path: Path, published_camera: Camera, capsys: pytest.CaptureFixture[str]
 ) -> None:
