@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
-from redetect.array_types import FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.plane import apply, fitted, rotation
 
@@ -43,7 +43,7 @@ _LONG_AGO = 4
 #: Most landmarks of a constellation that is compared with others, at the cost of their number to
 #: the fourth power. Beyond these, most labels of a stretch are parts of one landmark.
 MOST_COMPARED = 80
-# Labels with fewer rows than this share of what a typical row's label has are mostly clutter.
+# Labels with fewer rows than this share of what a typical row's label has may be clutter.
 _LEAST_SHARE = 0.2
 #: Largest systematic error of each step of odometry, in standard deviations.
 SYSTEMATIC_SIGMAS = 2.0
@@ -199,15 +199,18 @@ class Match:
     log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
-def enough_rows(rows: IntArray) -> float:
-    """Number of rows from which a label is hardly clutter, from those of the labels (n,) around it.
+def hardly_clutter(rows: IntArray, in_all: IntArray) -> BoolArray:
+    """(n,) mask of labels without clutter, if that is more than a third of them; else all.
 
-    It is a share of the number that the label of the median row has. So slow robots, which see each
-    disc dozens of times, leave out clutter, and fast ones keep what they see once.
+    Takes the numbers of their rows (n,) here and in all of the run. Those of clutter are less than
+    a share of the typical one, that of the median row's label. So slow robots, which see each disc
+    dozens of times, leave out clutter, and fast ones keep what they see once. A little clutter does
+    no harm, and discs seen for a moment are of use.
     """
     ordered = np.sort(rows)
     middle = np.searchsorted(np.cumsum(ordered), 0.5 * ordered.sum())
-    return float(_LEAST_SHARE * ordered[middle]) if len(rows) else 0.0
+    often = in_all >= _LEAST_SHARE * np.append(ordered, 0)[middle]
+    return np.asarray(often | (3 * np.count_nonzero(often) >= 2 * len(rows)))
 
 
 def stretches_of(
@@ -224,8 +227,8 @@ def stretches_of(
     """The constellations with enough landmarks along a run of `count` frames.
 
     They consist of `length` frames; if overlapping, one begins each fifth of it. With `most`, they
-    are for comparing places: those with most rows count, without clutter (`enough_rows`).
-    `frames, labels` (n,), `xy` (M, 2).
+    are for comparing places: those with most rows count, `hardly_clutter`. `frames, labels` (n,),
+    `xy` (M, 2).
     """
     found, stride = [], length // _OVERLAPPING if overlapping else length
     in_all = np.bincount(labels)
@@ -234,7 +237,7 @@ def stretches_of(
         seen, rows = np.unique(labels[first:last], return_counts=True)
         known = np.isfinite(xy[seen, 0])
         if most is not None:
-            known &= in_all[seen] >= enough_rows(rows)
+            known &= hardly_clutter(rows, in_all[seen])
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:

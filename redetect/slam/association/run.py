@@ -217,7 +217,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         compared = own.stretches(closed.at, closed.stretch_frames, overlapping=False, **limits)
         stretches.append(compared)
         places.append(np.full_like(closed.at.xy, np.nan))
-        for stretch in compared:  # the others are mostly clutter
+        for stretch in compared:  # others may be clutter
             places[-1][stretch.labels] = stretch.xy
     if len(parts) == 1:
         return parts[0]
