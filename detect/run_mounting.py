@@ -26,6 +26,8 @@ from redetect.array_types import FloatArray
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
+#: Largest change of the height that the outlines show, and share of frames that mostly have discs.
+_MOST_RAISED, _FEW_DISCS = 0.6, 0.4
 _TOGETHER = 5.0  #: Number of neighbouring frames that see the same discs.
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
@@ -56,6 +58,11 @@ class Mounting:
             f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
             f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
         )
+        if self.frames_with_discs < _FEW_DISCS * self.frames:
+            height += (
+                "; most frames show none: if discs are mostly in view, the radius or the "
+                "calibrated height is wrong, and so is this"
+            )
         return [lean, height]
 
 
@@ -84,7 +91,7 @@ def mounting_of_run(
             share = -(off + 0.5 * bend * share**2) / slope
         spread = 1.4826 * float(np.median(np.abs(same - off)))
         statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
-        raised_m = share * height_m
+        raised_m = share * height_m if abs(share) < _MOST_RAISED else math.nan
         sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
     frames = int(np.count_nonzero(verticals.known))
     return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)

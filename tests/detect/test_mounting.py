@@ -57,6 +57,16 @@ def test_lean_and_height_come_back(raised_m: float) -> None:
     assert 0.01 < found.raised_sigma_m < 0.03
     assert found.frames == found.frames_with_discs == 200
     assert f"{100 * found.raised_m:+.1f}" in found.sentences()[1]
+    assert "most frames show none" not in found.sentences()[1]
+
+
+def test_a_height_from_few_frames_is_doubted() -> None:
+    """At a wrong height, only things of another size look like discs, here and there."""
+    verticals, pitches = drive((0.01, 0.0), 0.0)
+    pitches[60:] = math.nan
+    found = mounting_of_run(HEIGHT_M, verticals, pitches)
+    assert found is not None
+    assert "most frames show none" in found.sentences()[1]
 
 
 def test_without_discs_the_height_stays() -> None:

@@ -22,6 +22,9 @@ from redetect.groundtruth.options import Network, Rig
 from redetect.groundtruth.report.pictures import draw_rig
 from redetect.storage import write_bytes
 
+#: Share of a marker's views above which those left out are warned of.
+_MANY_LEFT_OUT = 0.1
+
 
 def perform_network(command: Network) -> int:
     """Carry out ``groundtruth network``; returns the exit code."""
@@ -74,7 +77,7 @@ def perform_rig(command: Rig) -> int:
         groups, network, command.width_m, command.settings, reference=command.reference, known=known
     )
     frame = f"robot, by {command.robot.name}" if command.robot else f"marker {estimate.reference}"
-    rig, table = estimate.rig, []
+    rig, table = estimate.rig, list[dict[str, Any]]()
     for index, marker in enumerate(rig.ids):
         own = [i for i, view in enumerate(estimate.views) if view.rig_index == index]
         table.append({"marker": marker, **estimate.adjusted.residual_figures(own)})
@@ -100,6 +103,13 @@ def perform_rig(command: Rig) -> int:
     for marker, reason in estimate.left_out.items():
         print(f"marker {marker}: left out: {reason}")
     outputs.print_table(table)
+    for row in table:
+        marker, views, left_out = (row[name] for name in ("marker", "views", "left_out"))
+        if left_out > max(_MANY_LEFT_OUT * views, 2):
+            outputs.warn(
+                f"marker {marker}: {left_out} of {views} views disagree with the others: was it "
+                "moved, or misread?"
+            )
     outputs.print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
     print(
         f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "

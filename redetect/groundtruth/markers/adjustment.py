@@ -208,21 +208,28 @@ class AdjustedBundle:
         }
 
 
+#: Residuals this many times as large as those of most views are unusual.
+_UNUSUAL = 3.0
+
+
 def adjust_bundle(
     bundle: Bundle, *, outlier_sigma: float = 5.0, outlier_px: float = 1.0
 ) -> AdjustedBundle:
     """Adjust all free poses: robustly first, then by least squares without the wrong views.
 
     The bundle's poses are the start. A view is wrong if its normalised error and its residuals (px)
-    are larger than `outlier_sigma` and `outlier_px`. Raises `GeometryError` if the start has a
-    point behind its camera, or the points do not determine the poses.
+    are larger than `outlier_sigma` and `outlier_px`, and these than is usual here. Raises
+    `GeometryError` if the start has a point behind its camera, or the points do not determine the
+    poses.
     """
     everything = np.ones(len(bundle.seen), dtype=np.bool_)
     bundle = _minimised(bundle, everything, _ROBUST, _NEAR)
     used = everything
     for _ in range(5):
         errors, rms = _view_figures(bundle)
-        wrong = (errors > outlier_sigma) & (rms > outlier_px)
+        # Corners may be less accurate than stated, all of them.
+        least_px = max(outlier_px, _UNUSUAL * float(np.median(rms)))
+        wrong = (errors > outlier_sigma) & (rms > least_px)
         kept = ~wrong[bundle.view]
         if np.array_equal(kept, used) and used is not everything:
             break

@@ -171,6 +171,9 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
 
     By Levenberg-Marquardt with all headings, from all around the fiducial of the first distance.
     """
+    # Relative to that fiducial, since the solver's tolerance is relative to the coordinates.
+    origin = measured.fiducials[0]
+    measured = measured._replace(fiducials=measured.fiducials - origin)
     angles = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     bearing, heading = (part.ravel() for part in np.meshgrid(angles, angles))
     point = measured.fiducials[0] + measured.distances_m[0] * rotation(bearing)[:, :, 0]
@@ -192,7 +195,7 @@ def distance_minima(measured: Measured) -> tuple[FloatArray, FloatArray]:
         apart[:, 2] = np.abs(wrap_angle(apart[:, 2]))
         if not np.any(apart.max(axis=1, initial=0.0) < _SAME_M):
             kept.append(i)
-    return poses[kept], cost[kept]
+    return poses[kept] + np.append(origin, 0.0), cost[kept]
 
 
 def distance_residuals(pose: FloatArray, measured: Measured) -> tuple[FloatArray, FloatArray]:

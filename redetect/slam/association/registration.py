@@ -7,7 +7,7 @@ have repetitive structure.
 
 For global localisation, odometry combines the discs of the first frames, of more and more until the
 place is unique. For another run, each stretch is located separately; stretches located by chance,
-or in a similar room, do not agree with each other.
+or in a similar place, do not agree with each other.
 """
 
 from __future__ import annotations

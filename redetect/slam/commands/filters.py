@@ -24,7 +24,7 @@ from redetect.slam.scoring import map_distance, path_distance
 from redetect.storage import demand_free, write_bytes
 
 ERROR_PICTURE = "errors.png"
-# The pose is lost if less than this share of the rows of so many frames with discs match.
+# The pose is lost if less than this share of the rows of this number of frames with discs match.
 _LOST_SHARE, _LOST_FRAMES = 0.3, 20
 # Factor of innovations with known identifiers above which some are wrong, or covariances too small.
 _MOST_FACTOR = 2.5

@@ -23,6 +23,7 @@ from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import MOUNTING, Weighting, cost, linearise
 
 _MOST_STEPS = 200
+_ROBUST_ADVICE = "; if some identifiers are wrong, --loss geman-mcclure leaves their rows out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ def solve(
     if not found.converged:
         raise SlamError(
             f"least squares: no minimum within {_MOST_STEPS} steps: chi-squared is "
-            f"{found.costs[-1]:.6g} and falling"
+            f"{found.costs[-1]:.6g} and falling{_ROBUST_ADVICE}"
         )
     return found
 
@@ -114,7 +115,7 @@ def _determined(what: str) -> Iterator[None]:
         yield
     except np.linalg.LinAlgError:
         raise SlamError(
-            f"{what}: the measurements do not determine all poses and landmarks"
+            f"{what}: the measurements do not determine all poses and landmarks{_ROBUST_ADVICE}"
         ) from None
 
 

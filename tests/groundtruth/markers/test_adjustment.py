@@ -162,6 +162,17 @@ def test_a_wrong_view_is_left_out_and_the_rest_is_as_without_it() -> None:
     assert adjusted.cost == pytest.approx(without.cost, rel=1e-9)
 
 
+def test_corners_may_be_less_accurate_than_stated() -> None:
+    """Ten times as much noise as stated: only the view that is wrong is left out."""
+    bundle = watched_robot(seed=3, times=8)
+    wrong = bundle.view == 5
+    rng = np.random.default_rng(4)
+    pixels = bundle.seen.pixels + rng.normal(0.0, 10.0 * SIGMA_PX, bundle.seen.pixels.shape)
+    pixels[wrong] += [30.0, -25.0]
+    adjusted = adjust_bundle(replace(bundle, seen=replace(bundle.seen, pixels=pixels)))
+    np.testing.assert_array_equal(adjusted.used, ~wrong)
+
+
 def test_bodies_alone_and_shared_poses_alone_are_adjusted() -> None:
     for fixed in ("cameras and parts", "bodies"):
         of_bodies = fixed == "bodies"

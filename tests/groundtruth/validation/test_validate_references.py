@@ -117,6 +117,18 @@ def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -
 
 
 @pytest.mark.long
+def test_the_origin_of_the_world_does_not_matter() -> None:
+    """Coordinates of a map may be large: converged copies of one minimum must not differ."""
+    rng, far = np.random.default_rng(2), np.array([9e5, -9e5])
+    for _ in range(6):
+        near = {f"f{k}": rng.uniform([-2.0, -2.0], [12.0, 9.0]) for k in range(4)}
+        pose = np.array([*rng.uniform([0.0, 0.0], [10.0, 7.0]), rng.uniform(-3.1, 3.1)])
+        survey = survey_of({name: tuple(xy + far) for name, xy in near.items()})
+        found = solved(measured(pose + np.append(far, 0.0), survey, rng), survey)
+        assert found.status == "ok"
+        assert np.abs(found.pose[:2] - far - pose[:2]).max() < 0.03
+
+
 def test_the_covariance_is_that_of_the_errors() -> None:
     rng = np.random.default_rng(1)
     survey = survey_of()
