@@ -20,14 +20,8 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
-from detect.discs.candidates import (
-    SURE,
-    best_apart,
-    local_maxima,
-    paleness_penalty,
-    sign_penalty,
-    suppress_published,
-)
+from detect.discs.candidates import best_apart, local_maxima, suppress_published
+from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import Fate, JudgedCandidates, judge

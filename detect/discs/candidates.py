@@ -1,22 +1,12 @@
-"""Compares the discs of an image: they mostly look alike, and the best of close ones are kept."""
+"""Non-maximum suppression: keeps the best of centres that are close to each other."""
 
 from __future__ import annotations
-
-import math
 
 import cv2
 import numpy as np
 
-from detect.discs.rim import median
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
 from redetect.compiled import kernel
-
-#: Log-odds from which a disc is sure; doubtful discs are compared with the sure ones.
-SURE = 2.5
-_PALE = 0.5  #: A disc with less than this share of the others' contrast is pale.
-_PER_FACTOR = 4.0  #: Penalty for each factor of e, log-odds.
-_LEAST_OTHERS = 2  #: Least number of sure discs to compare with.
-_DARKEST = 5.0  #: Lowest grey value used in a ratio.
 
 
 def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
@@ -28,17 +18,22 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
     around = np.ones((3, 3), np.uint8)
     quality = np.where((quality >= threshold) & (quality > 0.0), quality, 0.0)
     highest = (quality > 0.0) & (quality >= cv2.dilate(quality, around))
-    _, plateau = cv2.connectedComponents(highest.astype(np.uint8), connectivity=8)
-    # Beside a plateau that touches a higher pixel is an equal one that is not among the highest.
-    lost = highest & (cv2.dilate(np.where(highest, 0.0, quality), around) >= quality)
-    highest &= ~np.isin(plateau, plateau[lost])
+    while True:
+        # A plateau that touches a higher pixel is removed, pixel by pixel.
+        lost = cv2.dilate(np.where(highest, 0.0, quality), around)
+        if not np.any(highest & (lost >= quality)):
+            break
+        highest &= lost < quality
+    labels, plateau = cv2.connectedComponents(highest.astype(np.uint8), connectivity=8)
     rows, columns = np.nonzero(highest)
-    _, number, size = np.unique(plateau[highest], return_inverse=True, return_counts=True)
+    number, count = plateau[rows, columns] - 1, labels - 1  # 0 is what is no maximum
+    size = np.bincount(number, minlength=count)
     off = np.zeros(len(number))
     for place in (rows, columns):
-        off += (place - (np.bincount(number, place) / size)[number]) ** 2
-    order = np.lexsort((off, number))  # the first of those nearest
-    middle = order[np.unique(number[order], return_index=True)[1]]
+        off += (place - (np.bincount(number, place, count) / size)[number]) ** 2
+    # The first of those nearest.
+    order = np.lexsort((np.arange(len(number)), off, number))
+    middle = order[np.concatenate([[0], np.cumsum(size)[:-1]])] if count else order
     maxima = np.zeros(quality.shape, np.bool_)
     maxima[rows[middle], columns[middle]] = True
     return maxima
@@ -92,55 +87,3 @@ def suppress_published(
                 kept[i] = False
                 break
     return kept
-
-
-@kernel()
-def paleness_penalty(contrast: FloatArray, floor_grey: FloatArray, sure: BoolArray) -> FloatArray:
-    """(N,) penalties, log-odds, for discs that are paler than the sure discs of their image.
-
-    A candidate with much less contrast than the sure discs is mostly the reflection of one in a
-    polished floor or in glass. A disc in shadow has less contrast, too, but its ratio to the floor
-    is the same as elsewhere, so the better of both measures counts. The constants were chosen on
-    the first 1,000 frames of run e; rendered buildings confirm them.
-
-    The contrast is that between a disc and its floor, grey levels. Sure discs have no penalty; the
-    others are compared with the sure discs of their own sign, if there are at least two.
-    """
-    penalty, ratio = np.zeros(len(contrast)), np.empty(len(contrast))
-    for k in range(len(contrast)):
-        disc = max(floor_grey[k] + contrast[k], _DARKEST)
-        ratio[k] = abs(math.log(disc / max(floor_grey[k], _DARKEST)))
-    contrasts, ratios = np.empty(len(contrast)), np.empty(len(contrast))
-    for sign in (1.0, -1.0):
-        count = 0
-        for k in range(len(contrast)):
-            if sure[k] and sign * contrast[k] > 0.0:
-                contrasts[count], ratios[count] = abs(contrast[k]), ratio[k]
-                count += 1
-        if count < _LEAST_OTHERS:
-            continue
-        usual_contrast, usual_ratio = median(contrasts[:count]), median(ratios[:count])
-        for k in range(len(contrast)):
-            if not sure[k] and sign * contrast[k] > 0.0:
-                of_contrast = abs(contrast[k]) / (_PALE * usual_contrast)
-                paleness = max(of_contrast, ratio[k] / max(usual_ratio, 1e-3), 1e-3)
-                penalty[k] = _PER_FACTOR * max(-math.log(paleness), 0.0)
-    return penalty
-
-
-@kernel()
-def sign_penalty(contrast: FloatArray, sure: BoolArray) -> FloatArray:
-    """(N,) penalties, log-odds, for discs whose sign is uncertain or less likely than the other.
-
-    If m of n sure discs have a sign, the probability of that sign is (m + 1) / (n + 2) by Laplace's
-    rule of succession; if the settings fix the polarity, it is 1.
-    """
-    light, dark = 1, 1
-    for k in range(len(contrast)):
-        light += sure[k] and contrast[k] > 0.0
-        dark += sure[k] and contrast[k] < 0.0
-    penalty = np.empty(len(contrast))
-    for k in range(len(contrast)):
-        alike = light if contrast[k] > 0.0 else dark
-        penalty[k] = math.log((light + dark) / alike)
-    return penalty

@@ -17,6 +17,7 @@ import numpy as np
 from camera import Camera
 from detect.circles import CircleDetections, scene_of, vote_shape
 from detect.discs.fit import working_space
+from detect.discs.identity import ids_of_rows
 from detect.discs.judgement import NO_CANDIDATES
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.discs.placing import place_discs
@@ -37,23 +38,19 @@ from detect.runs.plan import (
 from detect.settings import CircleSettings
 from detect.sources.interface import read_image
 from lut import VerticalTable, cached_vertical_table, cached_vote_table
-from redetect.array_types import FloatArray, GreyImage
+from redetect.array_types import GreyImage
 from redetect.interrupts import interrupts_deferred
 from redetect.landmarks import (
     CircleLandmark,
     FrameTilt,
     Landmark,
     LandmarkError,
-    associate,
-    circle_arrays,
     circle_landmarks,
     format_levelling,
     format_no_tilt,
     format_outline_tilt,
     format_record,
     format_tilt,
-    is_positive_definite,
-    squared_mahalanobis,
     tilt_as_written,
 )
 
@@ -64,8 +61,6 @@ if TYPE_CHECKING:
 #: Errors of one frame, not of the run.
 FRAME_ERRORS = (FrameError, LandmarkError, ArithmeticError, np.linalg.LinAlgError, MemoryError)
 
-#: Chi-squared of two degrees of freedom exceeds this once in a thousand.
-_GATE = 2.0 * math.log(1000.0)
 #: Standard deviation of the path of a map, metres, in addition to the covariances of its discs.
 _MAP_SIGMA_M = 0.1
 #: Least difference of a frame's tilt from the lean of a run with which discs are searched again.
@@ -304,33 +299,6 @@ def _disc_rows(
         for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
             ids[k] = own or (-1,)
     return [replace(row, ids=own) for row, own in zip(rows, ids)]
-
-
-def ids_of_rows(
-    xy: FloatArray,
-    rows: Sequence[CircleLandmark],
-    covariance: FloatArray | None = None,
-    slack_m: float = 0.0,
-) -> list[tuple[int, ...]]:
-    """IDs of discs, from rows of the same discs in the same frame; () for discs without a row.
-
-    If the rows are not corrected for the tilt, the discs (N, 2) must not be either: then both refer
-    to the same pixels, whatever the tilt, and the discs' own covariance is not used. `slack_m` is
-    the standard deviation, per axis, of errors that no covariance includes. Rows with a singular
-    covariance, such as zero, give no ID.
-    """
-    known = circle_arrays(rows)
-    spread = known.covariance + slack_m**2 * np.eye(2)
-    if covariance is not None:
-        spread = spread + covariance[:, None]
-    usable = is_positive_definite(spread)
-    spread = np.where(usable[..., None, None], spread, np.eye(2))
-    distance = squared_mahalanobis(xy[:, None] - known.xy, spread)
-    pairs = associate(distance, usable & (distance <= _GATE))
-    ids: list[tuple[int, ...]] = [()] * len(xy)
-    for disc, row in zip(pairs.first, pairs.second):
-        ids[disc] = rows[row].ids
-    return ids
 
 
 def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:

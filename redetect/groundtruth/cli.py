@@ -16,8 +16,8 @@ PROGRAM = Program(
     {
         options.Rig: "redetect.groundtruth.commands.markers:perform_rig",
         options.Network: "redetect.groundtruth.commands.markers:perform_network",
-        options.Poses: "redetect.groundtruth.commands.poses:perform_poses",
-        options.Score: "redetect.groundtruth.commands.poses:perform_score",
+        options.Poses: "redetect.groundtruth.commands.poses:perform",
+        options.Score: "redetect.groundtruth.commands.score:perform",
         options.Lasers: "redetect.groundtruth.commands.lasers:perform_lasers",
         options.Laser: "redetect.groundtruth.commands.lasers:perform_laser",
         options.Sync: "redetect.groundtruth.commands.fusion:perform_sync",

@@ -1,13 +1,10 @@
-"""The commands ``groundtruth poses`` and ``score``: poses from markers in images, and errors."""
+"""The command ``groundtruth poses``: a robot's poses from its markers in cameras' images."""
 
 from __future__ import annotations
 
-import math
 import sys
 from collections import Counter
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,9 +13,8 @@ from redetect.groundtruth.commands import outputs
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.markers import session
 from redetect.groundtruth.markers.track import PoseStatus, Track, report_entry, track_by_markers
-from redetect.groundtruth.options import Poses, Score
-from redetect.groundtruth.trajectories import streams
-from redetect.groundtruth.validation import scoring
+from redetect.groundtruth.options import Poses
+from redetect.groundtruth.trajectories.streams import format_tum, write_planar_poses
 from redetect.json_text import json_text
 from redetect.messages import counted
 from redetect.storage import write_bytes
@@ -30,7 +26,7 @@ _MANY_LEFT_OUT, _MOST_LEFT_OUT, _OF_THE_WRONG = 0.1, 0.5, 0.8
 _MUCH_TOO_LARGE = 9.0
 
 
-def perform_poses(command: Poses) -> int:
+def perform(command: Poses) -> int:
     """Carry out ``groundtruth poses``; returns the exit code: 1 without a single pose."""
     runs = session.find_runs(command.session)
     network_path = command.network or command.session / "network.json"
@@ -68,7 +64,7 @@ def perform_poses(command: Poses) -> int:
             f"widths and poses of markers in {rig_path}, the poses of cameras in {network_path}, "
             "or a lens calibration may be wrong"
         )
-    streams.write_planar_poses(output, poses, overwrite=command.force)
+    write_planar_poses(output, poses, overwrite=command.force)
     content = {
         **outputs.provenance(command.settings, (rig_path, network_path)),
         "columns": "t x y theta, covariance of x y theta row by row (s, m, rad)",
@@ -78,7 +74,7 @@ def perform_poses(command: Poses) -> int:
     write_json(settings_path, content, overwrite=command.force)
     if command.tum is not None:
         in_space = np.stack([pose.world_from_robot for _, pose in track.posed])
-        text = streams.format_tum(poses.times_s, in_space)
+        text = format_tum(poses.times_s, in_space)
         write_bytes(command.tum, text.encode(), overwrite=command.force)
     print(f"{output}: written")
     return 0
@@ -107,43 +103,3 @@ def print_left_out(track: Track, rig_path: Path, network_path: Path) -> None:
         f"{first}poses or widths of markers, in {rig_path}, or poses of cameras, in "
         f"{network_path}, may be wrong"
     )
-
-
-def perform_score(command: Score) -> int:
-    """Carry out ``groundtruth score``: compare poses with the truth; returns the exit code."""
-    outputs.check_outputs((command.json,), command.force)
-    solution, truth = (
-        streams.read_planar_poses(command.poses),
-        streams.read_planar_poses(command.truth),
-    )
-    relations = None if command.relations is None else scoring.read_relations(command.relations)
-    poses, truth, unmatched = streams.matched_streams(
-        solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate
-    )
-    alignment = streams.planar_alignment(poses, truth) if command.align else None
-    if alignment is not None:
-        poses = streams.moved_poses(poses, alignment)
-    score = scoring.score_poses(poses, truth, unmatched)
-    print(f"poses              {score.poses} ({score.unmatched} without the other at their time)")
-    print(*score.lines(), sep="\n")
-    relative = {}
-    if relations is not None:
-        relative["relations"] = scoring.score_relations(solution, relations, command.largest_gap_s)
-    if command.rpe_step is not None:
-        steps = scoring.score_steps(poses, truth, command.rpe_step, command.rpe_longest_s)
-        relative[f"steps of {command.rpe_step}"] = steps
-    for name, figures in relative.items():
-        print(
-            f"relative error, {name}: {figures.pairs} pairs ({figures.unmatched} left out), "
-            f"rmse {1e3 * figures.position_rmse_m:.2f} mm, median "
-            f"{1e3 * figures.position_median_m:.2f}, max {1e3 * figures.position_max_m:.2f}; "
-            f"rmse {math.degrees(figures.angle_rmse_rad):.3f} deg"
-        )
-    if command.json is not None:
-        values: dict[str, Any] = asdict(score)
-        if alignment is not None:
-            values["alignment"] = alignment.tolist()
-        if relative:
-            values["relative"] = {name: asdict(figures) for name, figures in relative.items()}
-        write_json(command.json, values, overwrite=command.force)
-    return 0

@@ -12,7 +12,7 @@ from camera import Camera
 from camera.kernels import camera_numbers
 from camera.model_checks import checked_pose
 from detect.circles import CircleDetections, detect_circles
-from detect.discs.candidates import paleness_penalty, sign_penalty
+from detect.discs.evidence import paleness_penalty, sign_penalty
 from detect.discs.judgement import GLANCED_AT, glance
 from detect.settings import CircleSettings
 from lut import VoteTable
