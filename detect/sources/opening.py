@@ -152,7 +152,8 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         poses = source.poses(named)
     elif named.endswith((".tum", ".velocities")):
         read = tum_poses if named.endswith(".tum") else velocity_poses
-        poses = PoseStream(named, Path(named), lambda: read(Path(named)))
+        of_velocities = read is velocity_poses
+        poses = PoseStream(named, Path(named), lambda: read(Path(named)), of_velocities)
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):

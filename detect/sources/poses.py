@@ -52,8 +52,7 @@ _END_SLACK_S = 1e-3
 class TimedPose:
     """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
-    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown. `is_guessed`
-    means that of the movement since the pose before, nothing was measured.
+    The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
     """
 
     time_s: float
@@ -61,15 +60,18 @@ class TimedPose:
     y: float
     theta: float
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    is_guessed: bool = False
 
 
 class PoseStream(NamedTuple):
-    """Poses of the robot over time: their name in messages, their file, and their reader."""
+    """Poses of the robot over time: their name in messages, their file, and their reader.
+
+    With `of_velocities`, nothing is known of the movement between poses that are far apart.
+    """
 
     name: str
     path: Path
     read: Callable[[], Generator[TimedPose, None, None]]
+    of_velocities: bool = False
 
 
 def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
@@ -119,9 +121,11 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 class PosesOverTime:
     """Poses in order, read once; requests must be in order, too."""
 
-    def __init__(self, poses: Iterator[TimedPose], name: str) -> None:
+    def __init__(
+        self, poses: Iterator[TimedPose], name: str, *, of_velocities: bool = False
+    ) -> None:
         self._poses = poses
-        self._name = name
+        self._name, self._of_velocities = name, of_velocities
         self.jumps = self.jumped = False  # now, and since the last step
         self._way_m, self._longest_s = 0.0, LARGEST_GAP_S
         self._before: TimedPose | None = None
@@ -151,7 +155,8 @@ class PosesOverTime:
                     "nanoseconds"
                 )
             fastest_m = max(_FASTEST_M_S * max(seconds, 1e-3), _LONGER * self._way_m)
-            self.jumps = self._after.is_guessed or way_m > fastest_m
+            is_guessed = self._of_velocities and seconds > self._longest_s
+            self.jumps = is_guessed or way_m > fastest_m
             self.jumped, self._way_m = self.jumped or self.jumps, way_m
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one
@@ -194,21 +199,17 @@ def velocity_poses(path: Path) -> Generator[TimedPose, None, None]:
 
     Their noise is white and, for positions, the same in all directions; sigmas are the standard
     deviations of its integral over one second (DLR Spatial Cognition data set report, equation 1).
-    Over rows that are much farther apart than those before, the movement is unknown.
     """
 
     def arcs() -> Iterator[_Arc]:
         columns = "t v omega sigma_v sigma_omega"
         last: list[float] = []
-        usual_s = LARGEST_GAP_S
         for place, row in rows_of_numbers(path, "file of velocities", columns, DetectError):
-            time_s, speed, turning, sigma_m, sigma_rad = last or row
+            time_s, speed, turning, *sigmas = last or row
             seconds = row[0] - time_s
-            root = math.sqrt(max(seconds, 0.0))
-            guessed = seconds > _USUAL_GAPS * max(usual_s, LARGEST_GAP_S)
-            movement = (seconds * speed, seconds * turning, root * sigma_m, root * sigma_rad)
-            yield _Arc(place, row[0], *movement, guessed)
-            last, usual_s = row, seconds
+            deviations = (math.sqrt(max(seconds, 0.0)) * sigma for sigma in sigmas)
+            yield _Arc(place, row[0], seconds * speed, seconds * turning, *deviations)
+            last = row
 
     return _poses_along(arcs())
 
@@ -222,12 +223,11 @@ class _Arc(NamedTuple):
     turn_rad: float
     sigma_m: float = 0.0  # of either coordinate
     sigma_rad: float = 0.0  # of the heading
-    is_guessed: bool = False
 
 
 def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
     pose = TimedPose(0.0, 0.0, 0.0, 0.0)
-    for place, time_s, *movement, is_guessed in arcs:
+    for place, time_s, *movement in arcs:
         if not max(map(abs, movement)) <= FARTHEST:
             raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
         way_m, turn_rad, sigma_m, sigma_rad = movement
@@ -238,7 +238,7 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
         by_heading = np.array([[-0.5 * dy, 0.5 * dx, 1.0], [-dy, dx, 0.0] / np.sqrt(12.0)])
         errors = np.vstack([sigma_m * np.eye(2, 3), sigma_rad * by_heading])
         covariance = carried(pose.covariance, pose, after) + errors.T @ errors
-        pose = replace(after, covariance=covariance, is_guessed=is_guessed)
+        pose = replace(after, covariance=covariance)
         yield pose
 
 
@@ -282,7 +282,8 @@ class FramesAlongPoses(Frames):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
         with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
-            poses = PosesOverTime(read, self._stream.name)
+            name, of_velocities = self._stream.name, self._stream.of_velocities
+            poses = PosesOverTime(read, name, of_velocities=of_velocities)
             last: TimedPose | None = None
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)

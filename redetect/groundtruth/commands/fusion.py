@@ -29,8 +29,8 @@ from redetect.messages import counted
 _CONFIDENCE = 1.959964
 #: Share of a stream's poses above which rejections are warned of.
 _MANY_REJECTED = 0.1
-#: Relative error of odometry's turns or distances that is no error of wheels any more.
-_NO_SCALE = 0.3
+#: Largest relative error of turns or distances that wheels may have.
+_LARGEST_SCALE = 0.3
 
 
 def perform_sync(options: Sync) -> int:
@@ -179,7 +179,7 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
         (fusion.odometry.turn_scale, "turned", "are its angles radians, counter-clockwise?"),
         (fusion.odometry.distance_scale, "moved", "are its positions metres?"),
     ):
-        if abs(scale) > _NO_SCALE:
+        if abs(scale) > _LARGEST_SCALE:
             warn(
                 f"{options.odometry}: the robot {moved} {1.0 + scale:.2f} times as much as it "
                 f"says: {advice}"

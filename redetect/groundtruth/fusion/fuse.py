@@ -155,6 +155,12 @@ class Rejected:
     squared_innovation: float  # Squared normalised innovation
 
 
+def _rejected(problem: MovementProblem, squared: FloatArray, which: BoolArray) -> list[Rejected]:
+    """Those measurements (M,), with their squared normalised innovations."""
+    columns = (problem.streams, problem.measured_s, squared)
+    return [Rejected(*row) for row in zip(*(column[which].tolist() for column in columns))]
+
+
 def wrong_starts(problem: MovementProblem) -> FloatArray:
     """(M,) squared innovations of measurements at the start, or after a gap, that most of those
     after them contradict; 0 of others.
@@ -240,9 +246,7 @@ def fuse(
     streams = {name: with_sag(stream, own) for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, settings)
     wrong = wrong_starts(problem)
-    at_start = zip(
-        problem.streams[wrong > 0.0], problem.measured_s[wrong > 0.0], wrong[wrong > 0.0]
-    )
+    rejected = _rejected(problem, wrong, wrong > 0.0)
     problem = problem.with_only(wrong == 0.0)
     first, last = problem.times_s[0], problem.times_s[-1]
     inside = odometry.times_s[odometry.during(first, last)]
@@ -282,15 +286,13 @@ def fuse(
     # The errors of a localisation are stationary.
     localisation = None
     if settings.learn_noise:
-        found = as_localisation(last_of_each_time(odometry), problem, over_seconds, path)
+        found = as_localisation(own, problem, over_seconds, path)
         if found is not None:
             path, localisation = found
             restarted[:] = False
-    out = ~innovations.accepted
-    in_filter = zip(problem.streams[out], problem.measured_s[out], innovations.squared[out])
-    rejected = [Rejected(str(name), float(t), float(d)) for name, t, d in (*at_start, *in_filter)]
+    rejected += _rejected(problem, innovations.squared, ~innovations.accepted)
     numbers = [smoothed[-1, 3:], _systematic_deviations(spread), noise, np.array([inflation])]
-    pauses = pauses_of(last_of_each_time(odometry))
+    pauses = pauses_of(own)
     return Fusion(
         poses=path,
         filtered=_path(inside, states[at], spreads[at]),

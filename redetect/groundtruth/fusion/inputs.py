@@ -90,15 +90,16 @@ def with_sag(poses: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
     passed = np.diff(odometry.times_s)
     rates = log_motion(between(odometry.poses[:-1], odometry.poses[1:])) / passed[:, None]
     changes = np.pad(np.square(np.diff(rates, axis=0)), ((1, 1), (0, 0)), mode="edge")
-    # Squares of the deviations in the middle of each arc: along the path, across it, of the turn.
+    # Squared deviations in the middle of each arc: along the path, across it, of the turn.
     middle = (0.125 * passed)[:, None] ** 2 * 0.5 * (changes[1:] + changes[:-1])
     middle[_paused(odometry.times_s)] = 0.0
     last = len(passed) - 1
     at = np.clip(np.searchsorted(odometry.times_s, poses.times_s, side="right") - 1, 0, last)
     share = np.clip((poses.times_s - odometry.times_s[at]) / passed[at], 0.0, 1.0)
-    added = np.square(4.0 * share * (1.0 - share))[:, None] * middle[at]
+    along, across, turn = (np.square(4.0 * share * (1.0 - share))[:, None] * middle[at]).T
     covariances = poses.covariances.copy()
-    np.einsum("kii->ki", covariances)[:] += added[:, [0, 0, 2]] + added[:, [1, 1, 1]] * [1, 1, 0]
+    variances = np.column_stack([along + across, along + across, turn])
+    np.einsum("kii->ki", covariances)[:] += variances  # in x and y alike: in any direction
     return PlanarPoses(poses.times_s, poses.poses, covariances)
 
 

@@ -199,7 +199,7 @@ class Match:
     log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
-def hardly_clutter(rows: IntArray, in_all: IntArray) -> BoolArray:
+def likely_landmarks(rows: IntArray, in_all: IntArray) -> BoolArray:
     """(n,) mask of labels without clutter, if that is more than a third of them; else all.
 
     Takes the numbers of their rows (n,) here and in all of the run. Those of clutter are less than
@@ -227,8 +227,8 @@ def stretches_of(
     """The constellations with enough landmarks along a run of `count` frames.
 
     They consist of `length` frames; if overlapping, one begins each fifth of it. With `most`, they
-    are for comparing places: those with most rows count, `hardly_clutter`. `frames, labels` (n,),
-    `xy` (M, 2).
+    are for comparing places: of `likely_landmarks`, those with most rows count. `frames, labels`
+    (n,), `xy` (M, 2).
     """
     found, stride = [], length // _OVERLAPPING if overlapping else length
     in_all = np.bincount(labels)
@@ -237,7 +237,7 @@ def stretches_of(
         seen, rows = np.unique(labels[first:last], return_counts=True)
         known = np.isfinite(xy[seen, 0])
         if most is not None:
-            known &= hardly_clutter(rows, in_all[seen])
+            known &= likely_landmarks(rows, in_all[seen])
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:

@@ -73,7 +73,7 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
 
 
 def _merged(xy: FloatArray) -> FloatArray:
-    """(n, 2) means of rows close to each other, if `loops.hardly_clutter`."""
+    """(n, 2) means of rows close to each other, of `loops.likely_landmarks`."""
     means: list[FloatArray] = []
     counts: list[int] = []
     for row in xy:
@@ -86,7 +86,7 @@ def _merged(xy: FloatArray) -> FloatArray:
             means.append(row)
             counts.append(1)
     rows = np.array(counts, dtype=np.int64)
-    return np.array(means).reshape(-1, 2)[loops.hardly_clutter(rows, rows)]
+    return np.array(means).reshape(-1, 2)[loops.likely_landmarks(rows, rows)]
 
 
 def located(

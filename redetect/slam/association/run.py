@@ -213,8 +213,13 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         own = run._replace(recording=part)
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        limits = {"least": ANYWHERE.least_agreeing, "most": loops.MOST_COMPARED}
-        compared = own.stretches(closed.at, closed.stretch_frames, overlapping=False, **limits)
+        compared = own.stretches(
+            closed.at,
+            closed.stretch_frames,
+            overlapping=False,
+            least=ANYWHERE.least_agreeing,
+            most=loops.MOST_COMPARED,
+        )
         stretches.append(compared)
         places.append(np.full_like(closed.at.xy, np.nan))
         for stretch in compared:  # others may be clutter
