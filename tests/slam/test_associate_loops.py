@@ -26,13 +26,13 @@ from redetect.slam.association.loops import (
     REACH_M,
     Match,
     Search,
-    Stretch,
+    Submap,
     chance_of_agreeing,
     find_matches,
     log10_false_alarms,
     motion_onto,
     mutual_pairs,
-    stretches_of,
+    submaps_of,
 )
 from redetect.slam.models import bearing_of_vertical, disc_in_robot
 from redetect.slam.recording import CircleRows, LineRows, Recording
@@ -95,22 +95,22 @@ def test_number_of_false_alarms_is_the_binomial_tail_times_the_motions_tried() -
     assert log10_false_alarms(2, 12, 0.2, 1000) == pytest.approx(3.0)
 
 
-def _stretch(frame: int, labels: range, xy: FloatArray) -> Stretch:
-    return Stretch(frame, np.array(labels, dtype=np.int64), xy)
+def _submap(frame: int, labels: range, xy: FloatArray) -> Submap:
+    return Submap(frame, np.array(labels, dtype=np.int64), xy)
 
 
 @pytest.mark.long
 def test_random_constellations_do_not_match_and_one_place_seen_twice_does() -> None:
     rng = np.random.default_rng(3)
-    stretches = [
-        _stretch(100 * k, range(20 * k, 20 * k + 20), rng.uniform(0, 5, (20, 2))) for k in range(30)
+    submaps = [
+        _submap(100 * k, range(20 * k, 20 * k + 20), rng.uniform(0, 5, (20, 2))) for k in range(30)
     ]
-    assert find_matches(stretches, Search()) == []
-    place = stretches[4].xy[:14]
+    assert find_matches(submaps, Search()) == []
+    place = submaps[4].xy[:14]
     again = np.concatenate([place + rng.normal(0, 0.02, place.shape), rng.uniform(0, 5, (6, 2))])
     again = again @ rotation(0.3).T + [1.0, 2.0]
-    stretches.append(_stretch(3000, range(600, 620), again))
-    (match,) = find_matches(stretches, Search())
+    submaps.append(_submap(3000, range(600, 620), again))
+    (match,) = find_matches(submaps, Search())
     assert (match.earlier_frame, match.later_frame) == (400, 3000)
     right = [(80 + k, 600 + k) for k in range(14)]
     assert set(map(tuple, match.pairs.tolist())) >= set(right[2:4])
@@ -140,33 +140,33 @@ def test_an_area_of_a_park_costs_no_more_than_that_of_a_room() -> None:
     assert most < 30e6
 
 
-def test_stretches_that_share_landmarks_already_are_not_matched() -> None:
+def test_submaps_that_share_landmarks_already_are_not_matched() -> None:
     rng = np.random.default_rng(4)
     xy = rng.uniform(0, 5, (20, 2))
     shared = np.r_[0:3, 20:37]
-    stretches = [_stretch(0, range(20), xy), Stretch(500, shared, xy)]
-    assert find_matches(stretches, Search()) == []
-    apart = [_stretch(0, range(20), xy), _stretch(500, range(20, 40), xy)]
+    submaps = [_submap(0, range(20), xy), Submap(500, shared, xy)]
+    assert find_matches(submaps, Search()) == []
+    apart = [_submap(0, range(20), xy), _submap(500, range(20, 40), xy)]
     assert len(find_matches(apart, Search())) == 1
-    close = [_stretch(0, range(20), xy), _stretch(30, range(20, 40), xy)]
+    close = [_submap(0, range(20), xy), _submap(30, range(20, 40), xy)]
     assert find_matches(close, Search()) == []
 
 
-def test_stretches_hold_what_their_frames_saw() -> None:
+def test_submaps_hold_what_their_frames_saw() -> None:
     frames = np.repeat(np.arange(100), 2)
     labels = np.repeat(np.arange(100), 2) // 5
     xy = np.stack([np.arange(20.0), np.zeros(20)], axis=1)
     xy[3] = np.nan
-    found = stretches_of(frames, labels, xy, 100)
+    found = submaps_of(frames, labels, xy, 100)
     assert found[0].labels.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
     assert [s.middle_frame for s in found[:3]] == [25, 35, 45]
     assert found[0].xy[3].tolist() == [4.0, 0.0]
 
 
-def test_stretches_that_are_compared_hold_what_was_seen_most() -> None:
+def test_submaps_that_are_compared_hold_what_was_seen_most() -> None:
     labels = np.array([0, 1, 2, 2, 3, 4, 4, 4, 1])
     xy = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
-    (found,) = stretches_of(np.arange(9), labels, xy, 9, least=1, most=3)
+    (found,) = submaps_of(np.arange(9), labels, xy, 9, least=1, most=3)
     assert found.labels.tolist() == [1, 2, 4]
     assert found.xy[:, 0].tolist() == [1.0, 2.0, 4.0]
 
@@ -175,7 +175,7 @@ def test_labels_with_few_rows_are_not_compared_where_they_are_many() -> None:
     def compared(rows: list[int]) -> list[int]:
         labels = np.repeat(np.arange(len(rows)), rows)
         xy = np.stack([np.arange(float(len(rows))), np.zeros(len(rows))], axis=1)
-        (found,) = stretches_of(np.zeros(len(labels), np.int64), labels, xy, 9, least=1, most=80)
+        (found,) = submaps_of(np.zeros(len(labels), np.int64), labels, xy, 9, least=1, most=80)
         return [int(label) for label in found.labels]
 
     assert compared([20, 1, 30, 2, 25, 1, 1, 1, 1, 5]) == [0, 2, 4, 9]
@@ -221,13 +221,13 @@ def test_pairs_are_in_the_order_of_their_votes() -> None:
     assert pairs_by_votes(matches) == [(2, 6), (1, 5), (3, 7)]
 
 
-def test_labels_at_one_spot_are_paired_only_in_stretches_known_to_be_one_place() -> None:
+def test_labels_at_one_spot_are_paired_only_in_submaps_known_to_be_one_place() -> None:
     xy = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]])
     spread = np.tile(0.01**2 * np.eye(2), (10, 1, 1))
-    known = [Stretch(0, np.array([0, 1, 2, 3]), xy), Stretch(90, np.array([0, 1, 2, 9]), xy + 0.01)]
+    known = [Submap(0, np.array([0, 1, 2, 3]), xy), Submap(90, np.array([0, 1, 2, 9]), xy + 0.01)]
     assert pairs_by_position(known, spread) == [(3, 9)]
     assert pairs_by_position(known, 0.01 * spread) == []
-    strangers = [known[0], Stretch(90, np.array([6, 7, 2, 9]), xy)]
+    strangers = [known[0], Submap(90, np.array([6, 7, 2, 9]), xy)]
     assert pairs_by_position(strangers, spread) == []
     assert pairs_by_position(known[:0], spread) == []
 
@@ -236,7 +236,7 @@ def test_labels_of_one_stretch_are_paired_by_their_covariances() -> None:
     """The nearest need not be the likeliest: positions are uncertain along the line of sight."""
     xy = np.array([[0.0, 0.0], [0.0, 0.2], [0.1, 0.0]])
     spread = np.tile(np.diag([0.01**2, 0.1**2]), (3, 1, 1))
-    assert pairs_by_position([Stretch(0, np.arange(3), xy)], spread) == [(0, 1)]
+    assert pairs_by_position([Submap(0, np.arange(3), xy)], spread) == [(0, 1)]
 
 
 def test_mutual_pairs_are_each_others_nearest() -> None:

@@ -12,7 +12,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import LineLandmark, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import read_map, read_path, with_joint_covariance
 from redetect.plane import apply, between, invert
-from redetect.slam.association.loops import Stretch
+from redetect.slam.association.loops import Submap
 from redetect.slam.association.registration import register_maps
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import score_association
@@ -157,14 +157,14 @@ def test_maps_lie_where_they_are_certain_to() -> None:
     rng = np.random.default_rng(1)
     discs = rng.uniform(0.0, [30.0, 6.0], (120, 2))
     true = np.array([[0.0, 0.0, 0.0], [5.0, 2.0, 2.0], [-3.0, 1.0, -1.0]])
-    places, stretches = [], []
+    places, submaps = [], []
     for pose, (low, high) in zip(true, ((0.0, 12.0), (18.0, 30.0), (6.0, 24.0))):
         seen = discs[(discs[:, 0] > low) & (discs[:, 0] < high)]
         places.append(apply(invert(pose), seen + rng.normal(0.0, 0.02, seen.shape)))
         labels = np.argsort(seen[:, 0])
         parts = np.array_split(labels, 2 if high - low < 15.0 else 3)
-        stretches.append([Stretch(25, np.sort(p), places[-1][np.sort(p)]) for p in parts])
-    motions, pairs, apart = register_maps(places, stretches)
+        submaps.append([Submap(25, np.sort(p), places[-1][np.sort(p)]) for p in parts])
+    motions, pairs, apart = register_maps(places, submaps)
     assert apart == []
     np.testing.assert_allclose(motions, true, atol=0.1)
     everywhere = np.concatenate([apply(m, p) for m, p in zip(motions, places)])
@@ -172,4 +172,4 @@ def test_maps_lie_where_they_are_certain_to() -> None:
     assert sum(map(len, gaps)) > 40
     assert max(map(max, gaps)) < 0.15
     twins = np.concatenate([places[0], places[0] + [0.0, 20.0]])
-    assert register_maps([twins, places[2]], [[], stretches[2]])[2] == [1]
+    assert register_maps([twins, places[2]], [[], submaps[2]])[2] == [1]

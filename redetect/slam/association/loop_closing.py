@@ -24,10 +24,10 @@ from redetect.least_squares.solver import Block, normal_equations, stack
 from redetect.plane import apply, between, chain_steps, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
-    STRETCH_FRAMES,
+    SUBMAP_FRAMES,
     SYSTEMATIC_SIGMAS,
     Match,
-    Stretch,
+    Submap,
     shared_landmarks,
     sightings,
 )
@@ -38,7 +38,7 @@ from redetect.slam.recording import Recording
 
 #: Share of the labels of one landmark that are compatible by position.
 SAME_PLACE = 0.999
-# Standard deviations of a step of the path and of a match of two stretches (rad, m).
+# Standard deviations of a step of the path and of a match of two submaps (rad, m).
 _STEP_SIGMA = (0.005, 0.01)
 _MATCH_SIGMA = (0.02, 0.05)
 # Largest squared error of a loop with random errors of odometry.
@@ -151,22 +151,20 @@ def pairs_by_votes(matches: Iterable[IntArray]) -> list[tuple[int, int]]:
     return sorted(votes, key=lambda pair: (-votes[pair], pair))
 
 
-def pairs_by_position(
-    stretches: Sequence[Stretch], covariance: FloatArray
-) -> list[tuple[int, int]]:
-    """Pairs of labels at the same position, with some `covariance` (M, 2, 2), in stretches known to
+def pairs_by_position(submaps: Sequence[Submap], covariance: FloatArray) -> list[tuple[int, int]]:
+    """Pairs of labels at the same position, with some `covariance` (M, 2, 2), in submaps known to
     be the same place.
     """
-    labels = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.labels for s in stretches)]))
+    labels = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.labels for s in submaps)]))
     if len(labels) < 2:
         return []
     xy = np.empty((int(labels[-1]) + 1, 2))
-    for stretch in stretches:
-        xy[stretch.labels] = stretch.xy
+    for submap in submaps:
+        xy[submap.labels] = submap.xy
     near = KDTree(xy[labels]).query_pairs(_FARTHEST_M, output_type="ndarray")
     first, second = labels[near].T
-    seen = csr_array(sightings(stretches), dtype=np.bool_)
-    linked = csr_array(shared_landmarks(stretches) >= SHARED_BY_ONE_PLACE)
+    seen = csr_array(sightings(submaps), dtype=np.bool_)
+    linked = csr_array(shared_landmarks(submaps) >= SHARED_BY_ONE_PLACE)
     one_place = np.asarray((linked @ seen[:, first]).multiply(seen[:, second]).sum(axis=0)) > 0
     squared = squared_mahalanobis(xy[first] - xy[second], covariance[first] + covariance[second])
     usable = np.flatnonzero(one_place & (squared <= chdtri(2, 1.0 - SAME_PLACE)))
@@ -249,10 +247,10 @@ def unrecognised_return(
     view = np.array([0.5 * np.median(np.hypot(*recording.circles.xy.T)), _ONE_VIEW_RAD])
 
     def seen(frame: int) -> IntArray:
-        near = [frame - STRETCH_FRAMES // 2, frame + STRETCH_FRAMES // 2]
+        near = [frame - SUBMAP_FRAMES // 2, frame + SUBMAP_FRAMES // 2]
         return numbers[slice(*np.searchsorted(frames, near))]
 
-    for later in range(0, len(path) - 1, STRETCH_FRAMES // 5):
+    for later in range(0, len(path) - 1, SUBMAP_FRAMES // 5):
         off = path[1 : later + 1] - path[later + 1]
         apart = np.stack([np.hypot(*off[:, :2].T), np.abs(wrap_angle(off[:, 2]))], axis=1)
         away = (apart / view).max(axis=1)

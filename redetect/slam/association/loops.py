@@ -1,11 +1,11 @@
 """Detects loops: parts of a run's map that are the same place, by mutual distances of landmarks.
 
-Landmarks seen in a short stretch of the run form a constellation that the drift of odometry hardly
-deforms. Two constellations of one place are aligned by a rigid motion that pairs of landmarks vote
-for. A match is accepted if that many landmarks would agree by chance in less than one of a thousand
-runs. The criterion is the expected number of matches at least as good among random constellations,
-over all motions tried ("number of false alarms", A. Desolneux, L. Moisan, J.-M. Morel, "Meaningful
-alignments", International Journal of Computer Vision 40, 2000).
+Landmarks seen in a short part of the run, a submap, form a constellation that the drift of odometry
+hardly deforms. Two constellations of one place are aligned by a rigid motion that pairs of
+landmarks vote for. A match is accepted if that many landmarks would agree by chance in less than
+one of a thousand runs. The criterion is the expected number of matches at least as good among
+random constellations, over all motions tried ("number of false alarms", A. Desolneux, L. Moisan,
+J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 40, 2000).
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _COVER_M = 0.6
 # Spacing at which the area is measured.
 _GRID_M = 0.15
 #: Least number of frames whose landmarks form a constellation, and constellations in their length.
-STRETCH_FRAMES, _OVERLAPPING = 50, 5
-# A stretch that shares landmarks with one this many lengths earlier is part of the map already.
+SUBMAP_FRAMES, _OVERLAPPING = 50, 5
+# A submap that shares landmarks with one this many lengths earlier is part of the map already.
 _LONG_AGO = 4
 #: Most landmarks of a constellation that is compared with others, at the cost of their number to
-#: the fourth power. Beyond these, most labels of a stretch are parts of one landmark.
+#: the fourth power. Beyond these, most labels of a submap are parts of one landmark.
 MOST_COMPARED = 80
 # Labels with fewer rows than this share of what a typical row's label has may be clutter.
 _LEAST_SHARE = 0.2
 #: Largest systematic error of each step of odometry, in standard deviations.
 SYSTEMATIC_SIGMAS = 2.0
-#: Stretches that share at least this many landmarks are known to be the same place.
+#: Submaps that share at least this many landmarks are known to be the same place.
 SHARED_BY_ONE_PLACE = 3
 
 
@@ -58,8 +58,8 @@ class Search(NamedTuple):
     most_shift_m: float = 8.0
     least_agreeing: int = 7  # of landmarks, whatever the number of false alarms
     false_alarms: float = 1e-3  # largest expected number of them in the whole search
-    stretch_frames: int = STRETCH_FRAMES  # length of the stretches
-    # Whether most of the map is in its place already: then only every second stretch is matched,
+    submap_frames: int = SUBMAP_FRAMES  # length of the submaps
+    # Whether most of the map is in its place already: then only every second submap is matched,
     # unless it shares landmarks with one long before it.
     mostly_closed: bool = False
 
@@ -175,27 +175,27 @@ def _best_motion(
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """Landmarks seen in a stretch of frames."""
+class Submap:
+    """Landmarks seen in some consecutive frames."""
 
     middle_frame: int
     labels: IntArray  # (n,): ascending
     xy: FloatArray  # (n, 2): their positions in the map (m)
 
-    def without(self, other: Stretch) -> Stretch:
-        """The landmarks that another stretch does not have."""
+    def without(self, other: Submap) -> Submap:
+        """The landmarks that another submap does not have."""
         own = ~np.isin(self.labels, other.labels)
-        return Stretch(self.middle_frame, self.labels[own], self.xy[own])
+        return Submap(self.middle_frame, self.labels[own], self.xy[own])
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Two stretches that show one place."""
+    """Two submaps that show one place."""
 
     earlier_frame: int  # middle frames of the two
     later_frame: int
-    pairs: IntArray  # (k, 2): labels of the same landmark in the earlier and the later stretch
-    motion: FloatArray  # (3,): maps the later stretch's landmarks onto the earlier one's
+    pairs: IntArray  # (k, 2): labels of the same landmark in the earlier and the later submap
+    motion: FloatArray  # (3,): maps the later submap's landmarks onto the earlier one's
     log10_false_alarms: float  # of the expected number of matches as good by chance
 
 
@@ -213,17 +213,17 @@ def likely_landmarks(rows: IntArray, in_all: IntArray) -> BoolArray:
     return np.asarray(often | (3 * np.count_nonzero(often) >= 2 * len(rows)))
 
 
-def stretches_of(
+def submaps_of(
     frames: IntArray,
     labels: IntArray,
     xy: FloatArray,
     count: int,
     *,
-    length: int = STRETCH_FRAMES,
+    length: int = SUBMAP_FRAMES,
     overlapping: bool = True,
     least: int = Search().least_agreeing,
     most: int | None = None,
-) -> list[Stretch]:
+) -> list[Submap]:
     """The constellations with enough landmarks along a run of `count` frames.
 
     They consist of `length` frames; if overlapping, one begins each fifth of it. With `most`, they
@@ -241,47 +241,47 @@ def stretches_of(
         seen, rows = seen[known], rows[known]
         seen = np.sort(seen[np.argsort(-rows, kind="stable")[:most]])
         if len(seen) >= least:
-            found.append(Stretch(min(start + length // 2, count - 1), seen, xy[seen]))
+            found.append(Submap(min(start + length // 2, count - 1), seen, xy[seen]))
     return found
 
 
-def sightings(stretches: Sequence[Stretch]) -> csr_array:
-    """(S, M) sparse int64, 1 where a stretch shows a label."""
-    labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in stretches)])
-    starts = np.cumsum([0, *(len(s.labels) for s in stretches)])
-    shape = (len(stretches), int(labels.max(initial=-1)) + 1)
+def sightings(submaps: Sequence[Submap]) -> csr_array:
+    """(S, M) sparse int64, 1 where a submap shows a label."""
+    labels = np.concatenate([np.zeros(0, dtype=np.int64), *(s.labels for s in submaps)])
+    starts = np.cumsum([0, *(len(s.labels) for s in submaps)])
+    shape = (len(submaps), int(labels.max(initial=-1)) + 1)
     return csr_array((np.ones(len(labels), dtype=np.int64), labels, starts), shape=shape)
 
 
-def shared_landmarks(stretches: Sequence[Stretch]) -> csr_array:
-    """(S, S) sparse int64, number of landmarks that two stretches have in common."""
-    seen = sightings(stretches)
+def shared_landmarks(submaps: Sequence[Submap]) -> csr_array:
+    """(S, S) sparse int64, number of landmarks that two submaps have in common."""
+    seen = sightings(submaps)
     return csr_array(seen @ seen.T)
 
 
-def find_matches(stretches: list[Stretch], search: Search) -> list[Match]:
-    """All pairs of stretches that show one place significantly, the most significant first.
+def find_matches(submaps: list[Submap], search: Search) -> list[Match]:
+    """All pairs of submaps that show one place significantly, the most significant first.
 
-    Landmarks that two stretches share are ignored; if these are three or more, they need no match.
+    Landmarks that two submaps share are ignored; if these are three or more, they need no match.
     """
-    candidates: list[tuple[Stretch, Stretch, Motion]] = []
-    centres = np.array([s.xy.mean(axis=0) for s in stretches]).reshape(-1, 2)
-    extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in stretches])
-    together = shared_landmarks(stretches)
+    candidates: list[tuple[Submap, Submap, Motion]] = []
+    centres = np.array([s.xy.mean(axis=0) for s in submaps]).reshape(-1, 2)
+    extents = np.array([np.linalg.norm(s.xy - s.xy.mean(axis=0), axis=1).max() for s in submaps])
+    together = shared_landmarks(submaps)
     later_step, earlier_step = (2, 3) if search.mostly_closed else (1, 2)
-    for k in range(0, len(stretches), later_step):
-        later = stretches[k]
+    for k in range(0, len(submaps), later_step):
+        later = submaps[k]
         shared = together[[k], :k].toarray()[0]
-        gap = np.array([later.middle_frame - s.middle_frame for s in stretches[:k]], dtype=np.int64)
-        apart = (gap >= search.stretch_frames) & (shared < SHARED_BY_ONE_PLACE)
-        long_ago = gap >= _LONG_AGO * search.stretch_frames
+        gap = np.array([later.middle_frame - s.middle_frame for s in submaps[:k]], dtype=np.int64)
+        apart = (gap >= search.submap_frames) & (shared < SHARED_BY_ONE_PLACE)
+        long_ago = gap >= _LONG_AGO * search.submap_frames
         if search.mostly_closed and np.any(~apart & long_ago):
             continue
         reach = search.most_shift_m + extents[:k] + extents[k]
         near = np.linalg.norm(centres[:k] - centres[k], axis=1) < reach
         near[np.arange(k) % earlier_step != 0] = False
         for i in np.flatnonzero(near & apart):
-            fixed, moved = stretches[i].without(later), later.without(stretches[i])
+            fixed, moved = submaps[i].without(later), later.without(submaps[i])
             if min(len(fixed.labels), len(moved.labels)) >= search.least_agreeing:
                 candidates.append((fixed, moved, motion_onto(moved.xy, fixed.xy, search)))
     tried = sum(motion.tried for _, _, motion in candidates)
@@ -375,7 +375,7 @@ def chance_of_agreeing(xy: FloatArray) -> float:
 
 
 def _refined(
-    earlier: Stretch, later: Stretch, pose: FloatArray, tried: int, search: Search
+    earlier: Submap, later: Submap, pose: FloatArray, tried: int, search: Search
 ) -> Match | None:
     """Refine a match by least squares over all agreeing landmarks; None if too few agree then."""
     found = refined_motion(later.xy, earlier.xy, pose, search.least_agreeing)

@@ -6,7 +6,7 @@ than one of a thousand maps, and if no other place of the map fits nearly as wel
 have repetitive structure.
 
 For global localisation, odometry combines the discs of the first frames, of more and more until the
-place is unique. For another run, each stretch is located separately; stretches located by chance,
+place is unique. For another run, each submap is located separately; submaps located by chance,
 or in a similar place, do not agree with each other.
 """
 
@@ -34,7 +34,7 @@ _RIVAL_SHARE = 0.7
 #: Least standard deviation of a disc (m): that of raw rows from a leaning camera.
 _DISC_SIGMA_M = 0.25
 ANYWHERE = loops.Search(math.inf, math.inf, least_agreeing=5)
-# Largest disagreement of stretches of one run, due to the drift of odometry.
+# Largest disagreement of submaps of one run, due to the drift of odometry.
 _DRIFT = loops.Search()
 
 
@@ -141,11 +141,11 @@ def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> 
 
 
 def register_maps(
-    places: Sequence[FloatArray], stretches: Sequence[Sequence[loops.Stretch]]
+    places: Sequence[FloatArray], submaps: Sequence[Sequence[loops.Submap]]
 ) -> tuple[FloatArray, list[IntArray], list[int]]:
     """Register K maps in the first one, or in those already registered.
 
-    Takes the landmarks (M, 2) of each map (m; NaN if unknown), and its stretches, without common
+    Takes the landmarks (M, 2) of each map (m; NaN if unknown), and its submaps, without common
     frames, whose labels are the landmarks' indices. Returns poses (K, 3) of the maps' frames in the
     first one's, pairs (k, 2) of identical landmarks, numbered through all maps, and the maps that
     cannot be registered in the others.
@@ -156,7 +156,7 @@ def register_maps(
     pairs: list[IntArray] = []
     waiting = list(range(1, len(places)))
     while True:
-        tried = ((k, register(stretches[k], xy)) for k in waiting)
+        tried = ((k, register(submaps[k], xy)) for k in waiting)
         k, found = next(((k, found) for k, found in tried if found), (0, None))
         if found is None:
             return motions, pairs, waiting
@@ -170,23 +170,23 @@ def register_maps(
 
 
 def register(
-    stretches: Sequence[loops.Stretch], xy: FloatArray
+    submaps: Sequence[loops.Submap], xy: FloatArray
 ) -> tuple[FloatArray, list[tuple[IntArray, IntArray]]] | None:
     """The motion that registers a run's map in another one, and the identical landmarks.
 
-    Each stretch is located separately. The result is the motion on which most of them agree, within
+    Each submap is located separately. The result is the motion on which most of them agree, within
     drift, if these are more than half; else there is none.
 
     Takes `xy` (M, 2), the other map's landmarks; returns a pose (3,) and, for each agreeing
-    stretch, indices into `xy` and labels, both (k,).
+    submap, indices into `xy` and labels, both (k,).
     """
-    alarms = ANYWHERE.false_alarms / max(len(stretches), 1)
-    tried = [(stretch, located(stretch.xy, xy, alarms)) for stretch in stretches]
-    found = [(stretch, *place) for stretch, place in tried if place is not None]
+    alarms = ANYWHERE.false_alarms / max(len(submaps), 1)
+    tried = [(submap, located(submap.xy, xy, alarms)) for submap in submaps]
+    found = [(submap, *place) for submap, place in tried if place is not None]
     if not found:
         return None
     poses = np.array([pose for _, pose, _ in found])
-    middles = np.array([stretch.xy.mean(axis=0) for stretch, _, _ in found])
+    middles = np.array([submap.xy.mean(axis=0) for submap, _, _ in found])
     off = np.linalg.norm(apply(poses[:, None], middles) - apply(poses, middles), axis=2)
     turned = np.abs(wrap_angle(poses[:, None, 2] - poses[:, 2]))
     agree = (off <= _DRIFT.most_shift_m) & (turned <= _DRIFT.most_turn_rad)
@@ -194,7 +194,7 @@ def register(
     if 2 * np.count_nonzero(agree[best]) <= len(found):
         return None
     return poses[best], [
-        (pairs[:, 0], stretch.labels[pairs[:, 1]])
-        for (stretch, _, pairs), right in zip(found, agree[best])
+        (pairs[:, 0], submap.labels[pairs[:, 1]])
+        for (submap, _, pairs), right in zip(found, agree[best])
         if right
     ]

@@ -61,7 +61,7 @@ _MOST_TOGETHER = 0.1
 _MOST_COST = 100.0
 # Matches that may contain a wrong one are divided into at most this many parts.
 _MOST_PARTS = 16
-# Stretches are longer, at most of this many frames, if they have fewer discs that are seen often
+# Submaps are longer, at most of this many frames, if they have fewer discs that are seen often
 # (median) than are enough to recognise a place.
 _LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
@@ -153,7 +153,7 @@ class _Closed(NamedTuple):
 
     at: _Solved
     matches: tuple[loops.Match, ...]  # the loops
-    stretch_frames: int  # length of the stretches that were matched
+    submap_frames: int  # length of the submaps that were matched
 
 
 class _Run(NamedTuple):
@@ -176,10 +176,10 @@ class _Run(NamedTuple):
     def merged(self, labels: IntArray, pairs: Sequence[tuple[int, int]]) -> tuple[IntArray, int]:
         return merge_labels(self.frames, labels, pairs, _MOST_TOGETHER if self.by_discs else 0.0)
 
-    def stretches(self, at: _Solved, length: int, **limits: Any) -> list[loops.Stretch]:
-        """Stretches of the run; `limits` as in `redetect.slam.association.loops.stretches_of`."""
+    def submaps(self, at: _Solved, length: int, **limits: Any) -> list[loops.Submap]:
+        """Submaps of the run; `limits` as in `redetect.slam.association.loops.submaps_of`."""
         count = len(self.recording)
-        return loops.stretches_of(self.frames, at.labels, at.xy, count, length=length, **limits)
+        return loops.submaps_of(self.frames, at.labels, at.xy, count, length=length, **limits)
 
     def solved(self, labels: IntArray, path: FloatArray | None) -> _Solved:
         recording, none, line_xy = self.recording, np.zeros(0, dtype=np.int64), None
@@ -202,7 +202,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     recording, frames = run.recording, run.frames
     starts = [0, *recording.lost.tolist()]
     parts: list[_Closed] = []
-    stretches: list[list[loops.Stretch]] = []
+    submaps: list[list[loops.Submap]] = []
     places: list[FloatArray] = []
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
@@ -213,21 +213,21 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
         own = run._replace(recording=part)
         closed = _closed(own, in_order(labels[rows]))
         parts.append(closed)
-        compared = own.stretches(
+        compared = own.submaps(
             closed.at,
-            closed.stretch_frames,
+            closed.submap_frames,
             overlapping=False,
             least=ANYWHERE.least_agreeing,
             most=loops.MOST_COMPARED,
         )
-        stretches.append(compared)
+        submaps.append(compared)
         places.append(np.full_like(closed.at.xy, np.nan))
-        for stretch in compared:  # others may be clutter
-            places[-1][stretch.labels] = stretch.xy
+        for submap in compared:  # others may be clutter
+            places[-1][submap.labels] = submap.xy
     if len(parts) == 1:
         return parts[0]
     run.report("registering the parts")
-    motions, pairs, left = register_maps(places, stretches)
+    motions, pairs, left = register_maps(places, submaps)
     if left:
         frame = starts[left[0]]
         raise UnregisteredError(
@@ -251,37 +251,37 @@ def _closed(run: _Run, labels: IntArray, path: FloatArray | None = None) -> _Clo
     at = run.solved(labels, path)
     matches: list[loops.Match] = []
     while True:
-        length = search.stretch_frames
+        length = search.submap_frames
         for number in range(1, _MOST_ROUNDS + 1):
-            run.report(f"loops, stretches of {length} frames, round {number}")
+            run.report(f"loops, submaps of {length} frames, round {number}")
             before = len(at.xy)
-            found = loops.find_matches(run.stretches(at, length, most=loops.MOST_COMPARED), search)
+            found = loops.find_matches(run.submaps(at, length, most=loops.MOST_COMPARED), search)
             found = consistent_matches(found, matches, at.path, run.recording.step_covariance)
             at, found = _with_matches(run, at, found)
             spread = _isotropic(len(at.xy), loops.REACH_M)
             if run.by_discs:
                 spread = _spread(run.recording, at.path, at.labels, run.settings.sigma_scale)
-            pairs = pairs_by_position(run.stretches(at, length), spread)
+            pairs = pairs_by_position(run.submaps(at, length), spread)
             labels, by_position = run.merged(at.labels, pairs)
             if by_position:
                 at = run.solved(labels, at.path)
             matches += found
             if len(at.xy) == before and search.most_shift_m == math.inf:
                 break
-            search = loops.Search(math.inf, math.inf, stretch_frames=length, mostly_closed=True)
+            search = loops.Search(math.inf, math.inf, submap_frames=length, mostly_closed=True)
         if not run.by_discs or length == _LONGEST or not _sparse(run, at, length):
             return _Closed(at, tuple(matches), length)
-        search = loops.Search(stretch_frames=min(2 * length, _LONGEST))
+        search = loops.Search(submap_frames=min(2 * length, _LONGEST))
 
 
 def _sparse(run: _Run, at: _Solved, length: int) -> bool:
-    """Whether stretches of a length have too few discs to be recognised."""
+    """Whether submaps of a length have too few discs to be recognised."""
     often = np.bincount(at.labels)[at.labels] >= _SEEN_OFTEN
     frames, labels, count = run.frames[often], at.labels[often], len(run.recording)
-    stretches = loops.stretches_of(
+    submaps = loops.submaps_of(
         frames, labels, at.xy, count, length=length, overlapping=False, least=0
     )
-    return float(np.median([len(stretch.labels) for stretch in stretches])) < _ENOUGH
+    return float(np.median([len(submap.labels) for submap in submaps])) < _ENOUGH
 
 
 def _with_matches(
@@ -352,9 +352,9 @@ def without_clutter(
         if not last and np.any(kept):
             known, numbers = np.unique(labels[kept], return_inverse=True)
             rows = replace(swayed, circles=swayed.circles.only(kept))
-            stretches = loops.stretches_of(frames[kept], numbers, places[known], len(recording))
+            submaps = loops.submaps_of(frames[kept], numbers, places[known], len(recording))
             spread = _spread(rows, path, numbers, settings.sigma_scale)
-            pairs = pairs_by_position(stretches, spread)
+            pairs = pairs_by_position(submaps, spread)
             merged, _ = merge_labels(frames[kept], numbers, pairs)
             of_merged = known[numbers[np.unique(merged, return_index=True)[1]]]
             renamed = np.arange(len(places))
@@ -406,8 +406,8 @@ def _merged_lines(
         return labels
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
-        stretches = loops.stretches_of(recording.lines.frame, labels, xy, len(recording))
-        pairs = pairs_by_position(stretches, _isotropic(len(xy), _LINE_REACH_M))
+        submaps = loops.submaps_of(recording.lines.frame, labels, xy, len(recording))
+        pairs = pairs_by_position(submaps, _isotropic(len(xy), _LINE_REACH_M))
         labels, merged = merge_labels(recording.lines.frame, labels, pairs)
         if merged == 0:
             break
