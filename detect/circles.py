@@ -24,7 +24,7 @@ from detect.discs.candidates import best_apart, local_maxima, suppress_published
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
-from detect.discs.judgement import Fate, JudgedCandidates, judge
+from detect.discs.judgement import JudgedCandidates, Outcome, judge
 from detect.discs.placing import place_discs
 from detect.discs.positions import published_positions, refined_covariances
 from detect.discs.quality import Limits, centres_of
@@ -275,13 +275,13 @@ def judged(
 
 def adjusted_log_odds(judgement: JudgedCandidates, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
-    rims = np.flatnonzero(judgement.fate == Fate.JUDGED)
+    rims = np.flatnonzero(judgement.outcome == Outcome.JUDGED)
     step, log_odds = judgement.step[rims], judgement.log_odds[rims]
     sure = log_odds >= SURE
     penalty = paleness_penalty(step, judgement.floor_grey[rims], sure)
     if settings.polarity == "any":
         penalty += sign_penalty(step, sure)
-    adjusted = np.full(len(judgement.fate), -np.inf)
+    adjusted = np.full(len(judgement.outcome), -np.inf)
     adjusted[rims] = log_odds - penalty
     return adjusted
 

@@ -34,7 +34,7 @@ from detect.line_settings import (
     numbers_of,
 )
 from detect.verticals.joining import Lines, lines_of_tracks
-from detect.verticals.judgement import FATES, JudgedTracks, fit_and_judge
+from detect.verticals.judgement import OUTCOMES, JudgedTracks, fit_and_judge
 from detect.verticals.refinement import LineFits, StepFilters, step_filters
 from detect.verticals.response import LineFilter, Strip, line_filter, strip_of
 from detect.verticals.starts import StartBand, band_response, line_starts, start_band
@@ -45,8 +45,8 @@ from redetect.array_types import GreyImage
 from redetect.landmarks import LineLandmark, wrap_angle
 from redetect.tables import ByContent
 
-#: Fates of tracks that are a line, or part of one.
-ACCEPTED, JOINED = FATES[:2]
+#: Outcomes of tracks that are a line, or part of one.
+ACCEPTED, JOINED = OUTCOMES[:2]
 #: Largest difference of bearings of the same line, unless two standard deviations are larger.
 _SAME_LINE_RAD = np.radians(0.5)
 _WIDE_ENOUGH = 0.68  #: Least width of the filter, as a share of the blur's width.
@@ -68,7 +68,7 @@ class LineDetections(ByContent):
 
     lines: Lines  # the leftmost is the first, here and elsewhere
     tracks: LineTracks
-    judged: JudgedTracks  # lines through all tracks, and their fates
+    judged: JudgedTracks  # lines through all tracks, and their outcomes
 
     def __len__(self) -> int:
         return len(self.lines.alpha_rad)
@@ -79,9 +79,9 @@ class LineDetections(ByContent):
         return self.judged.tilt
 
     @cached_property
-    def fate(self) -> tuple[str, ...]:
+    def outcome(self) -> tuple[str, ...]:
         """(T,) "accepted", "joined" (to a stronger one), or why the track is not a line."""
-        return tuple(FATES[number] for number in self.judged.fate.tolist())
+        return tuple(OUTCOMES[number] for number in self.judged.outcome.tolist())
 
     def landmarks(self) -> tuple[LineLandmark, ...]:
         """Rows for a landmark file, without identifiers; quality is 0 as in the data set's own."""

@@ -26,7 +26,7 @@ from detect.circles import (
     vote_shape,
     within_margins,
 )
-from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, Fate, JudgedCandidates
+from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, JudgedCandidates, Outcome
 from detect.discs.radius import find_radius
 from detect.lean import detect_tilted, search_of
 from detect.lines import detect_lines
@@ -39,10 +39,21 @@ from redetect.messages import counted
 from redetect.tables import Table
 
 Stage = Literal[
-    "disc", "polarity", "steps", "glance", "rim", "evidence", "beside a better disc", "outside"
+    "disc",
+    "polarity",
+    "steps",
+    "prescreening",
+    "rim",
+    "evidence",
+    "beside a better disc",
+    "outside",
 ]
 
-_STAGES: dict[Fate, Stage] = {Fate.FEW_STEPS: "steps", Fate.GLANCE: "glance", Fate.NO_RIM: "rim"}
+_STAGES: dict[Outcome, Stage] = {
+    Outcome.FEW_STEPS: "steps",
+    Outcome.PRESCREENING: "prescreening",
+    Outcome.NO_RIM: "rim",
+}
 #: Radii from the nominal one divided by this to the nominal one times this are tried at a position.
 _OTHER_RADII = 2.5
 _FACTOR = 1.1  #: From one of these to the next.
@@ -78,7 +89,7 @@ class Candidate(NamedTuple):
             "polarity": "it is of the other polarity (--polarity any)",
             "steps": "the grey value steps on few sides, or too little for the noise "
             "(--noise-floor)",
-            "glance": f"no disc at a glance: log-odds {value}",
+            "prescreening": f"no disc by the prescreening: log-odds {value}",
             "rim": f"{value} of its rim lie on a circle of this radius, {limit} expected",
             "evidence": f"evidence {value} is less than {limit} (--evidence)",
             "beside a better disc": f"{value} radii from a better disc (--separation {limit})",
@@ -183,13 +194,13 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
     searched = counted(len(images), "image")
     if not stages:
         return f"There is no candidate in {searched}: no edges lie on a circle."
-    fates = (
+    outcomes = (
         (stages["polarity"], f"are not {settings.polarity} (--polarity any)"),
         (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
-        (stages["glance"] + stages["rim"], "have no rim of this radius (--radius-m)"),
+        (stages["prescreening"] + stages["rim"], "have no rim of this radius (--radius-m)"),
         (stages["evidence"], "do not look like a disc (--evidence)"),
     )
-    failed = ", ".join(f"{count} {test}" for count, test in fates if count)
+    failed = ", ".join(f"{count} {test}" for count, test in outcomes if count)
     return f"Of {counted(stages.total(), 'candidate')} in {searched}, {failed}."
 
 
@@ -240,18 +251,18 @@ def _candidates(scene: _Examined) -> Iterator[Candidate]:
     sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[settings.polarity]
     pixels = camera.project_floor(judgement.floor_xy)
     for k in np.flatnonzero(~taken).tolist():
-        fate, value = Fate(judgement.fate[k]), float(judgement.value[k])
-        if fate is Fate.SAME_RIM:
+        outcome, value = Outcome(judgement.outcome[k]), float(judgement.value[k])
+        if outcome is Outcome.SAME_RIM:
             continue
-        contrast = float(judgement.step[k]) if fate is Fate.JUDGED else math.nan
+        contrast = float(judgement.step[k]) if outcome is Outcome.JUDGED else math.nan
         stage: Stage = "evidence"
         limit = settings.evidence
         if judgement.sign[k] * sign < 0.0:
-            if fate is not Fate.JUDGED or value < 0.0:
+            if outcome is not Outcome.JUDGED or value < 0.0:
                 continue
             stage = "polarity"
-        elif fate is not Fate.JUDGED:
-            stage, limit = _STAGES[fate], LEAST_RIM if fate is Fate.NO_RIM else math.nan
+        elif outcome is not Outcome.JUDGED:
+            stage, limit = _STAGES[outcome], LEAST_RIM if outcome is Outcome.NO_RIM else math.nan
         elif evidence[k] < limit:
             value = float(evidence[k])
         else:
@@ -311,7 +322,7 @@ def _suggestions(scene: _Examined, at: tuple[float, float] | None) -> Iterator[s
     if radius_m is not None and abs(math.log(radius_m / settings.radius_m)) > math.log(_FACTOR):
         yield f"--radius-m {radius_m:.3f} finds {gain}."
     rims = scene.judgement[1]
-    discs = (rims.fate == Fate.JUDGED) & (rims.log_odds > settings.evidence)
+    discs = (rims.outcome == Outcome.JUDGED) & (rims.log_odds > settings.evidence)
     sizes = rims.radius[discs] / (RIM_RADIUS * settings.radius_m)
     if len(sizes) >= _FEWEST_RIMS:
         off = float(np.median(sizes)) - 1.0

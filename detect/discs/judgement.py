@@ -1,8 +1,8 @@
-"""Decides which candidates are discs: a glance, then the rim, by networks trained on known truth.
+"""Decides which candidates are discs: prescreening, then the rim, by networks trained on truth.
 
-The candidates come from the Hough transform (`detect.discs.hough`). Most are rejected at a glance
-at a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare beside a
-disc or a cable across it, the rest still is on a circle of the right size. A small network
+The candidates come from the Hough transform (`detect.discs.hough`). Most are rejected by a
+prescreening of a few grey values. For the others the rim is traced (`detect.discs.rim`): with glare
+beside a disc or a cable across it, the rest still is on a circle of the right size. A small network
 (`detect.discs.rim_network`) then decides from the grey values around the candidate and the rim.
 """
 
@@ -42,16 +42,17 @@ from redetect.compiled import kernel
 
 #: Distances at which grey values are taken for the disc and for the floor, nominal radii.
 _INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
-#: Directions of a glance (a subset of the rim's), the distances of its samples, which of them are
+#: Directions of sparse profiles (some of the rim's), distances of their samples, which of these are
 #: inside and outside, and the least share of directions in which the disc differs from the floor.
-GLANCED = DIRECTIONS // 2
-GLANCED_AT = np.linspace(0.3, 1.7, 8)
+_EVERY = 2
+SPARSE_DIRECTIONS = DIRECTIONS // _EVERY
+SPARSE_RADII = np.linspace(0.3, 1.7, 8)
 _INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
 #: Distances of what the network sees about a rim, nominal radii: means of pairs of steps.
-LOOKED_AT = np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1)
-_AT_ONCE = 16  #: Candidates at which a network glances at a time.
-_LEAST_GLANCE = 0.0  #: Threshold of the log-odds of a glance.
+DENSE_RADII = np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1)
+_AT_ONCE = 16  #: Candidates that are prescreened at a time.
+_LEAST_PRESCREENING = 0.0  #: Threshold of the prescreening.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
 RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
 #: A rim is traced again, from its own centre, unless it is hopeless or its log-odds exceed this.
@@ -62,20 +63,20 @@ _SAME = 0.1  #: Two rims closer than this share of the radius are the same.
 FEATURES = ("rim", "runs", "scatter", "radius", "radius_2", "size", "score")
 
 
-class Fate(IntEnum):
+class Outcome(IntEnum):
     """The stage that rejected a candidate, in order; or it was judged by its rim."""
 
     FEW_STEPS = 0
-    GLANCE = 1
+    PRESCREENING = 1
     NO_RIM = 2
     SAME_RIM = 3
     JUDGED = 4
 
 
 class JudgedCandidates(NamedTuple):
-    """N candidates and their fates; `step` and later fields are valid for judged rims only."""
+    """N candidates and their outcomes; `step` and later fields are valid for judged rims only."""
 
-    fate: NDArray[np.int8]  #: (N,) of `Fate`
+    outcome: NDArray[np.int8]  #: (N,) of `Outcome`
     value: FloatArray  #: (N,) the number that decided: log-odds, or a share of the rim
     sign: FloatArray  #: (N,) 1 for light discs, -1 for dark ones
     features: FloatArray  #: (N, len(FEATURES))
@@ -120,42 +121,44 @@ def judge(
     features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
     traced_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
     step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    fate, value = np.full(n, Fate.FEW_STEPS, np.int8), np.zeros(n)
+    outcome, value = np.full(n, Outcome.FEW_STEPS, np.int8), np.zeros(n)
     agreeing, radius = np.zeros(n), np.zeros(n)
     judged = np.empty((n, 3))  # places and signs of rims
     count = 0
-    contrast, glanced = _glance_odds(
-        image, candidates, nominal, least_step, camera_numbers, networks.glance
+    contrast, prescreened = _prescreening_odds(
+        image, candidates, nominal, least_step, camera_numbers, networks.prescreening
     )
     for i in range(n):
         if contrast[i] == 0.0:
             continue
-        fate[i], value[i] = Fate.GLANCE, glanced[i]
-        if glanced[i] < _LEAST_GLANCE:
+        outcome[i], value[i] = Outcome.PRESCREENING, prescreened[i]
+        if prescreened[i] < _LEAST_PRESCREENING:
             continue
         x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
         score = candidates.score[i]
         radial = profiles(image, camera_numbers, x, y, nominal)
         rim = follow_rim(image, camera_numbers, radial, sign * contrast[i])
-        fate[i], value[i] = Fate.NO_RIM, rim.agreeing
+        outcome[i], value[i] = Outcome.NO_RIM, rim.agreeing
         if rim.agreeing < LEAST_RIM:
             continue
-        fate[i] = Fate.SAME_RIM
+        outcome[i] = Outcome.SAME_RIM
         if _is_known(judged[:count], rim, sign, nominal):
             continue
         radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.look)
+        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.classifier)
         if HOPELESS <= odds < _CERTAIN:
             # A rim is seen best from its own centre, but that may lead to another circle.
             again = follow_rim(image, camera_numbers, radial, rim.step)
             if again.agreeing >= rim.agreeing - _SLACK:
                 radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, features_again = _rim_odds(radial_again, again, score, sign, networks.look)
+                more, features_again = _rim_odds(
+                    radial_again, again, score, sign, networks.classifier
+                )
                 doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
                 if more > odds and not _is_known(judged[:count], again, sign, nominal):
                     x, y = rim.x, rim.y
                     rim, odds, rim_features, radial = again, more, features_again, radial_again
-        fate[i], value[i], log_odds[i], step[i] = Fate.JUDGED, odds, odds, rim.step
+        outcome[i], value[i], log_odds[i], step[i] = Outcome.JUDGED, odds, odds, rim.step
         agreeing[i], radius[i] = rim.agreeing, rim.radius
         for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
             features[i, k] = rim_features[k]
@@ -165,8 +168,8 @@ def judge(
         judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
         count += 1
     return JudgedCandidates(
-        fate, value, candidates.sign, features, agreeing, radius, place, traced_from, doubt, step,
-        floor_grey, quality, log_odds,
+        outcome, value, candidates.sign, features, agreeing, radius, place, traced_from, doubt,
+        step, floor_grey, quality, log_odds,
     )  # fmt: skip
 
 
@@ -194,7 +197,7 @@ def _between(grey: Float32Array, bounds: tuple[float, float]) -> FloatArray:
 
 
 @kernel()
-def _glance_odds(
+def _prescreening_odds(
     image: GreyImage, candidates: HoughCandidates, nominal: float, least_step: float,
     camera_numbers: FloatArray, network: RimNetwork,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
@@ -204,7 +207,8 @@ def _glance_odds(
     for first in range(0, n, _AT_ONCE):
         end = min(first + _AT_ONCE, n)
         sign, score = candidates.sign[first:end], candidates.score[first:end]
-        grey, scale = glance(image, camera_numbers, candidates.floor_xy[first:end], nominal)
+        floor_xy = candidates.floor_xy[first:end]
+        grey, scale = sparse_profiles(image, camera_numbers, floor_xy, nominal)
         inputs, scales = network_inputs(grey, scale, sign)
         log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)
         for k in range(end - first):
@@ -214,20 +218,20 @@ def _glance_odds(
 
 
 @kernel()
-def glance(
+def sparse_profiles(
     image: GreyImage, camera_numbers: FloatArray, floor_xy: FloatArray, radius: float
 ) -> tuple[Float32Array, FloatArray]:
     """Nearest-pixel grey values along some directions from N points on the floor.
 
-    Perspective within a disc is ignored if it shifts the rim by less than a step. Returns
-    (N, GLANCED, len(GLANCED_AT)) grey values, NaN outside the image, and (N, GLANCED) pixels per
-    radius; parameters otherwise as for `detect.discs.rim.profiles`.
+    Perspective within a disc is ignored if it shifts the rim by less than a step. Returns (N, K, M)
+    grey values, NaN outside the image, and (N, K) pixels per radius; parameters otherwise as for
+    `detect.discs.rim.profiles`.
     """
     count = len(floor_xy)
-    grey = np.empty((count, GLANCED, len(GLANCED_AT)), np.float32)
-    scale = np.empty((count, GLANCED))
+    grey = np.empty((count, SPARSE_DIRECTIONS, len(SPARSE_RADII)), np.float32)
+    scale = np.empty((count, SPARSE_DIRECTIONS))
     height, width = image.shape
-    step = GLANCED_AT[1] - GLANCED_AT[0]
+    step = SPARSE_RADII[1] - SPARSE_RADII[0]
     for i in range(count):
         x, y = floor_xy[i]
         u0, v0 = project_floor_point(camera_numbers, x, y)
@@ -235,14 +239,14 @@ def glance(
         uy, vy = project_floor_point(camera_numbers, x, y + radius)
         # The scale changes from the centre to the rim by up to radius over distance.
         flat = 2.0 * radius < step * distance_of_floor_point(camera_numbers, x, y)
-        for k in range(GLANCED):
-            cos, sin = COS[k * (DIRECTIONS // GLANCED)], SIN[k * (DIRECTIONS // GLANCED)]
+        for k in range(SPARSE_DIRECTIONS):
+            cos, sin = COS[_EVERY * k], SIN[_EVERY * k]
             du, dv = cos * (ux - u0) + sin * (uy - u0), cos * (vx - v0) + sin * (vy - v0)
             scale[i, k] = math.sqrt(du * du + dv * dv)
-            for m in range(len(GLANCED_AT)):
-                u, v = u0 + GLANCED_AT[m] * du, v0 + GLANCED_AT[m] * dv
+            for m in range(len(SPARSE_RADII)):
+                u, v = u0 + SPARSE_RADII[m] * du, v0 + SPARSE_RADII[m] * dv
                 if not flat:
-                    off = radius * GLANCED_AT[m]
+                    off = radius * SPARSE_RADII[m]
                     u, v = project_floor_point(camera_numbers, x + off * cos, y + off * sin)
                 u, v = u + 0.5, v + 0.5
                 inside = 0.0 <= u < width and 0.0 <= v < height  # not if NaN
@@ -264,16 +268,16 @@ def pairs_of_steps(grey: Float32Array) -> Float32Array:
 @kernel()
 def _contrast(grey: Float32Array, sign: float, least_step: float) -> float:
     """Median step over the directions with a sufficient step; 0 if these are too few."""
-    steps = np.empty(GLANCED)
+    steps = np.empty(SPARSE_DIRECTIONS)
     for inner in _INNER:
         count = 0
-        for k in range(GLANCED):
+        for k in range(SPARSE_DIRECTIONS):
             inside = grey[k, inner] + grey[k, inner + 1]
             step = 0.5 * sign * (inside - (grey[k, _OUTER] + grey[k, _OUTER + 1]))
             if step > least_step:
                 steps[count] = step
                 count += 1
-        if count >= _LEAST_STEPS * GLANCED:
+        if count >= _LEAST_STEPS * SPARSE_DIRECTIONS:
             return median(steps[:count])
     return 0.0
 

@@ -11,7 +11,7 @@ and minimum of each channel, and weighs these together with some features of the
     log-odds = w4 [c, features] + b4
 
 A rotation of the disc rotates a and b and changes nothing else. Networks trained from several seeds
-are averaged until their mean is certain. There are two kinds: one glances at every candidate,
+are averaged until their mean is certain. There are two kinds: one prescreens all candidates,
 several of them at once, the other decides about those whose rim was traced.
 `python -m tools.evaluation train-rim-network` trains both.
 """
@@ -56,47 +56,47 @@ class RimNetwork(NamedTuple):
 class Networks(NamedTuple):
     """One decides whether the rim of a candidate is traced, the other whether it is a disc's."""
 
-    glance: RimNetwork
-    look: RimNetwork
+    prescreening: RimNetwork
+    classifier: RimNetwork
 
 
 @cache
 def trained_networks() -> Networks:
     """The networks that the detector uses."""
     with np.load(WEIGHTS_FILE, allow_pickle=False) as weights:
-        glance, look = (
+        prescreening, classifier = (
             RimNetwork(
                 *(np.ascontiguousarray(weights[f"{sort}_{name}"]) for name in RimNetwork._fields)
             )
             for sort in Networks._fields
         )
-    return Networks(glance, look)
+    return Networks(prescreening, classifier)
 
 
 @kernel()
 def network_inputs(
     grey: Float32Array, pixels_per_radius: FloatArray, sign: FloatArray
 ) -> tuple[_Weights, _Weights]:
-    """The input of a network for N looks: (N, K, M) grey values in K directions at M distances.
+    """The input of a network for N samples: (N, K, M) grey values in K directions at M distances.
 
     Grey values are NaN outside the image. `sign` (N,) is -1 for dark discs, which are seen as light
     ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean relative to their root
     mean square, 0 outside the image; the logarithm of the pixels per radius; the share outside.
-    Those of each look are padded by the last direction in front and the first at the end. The
+    Those of each sample are padded by the last direction in front and the first at the end. The
     scales (N, SCALES) are logarithms of the pixels per radius and of the root mean square, relative
     to usual ones.
     """
-    looks, directions, distances = grey.shape
-    inputs = np.zeros((distances + OTHERS, looks * (directions + 2)), np.float32)
-    scales = np.empty((looks, SCALES), np.float32)
-    for look in range(looks):
-        first = look * (directions + 2) + 1
+    samples, directions, distances = grey.shape
+    inputs = np.zeros((distances + OTHERS, samples * (directions + 2)), np.float32)
+    scales = np.empty((samples, SCALES), np.float32)
+    for sample in range(samples):
+        first = sample * (directions + 2) + 1
         total = squares = size = 0.0
         n = 0
         for k in range(directions):
             sum_k = squares_k = 0.0  # sums by direction do not wait for each other
             for m in range(distances):
-                value = np.float64(grey[look, k, m])
+                value = np.float64(grey[sample, k, m])
                 if value == value:
                     sum_k += value
                     squares_k += value * value
@@ -105,29 +105,29 @@ def network_inputs(
             squares += squares_k
         mean = total / max(n, 1)
         deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
-        scale = sign[look] / deviation
+        scale = sign[sample] / deviation
         for k in range(directions):
             outside = 0
             for m in range(distances):
-                value = np.float64(grey[look, k, m])
+                value = np.float64(grey[sample, k, m])
                 if value == value:
                     inputs[m, first + k] = scale * (value - mean)
                 else:
                     outside += 1
-            log_size = math.log(np.float32(pixels_per_radius[look, k])) - 1.5
+            log_size = math.log(np.float32(pixels_per_radius[sample, k])) - 1.5
             size += log_size
             inputs[distances, first + k] = log_size
             inputs[distances + 1, first + k] = outside / distances
-        scales[look, 0] = size / directions
-        scales[look, 1] = math.log(deviation) - 2.5
-    _pad(inputs, looks)
+        scales[sample, 0] = size / directions
+        scales[sample, 1] = math.log(deviation) - 2.5
+    _pad(inputs, samples)
     return inputs, scales
 
 
 @kernel()
-def _pad(values: _Weights, looks: int) -> None:
-    """Put the last direction of each look before its first, and the first behind the last."""
-    width = values.shape[1] // looks
+def _pad(values: _Weights, samples: int) -> None:
+    """Put the last direction of each sample before its first, and the first behind the last."""
+    width = values.shape[1] // samples
     for row in values:
         for first in range(0, len(row), width):
             last = first + width - 1
@@ -135,10 +135,10 @@ def _pad(values: _Weights, looks: int) -> None:
 
 
 @kernel(fastmath={"contract"})
-def _convolve(values: _Weights, weights: _Weights, bias: _Weights, looks: int) -> _Weights:
+def _convolve(values: _Weights, weights: _Weights, bias: _Weights, samples: int) -> _Weights:
     """Convolution over three neighbours on a circle, and relu, as (C, N (K + 2)) float32."""
     result = np.zeros((len(bias), values.shape[1]), np.float32)
-    # Across the looks, too, so that the loops are long; what is between them is overwritten.
+    # Across the samples, too, so that the loops are long; what is between them is overwritten.
     inner = values.shape[1] - 2
     for c in range(len(bias)):
         row = result[c, 1:]
@@ -151,27 +151,27 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights, looks: int) -
                 row[k] += before * seen[k] + same * seen[k + 1] + after * seen[k + 2]
         for k in range(inner):
             row[k] = max(row[k], np.float32(0.0))
-    _pad(result, looks)
+    _pad(result, samples)
     return result
 
 
 @kernel()
 def _pool(values: _Weights, scales: _Weights) -> _Weights:
-    """(N, 3 C + SCALES) mean, maximum and minimum of each channel of N looks, and their scales."""
-    channels, looks = len(values), len(scales)
-    width = values.shape[1] // looks
-    pooled = np.empty((looks, 3 * channels + scales.shape[1]), np.float32)
-    for look in range(looks):
+    """(N, 3 C + SCALES) mean, maximum and minimum of channels of N samples, and their scales."""
+    channels, samples = len(values), len(scales)
+    width = values.shape[1] // samples
+    pooled = np.empty((samples, 3 * channels + scales.shape[1]), np.float32)
+    for sample in range(samples):
         for c in range(channels):
-            row = values[c, look * width + 1 : (look + 1) * width - 1]
+            row = values[c, sample * width + 1 : (sample + 1) * width - 1]
             total, most, least = np.float32(0.0), row[0], row[0]
             for k in range(len(row)):
                 total += row[k]
                 most, least = max(most, row[k]), min(least, row[k])
-            pooled[look, c] = total / np.float32(len(row))
-            pooled[look, channels + c], pooled[look, 2 * channels + c] = most, least
+            pooled[sample, c] = total / np.float32(len(row))
+            pooled[sample, channels + c], pooled[sample, 2 * channels + c] = most, least
         for i in range(scales.shape[1]):
-            pooled[look, 3 * channels + i] = scales[look, i]
+            pooled[sample, 3 * channels + i] = scales[sample, i]
     return pooled
 
 
@@ -180,28 +180,28 @@ def network_log_odds(
     inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
 ) -> FloatArray:
     """(N,) log-odds that rims with (N, F) features are discs', the mean of the networks."""
-    looks, (members, units) = len(scales), network.dense_bias.shape
-    odds = np.zeros(looks)
+    samples, (members, units) = len(scales), network.dense_bias.shape
+    odds = np.zeros(samples)
     for n in range(members):
-        around = _convolve(inputs, network.around[n], network.around_bias[n], looks)
-        again = _convolve(around, network.again[n], network.again_bias[n], looks)
+        around = _convolve(inputs, network.around[n], network.around_bias[n], samples)
+        again = _convolve(around, network.again[n], network.again_bias[n], samples)
         pooled = _pool(again, scales)
         doubtful = 0
-        for look in range(looks):
-            if not HOPELESS <= odds[look] <= CERTAIN:
+        for sample in range(samples):
+            if not HOPELESS <= odds[sample] <= CERTAIN:
                 continue
             dense = network.dense_bias[n].copy()
             for i in range(pooled.shape[1]):
                 for d in range(units):
-                    dense[d] += pooled[look, i] * network.dense[n, i, d]
+                    dense[d] += pooled[sample, i] * network.dense[n, i, d]
             value = np.float64(network.out_bias[n])
             for d in range(units):
                 value += max(dense[d], np.float32(0.0)) * network.out[n, d]
             for f in range(features.shape[1]):
-                value += features[look, f] * network.out[n, units + f]
+                value += features[sample, f] * network.out[n, units + f]
             # The mean so far.
-            odds[look] += (value - odds[look]) / (n + 1)
-            doubtful += HOPELESS <= odds[look] <= CERTAIN
+            odds[sample] += (value - odds[sample]) / (n + 1)
+            doubtful += HOPELESS <= odds[sample] <= CERTAIN
         if doubtful == 0:
             break
     return odds

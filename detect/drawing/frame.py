@@ -26,7 +26,7 @@ from detect.markers.detect import SAME_MARKER, MarkerDetections
 from detect.options import CompareOptions
 from detect.projection import DiscProjection, circle_on_floor
 from detect.row_files import KINDS, ImageRows
-from detect.verticals.judgement import FATES
+from detect.verticals.judgement import OUTCOMES
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable
 from redetect.array_types import BoolArray, ByteArray, FloatArray, GreyImage
@@ -238,8 +238,8 @@ def _draw_markers(canvas: _Canvas, found: Sequence[MarkerLandmark]) -> None:
 
 
 def _count(what: str, match: FrameMatch, compared: bool) -> str:
-    fate = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
-    return f"{len(match.detected)} {what}{fate}"
+    outcome = f" ({len(match.extra)} extra, {len(match.missed)} missed)" if compared else ""
+    return f"{len(match.detected)} {what}{outcome}"
 
 
 def canvas_of(image: GreyImage, camera: Camera | None = None) -> ByteArray:
@@ -321,25 +321,27 @@ def _colours(names: Sequence[str]) -> dict[str, Colour]:
     return dict(zip(names, [LINE_COLOUR, *map(tuple, pale)], strict=True))
 
 
-_FATE_COLOURS = _colours(FATES)
+_OUTCOME_COLOURS = _colours(OUTCOMES)
 _STAGE_COLOURS = _colours(get_args(Stage))
 
 
 def draw_tracks(image: GreyImage, table: VerticalTable, found: LineDetections) -> ByteArray:
-    """Draw the points of tracks, coloured by their fates, with a legend below."""
+    """Draw the points of tracks, coloured by their outcomes, with a legend below."""
     canvas = canvas_of(image)
-    for t, fate in enumerate(found.fate):
+    for t, outcome in enumerate(found.outcome):
         points = np.rint(track_pixels(found.tracks, table, t)).astype(np.intp)
-        canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _FATE_COLOURS[fate]
-    counts = sorted(Counter(found.fate).items())
-    words = [(f"{fate}: {count}", _FATE_COLOURS[fate]) for fate, count in counts]
+        canvas[points[:, 1], np.clip(points[:, 0], 0, image.shape[1] - 1)] = _OUTCOME_COLOURS[
+            outcome
+        ]
+    counts = sorted(Counter(found.outcome).items())
+    words = [(f"{outcome}: {count}", _OUTCOME_COLOURS[outcome]) for outcome, count in counts]
     return with_legend(canvas, words, 190, 0.38)
 
 
 def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> ByteArray:
     """A picture with rejected candidates for markers, and the reasons for rejection below it."""
     for candidate in found.candidates:
-        if candidate.fate not in (ACCEPTED_MARKER, SAME_MARKER):
+        if candidate.outcome not in (ACCEPTED_MARKER, SAME_MARKER):
             draw_curve(picture, _scaled(candidate.outline, scale), _CANDIDATE_COLOUR, closed=True)
     causes = sorted(found.rejected.items())
     words = [(f"{cause}: {count}", _CANDIDATE_COLOUR) for cause, count in causes]
@@ -347,7 +349,7 @@ def draw_candidates(picture: ByteArray, found: MarkerDetections, scale: int) -> 
 
 
 def draw_explanation(found: DiscExplanation) -> ByteArray:
-    """Draw candidates for discs, coloured by their fates and numbered in order, with a legend."""
+    """Draw numbered candidates for discs, coloured by their outcomes, with a legend."""
     canvas = canvas_of(found.image, found.camera)
     for number, candidate in enumerate(found.candidates, start=1):
         colour, place = _STAGE_COLOURS[candidate.stage], (candidate.x_m, candidate.y_m)

@@ -29,7 +29,7 @@ from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage, IntArray
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 
-#: Fates of candidates, beside the reasons for rejection.
+#: Outcomes of candidates, beside the reasons for rejection.
 ACCEPTED = "accepted"
 SAME_MARKER = "duplicate of a marker"
 
@@ -95,10 +95,10 @@ _PLAIN_MISFIT, _PLAIN_AGREEMENT, _PLAIN_CELL_ERROR = 0.04, 0.95, 0.25
 
 @dataclass(frozen=True)
 class Candidate:
-    """A region with four corners, and its fate."""
+    """A region with four corners, and its outcome."""
 
     outline: FloatArray  # (4, 2) its rough corners, pixels of the image
-    fate: str  # "accepted", or the reason for rejection
+    outcome: str  # "accepted", or the reason for rejection
 
 
 @dataclass(frozen=True)

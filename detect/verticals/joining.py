@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from detect.line_settings import LineNumbers
-from detect.verticals.judgement import Fate, JudgedTracks, accepted_tracks
+from detect.verticals.judgement import JudgedTracks, Outcome, accepted_tracks
 from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
 from detect.verticals.tilt import levelling_rotation, strongest_first
@@ -45,23 +45,23 @@ class Lines(NamedTuple):
 def lines_of_tracks(
     strip: Strip, tracks: LineTracks, judged: JudgedTracks, numbers: LineNumbers
 ) -> Lines:
-    """Lines of accepted tracks; updates the fates of tracks that are suppressed or joined."""
+    """Lines of accepted tracks; updates the outcomes of tracks that are suppressed or joined."""
     tilt = (judged.tilt.pitch_rad, judged.tilt.roll_rad) if judged.tilt is not None else (0.0, 0.0)
     if judged.tilt is None or not numbers.level:
         numbers = numbers._replace(building_deg=math.inf)
-    return _join(strip, tracks, judged.fits, judged.evidence, judged.fate, tilt, numbers)
+    return _join(strip, tracks, judged.fits, judged.evidence, judged.outcome, tilt, numbers)
 
 
 @kernel()
 def _join(
     strip: Strip, tracks: LineTracks, fits: LineFits, evidence: FloatArray,
-    fate: NDArray[np.int8], tilt: tuple[float, float], numbers: LineNumbers,
+    outcome: NDArray[np.int8], tilt: tuple[float, float], numbers: LineNumbers,
 ) -> Lines:  # fmt: skip
-    chosen = accepted_tracks(fate)
+    chosen = accepted_tracks(outcome)
     chosen = chosen[strongest_first(evidence[chosen])]
     alpha, noise = _bearings(fits, chosen, tilt, numbers)
-    _leave_out(chosen, alpha, tracks.polarity, fits, evidence, numbers, fate)
-    chosen = chosen[accepted_tracks(fate[chosen])]
+    _leave_out(chosen, alpha, tracks.polarity, fits, evidence, numbers, outcome)
+    chosen = chosen[accepted_tracks(outcome[chosen])]
     count = len(chosen)
     group = chain_neighbours(alpha[chosen], _reach(fits.pixel_rad[chosen], numbers))
     # The strongest track of each line stays its first.
@@ -71,9 +71,9 @@ def _join(
         for k in range(count):
             if group[k] == lines:
                 members[n] = chosen[k]
-                fate[members[n]] = Fate.JOINED
+                outcome[members[n]] = Outcome.JOINED
                 n += 1
-        fate[members[bounds[lines]]] = Fate.ACCEPTED
+        outcome[members[bounds[lines]]] = Outcome.ACCEPTED
         lines += 1
         bounds[lines] = n
     bounds = bounds[: lines + 1]
@@ -144,24 +144,24 @@ def _bearings(
 @kernel()
 def _leave_out(
     tracks: IntArray, alpha: FloatArray, polarity: FloatArray, fits: LineFits,
-    evidence: FloatArray, numbers: LineNumbers, fate: NDArray[np.int8],
+    evidence: FloatArray, numbers: LineNumbers, outcome: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Suppress tracks, from the strongest on, on the same edge as a stronger one or beside it."""
     pixel, contrast, reach = fits.pixel_rad, fits.contrast, _reach(fits.pixel_rad, numbers)
     for k in range(len(tracks)):
         t = tracks[k]
         for s in tracks[:k]:
-            if fate[s] != Fate.ACCEPTED:
+            if outcome[s] != Outcome.ACCEPTED:
                 continue
             off = abs(_wrapped(alpha[t] - alpha[s]))
             near_px = off / pixel[t]
             if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
-                fate[t] = Fate.SAME_EDGE
+                outcome[t] = Outcome.SAME_EDGE
                 break
             faint = evidence[t] < numbers.join_share * evidence[s]
             fainter = contrast[t] < numbers.shoulder_share * contrast[s]
             if (off < reach[t] and faint) or (near_px < numbers.shoulder_px and fainter):
-                fate[t] = Fate.BESIDE_A_STRONGER_EDGE
+                outcome[t] = Outcome.BESIDE_A_STRONGER_EDGE
 
 
 @kernel()

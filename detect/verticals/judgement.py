@@ -30,8 +30,8 @@ from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
 from redetect.compiled import kernel
 
 
-class Fate(IntEnum):
-    """Fate of a track: a line of its own, joined to another one, or the reason for rejection."""
+class Outcome(IntEnum):
+    """Outcome of a track: a line of its own, joined to another one, or the reason for rejection."""
 
     ACCEPTED = 0
     JOINED = 1
@@ -48,23 +48,29 @@ class Fate(IntEnum):
     BESIDE_A_STRONGER_EDGE = 12
 
 
-#: The fates in words.
-FATES = tuple(fate.name.lower().replace("_", " ") for fate in Fate)
+#: The outcomes in words.
+OUTCOMES = tuple(outcome.name.lower().replace("_", " ") for outcome in Outcome)
 
-#: Tracks with these fates might be lines if tracked again,
-_DOUBTFUL = (Fate.NO_MAXIMUM, Fate.OFF_THE_TRACK, Fate.NOT_STRAIGHT, Fate.UNCERTAIN, Fate.SOFT)
+#: Tracks with these outcomes might be lines if tracked again,
+_DOUBTFUL = (
+    Outcome.NO_MAXIMUM,
+    Outcome.OFF_THE_TRACK,
+    Outcome.NOT_STRAIGHT,
+    Outcome.UNCERTAIN,
+    Outcome.SOFT,
+)
 #: and those with at least this share of the evidence threshold might exceed it.
 _NEARLY = 0.7
 
 
 class JudgedTracks(NamedTuple):
-    """Lines through tracks, and their fates."""
+    """Lines through tracks, and their outcomes."""
 
     fits: LineFits  # a line for each track, unless that is too short or too faint
     #: (T,) response summed over the length in pixel widths, times the square of the sharpness
     evidence: FloatArray
-    #: (T,) indices of `FATES`; lines that disagree with the tilt are "not vertical"
-    fate: NDArray[np.int8]
+    #: (T,) indices of `OUTCOMES`; lines that disagree with the tilt are "not vertical"
+    outcome: NDArray[np.int8]
     #: (T,) rejected tracks that may have continued beyond the edge's end, or lost it early
     doubtful: BoolArray
     #: Consensus tilt; None if too few lines agree. Its covariance is that of least squares.
@@ -92,11 +98,11 @@ def fit_and_judge(
         kept = np.flatnonzero(~before.doubtful)
         new = fit_lines(image, strip, tracks, filters, least, len(kept))
         fits = LineFits(*map(np.concatenate, zip((old[kept] for old in before.fits), new)))
-    evidence, fate, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
+    evidence, outcome, doubtful, accepted, lines, edge = _judge(strip, tracks, fits, numbers)
     tilt, agrees = agree_on_tilt(lines, numbers)
-    fate[accepted[~agrees]] = Fate.NOT_VERTICAL
+    outcome[accepted[~agrees]] = Outcome.NOT_VERTICAL
     consensus = tilt if tilt.lines > 0 else None
-    return JudgedTracks(fits, evidence, fate, doubtful, consensus, lines, edge)
+    return JudgedTracks(fits, evidence, outcome, doubtful, consensus, lines, edge)
 
 
 # Kernels that are launched one after the other compile faster than nested ones.
@@ -106,15 +112,19 @@ def fit_and_judge(
 def _judge(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers
 ) -> tuple[FloatArray, NDArray[np.int8], BoolArray, IntArray, Verticals, IntArray]:
-    """Evidence and individual fates of tracks, which are doubtful; planes and edges of lines."""
+    """Evidence and individual outcomes of tracks, which are doubtful; planes and edges of lines."""
     count = len(tracks.polarity)
-    evidence, fate, doubtful = np.empty(count), np.empty(count, np.int8), np.empty(count, np.bool_)
-    _judge_each(strip, tracks, fits, numbers, evidence, fate)
-    _reject_soft(fits, evidence, accepted_tracks(fate), numbers, fate)
+    evidence, outcome, doubtful = (
+        np.empty(count),
+        np.empty(count, np.int8),
+        np.empty(count, np.bool_),
+    )
+    _judge_each(strip, tracks, fits, numbers, evidence, outcome)
+    _reject_soft(fits, evidence, accepted_tracks(outcome), numbers, outcome)
     for t in range(count):
         nearly = evidence[t] >= _NEARLY * numbers.least_evidence
-        doubtful[t] = fate[t] in _DOUBTFUL or (fate[t] == Fate.LITTLE_EVIDENCE and nearly)
-    accepted = accepted_tracks(fate)
+        doubtful[t] = outcome[t] in _DOUBTFUL or (outcome[t] == Outcome.LITTLE_EVIDENCE and nearly)
+    accepted = accepted_tracks(outcome)
     count = len(accepted)
     votes, place, near = np.empty(count), np.empty(count), np.empty(count)
     own_evidence, polarity = np.empty(count), np.empty(count)
@@ -127,17 +137,17 @@ def _judge(
     lines = _weigh(fits, accepted, votes, numbers)
     edge = group_around_strongest(place, near, own_evidence, polarity)
     share_edges(lines, edge)
-    return evidence, fate, doubtful, accepted, lines, edge
+    return evidence, outcome, doubtful, accepted, lines, edge
 
 
 @kernel()
 def _judge_each(
     strip: Strip, tracks: LineTracks, fits: LineFits, numbers: LineNumbers,
-    evidence: FloatArray, fate: NDArray[np.int8],
+    evidence: FloatArray, outcome: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Evidence of each track, and whether it can individually be a vertical."""
     score = tracks.score
-    for t in range(len(fate)):
+    for t in range(len(outcome)):
         begin, end = tracks.bounds[t], tracks.bounds[t + 1]
         total = 0.0
         for i in range(begin, end):
@@ -147,29 +157,29 @@ def _judge_each(
         gap = max(horizon - tracks.row[end - 1], tracks.row[begin] - horizon) * strip.row_aspect
         noise_px = math.sqrt(fits.covariance[t, 0, 0]) / fits.pixel_rad[t]
         if end - begin < numbers.least_points:
-            fate[t] = Fate.SHORT
+            outcome[t] = Outcome.SHORT
         elif not evidence[t] >= numbers.least_evidence:
-            fate[t] = Fate.LITTLE_EVIDENCE
+            outcome[t] = Outcome.LITTLE_EVIDENCE
         elif not math.isfinite(fits.line[t, 0]):
-            fate[t] = Fate.NO_MAXIMUM
+            outcome[t] = Outcome.NO_MAXIMUM
         elif not fits.shift_px[t] <= numbers.largest_shift_px:
-            fate[t] = Fate.OFF_THE_TRACK
+            outcome[t] = Outcome.OFF_THE_TRACK
         elif not fits.scatter_px[t] <= numbers.largest_scatter_px:
-            fate[t] = Fate.NOT_STRAIGHT
+            outcome[t] = Outcome.NOT_STRAIGHT
         elif not gap <= numbers.largest_horizon_gap_px:
-            fate[t] = Fate.OFF_THE_HORIZON
+            outcome[t] = Outcome.OFF_THE_HORIZON
         elif not noise_px <= numbers.largest_noise_px:
-            fate[t] = Fate.UNCERTAIN
+            outcome[t] = Outcome.UNCERTAIN
         else:
-            fate[t] = Fate.ACCEPTED
+            outcome[t] = Outcome.ACCEPTED
 
 
 @kernel()
-def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
+def accepted_tracks(outcome: NDArray[np.int8]) -> IntArray:
     """(N,) indices of the tracks accepted so far."""
-    accepted, count = np.empty(len(fate), np.int64), 0
-    for t in range(len(fate)):
-        if fate[t] == Fate.ACCEPTED:
+    accepted, count = np.empty(len(outcome), np.int64), 0
+    for t in range(len(outcome)):
+        if outcome[t] == Outcome.ACCEPTED:
             accepted[count] = t
             count += 1
     return accepted[:count]
@@ -178,7 +188,7 @@ def accepted_tracks(fate: NDArray[np.int8]) -> IntArray:
 @kernel()
 def _reject_soft(
     fits: LineFits, evidence: FloatArray, accepted: IntArray, numbers: LineNumbers,
-    fate: NDArray[np.int8],
+    outcome: NDArray[np.int8],
 ) -> None:  # fmt: skip
     """Reject lines that are soft and faint compared to the other accepted ones."""
     if len(accepted) == 0:
@@ -189,7 +199,7 @@ def _reject_soft(
     for t in accepted:
         soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
         if soft and evidence[t] < numbers.soft_evidence:
-            fate[t] = Fate.SOFT
+            outcome[t] = Outcome.SOFT
 
 
 @kernel()

@@ -207,7 +207,7 @@ def test_close_edges_are_joined_to_one_row() -> None:
     joined = detect_lines(render(camera, bar, grey=80.0), table)
     assert (len(apart), len(joined)) == (2, 1)
     assert joined.lines.bounds.tolist() == [0, 2]
-    assert sorted(joined.fate[t] for t in joined.lines.members) == [ACCEPTED, JOINED]
+    assert sorted(joined.outcome[t] for t in joined.lines.members) == [ACCEPTED, JOINED]
     evidence = joined.judged.evidence[joined.lines.members]
     share, order = evidence / evidence.sum(), np.argsort(-evidence)
     assert apart.lines.bounds.tolist() == [0, 1, 2]
@@ -316,7 +316,7 @@ def test_one_call_goes_the_path_of_the_steps() -> None:
 @pytest.mark.parametrize("value", [0, 255])
 def test_blank_images_give_nothing(value: int) -> None:
     found = detect_lines(np.full((160, 240), value, np.uint8), TABLE)
-    assert (len(found), found.tilt, found.landmarks(), found.fate) == (0, None, (), ())
+    assert (len(found), found.tilt, found.landmarks(), found.outcome) == (0, None, (), ())
 
 
 def test_wrong_images_are_refused() -> None:

@@ -18,7 +18,7 @@ from camera.calibration.choice import _POLYNOMIAL_WORTH, _TANGENTIAL_WORTH
 from camera.calibration.start import _FOCAL_WIDTHS
 from camera.formats.conversion import _NEAR_PX
 from detect.discs.hough import _MOST_DOUBTFUL
-from detect.discs.judgement import GLANCED, GLANCED_AT
+from detect.discs.judgement import SPARSE_DIRECTIONS, SPARSE_RADII
 from detect.discs.rim import DIRECTIONS
 from detect.line_settings import LineSettings
 from detect.settings import (
@@ -54,7 +54,7 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
       PUBLISHED.threshold, PUBLISHED.least_contrast]),
     ("docs/discs.md", r"the best within # radii on the floor", [DISCS.separation]),
     ("docs/discs.md", r"the rim is traced in # directions", [DIRECTIONS]),
-    ("docs/discs.md", r"at # directions times # pixels", [GLANCED, len(GLANCED_AT)]),
+    ("docs/discs.md", r"at # directions times # pixels", [SPARSE_DIRECTIONS, len(SPARSE_RADII)]),
     ("docs/discs.md", r"the best # centres of either polarity", [_MOST_DOUBTFUL]),
     ("docs/discs.md", r"at least #°. If fewer than # of them", [USUAL_TILT_DEG, LEAST_FRAMES]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),

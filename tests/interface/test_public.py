@@ -424,7 +424,7 @@ def test_every_disc_that_is_found_is_explained(
     why = rd.explain(demo_image, demo_camera, polarity="light")
     assert sum(row.is_disc for row in why.candidates) == len(found.discs)
     stages = {row.stage for row in why.candidates}
-    assert {"disc", "steps", "glance", "polarity"} <= stages
+    assert {"disc", "steps", "prescreening", "polarity"} <= stages
     for row in why.candidates:
         assert row.is_disc == row.reason().startswith("found")
         assert not row.is_disc or row.contrast > 15.0  # of large discs, too

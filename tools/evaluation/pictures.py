@@ -80,15 +80,15 @@ def draw_verticals(figure: Any, run: Path, frame: int) -> None:
     )  # fmt: skip
     titles = (
         "response: how much a step of the grey value along the vertical explains, with its sign",
-        f"{len(found.fate)} tracks from the horizon (dashed) up and down",
+        f"{len(found.outcome)} tracks from the horizon (dashed) up and down",
         f"{len(found)} verticals{said}, on which {0 if tilt is None else tilt.lines} tracks agree",
     )
     panels = _panels(figure, (3, 1), image, titles)
     panels[0].imshow(response, cmap="RdBu", vmin=-0.7, vmax=0.7)
-    for t, fate in enumerate(found.fate):
+    for t, outcome in enumerate(found.outcome):
         place = track_pixels(found.tracks, table, t)
-        panels[1].plot(*place.T, color=_LINE if fate == "accepted" else "#3498db", lw=1.2)
-        if fate == "accepted":
+        panels[1].plot(*place.T, color=_LINE if outcome == "accepted" else "#3498db", lw=1.2)
+        if outcome == "accepted":
             panels[2].plot(*place.T, color=_LINE, lw=1.4)
     panels[1].plot(np.arange(camera.width), table.anchor_row, "--", color="white", lw=0.7)
 

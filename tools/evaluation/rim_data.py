@@ -25,7 +25,14 @@ from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
 from detect.circles import candidates_of, judged, scene_of, vote_shape
-from detect.discs.judgement import FEATURES, GLANCED_AT, LOOKED_AT, Fate, glance, pairs_of_steps
+from detect.discs.judgement import (
+    DENSE_RADII,
+    FEATURES,
+    SPARSE_RADII,
+    Outcome,
+    pairs_of_steps,
+    sparse_profiles,
+)
 from detect.discs.rim import DIRECTIONS, profiles
 from detect.discs.rim_network import OTHERS, SCALES, Networks, RimNetwork
 from detect.settings import CircleSettings
@@ -74,15 +81,15 @@ def _network_by(features: int, decisive: int, inputs: int) -> RimNetwork:
     return RimNetwork._make([*weights, out, np.zeros(1, np.float32)])
 
 
-#: Glances pass; of the looks at one place, the one with most of a rim is the best.
+#: All pass the prescreening; of the rims at one place, the one with most of a rim is the best.
 _BY_RIM = Networks(
-    _network_by(1, 0, len(GLANCED_AT) + OTHERS),
-    _network_by(len(FEATURES), FEATURES.index("rim"), len(LOOKED_AT) + OTHERS),
+    _network_by(1, 0, len(SPARSE_RADII) + OTHERS),
+    _network_by(len(FEATURES), FEATURES.index("rim"), len(DENSE_RADII) + OTHERS),
 )
 
 
-class Looks(NamedTuple):
-    """Glances at candidates, or looks at rims, of known truth."""
+class Samples(NamedTuple):
+    """Profiles of candidates, sparse ones or those of rims, of known truth."""
 
     features: FloatArray  # (N, F)
     grey: Float32Array  # (N, V, K, M) Of a dark disc, turned into a light one.
@@ -113,8 +120,8 @@ _Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
 class _Gathering:
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self.glances: list[_Row] = []
-        self.looks: list[_Row] = []
+        self.sparse: list[_Row] = []
+        self.rims: list[_Row] = []
 
     def add(
         self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float],
@@ -137,22 +144,22 @@ class _Gathering:
                     yield k, is_disc, weight[0] if is_disc else less * weight[1] / kept, source
 
         candidates = candidates_of(scene, table, _SETTINGS)
-        grey, scale = glance(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
+        grey, scale = sparse_profiles(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
         grey = _as_light(grey, candidates.sign[:, None, None])
         for k, *row in known(candidates.floor_xy, candidates.sign):
             seen: tuple[Any, ...] = candidates.score[k, None], grey[k, None], scale[k, None]
-            self.glances.append((*seen, *row))
+            self.sparse.append((*seen, *row))
         rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
-        rims = rims.where((rims.fate == Fate.JUDGED) & np.isfinite(rims.features).all(axis=1))
+        rims = rims.where((rims.outcome == Outcome.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
             views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])
             seen = rims.features[k], *views
-            self.looks.append((*seen, *row))
+            self.rims.append((*seen, *row))
 
     def _views(
         self, image: ByteArray, camera: Camera, place: FloatArray, sign: float
     ) -> tuple[Float32Array, Float32Array]:
-        grey = np.empty((_VIEWS, DIRECTIONS, len(LOOKED_AT)), np.float32)
+        grey = np.empty((_VIEWS, DIRECTIONS, len(DENSE_RADII)), np.float32)
         scale = np.empty((_VIEWS, DIRECTIONS), np.float32)
         off = self._rng.normal(size=(_VIEWS, 3)) * [_OFF_PLACE, _OFF_PLACE, _OFF_SIZE]
         off[0] = 0.0
@@ -170,9 +177,9 @@ def _as_light(grey: Float32Array, sign: FloatArray | float) -> Float32Array:
     return np.asarray(np.where(np.asarray(sign) > 0.0, grey, 255.0 - grey), np.float32)
 
 
-def _looks_of(rows: list[_Row]) -> Looks:
+def _samples_of(rows: list[_Row]) -> Samples:
     features, grey, scale, is_disc, weight, source = zip(*rows, strict=True)
-    return Looks(
+    return Samples(
         np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
         np.array(is_disc), np.array(weight), np.array(source),
     )  # fmt: skip
@@ -201,8 +208,8 @@ def _images(camera: Camera, places: FloatArray, slack_px: float = 0.0) -> FloatA
 
 def gather(
     data: Path, frames: slice, scenes: int, seed: int, without: str = ""
-) -> tuple[Looks, Looks]:
-    """Glances and looks at the sources of a folder of data, and at some frames of the recorded run.
+) -> tuple[Samples, Samples]:
+    """Sparse profiles and rims from a folder of data, and from some frames of its recorded run.
 
     A rendered building may be left out.
     """
@@ -231,16 +238,16 @@ def gather(
     with ProcessPoolExecutor() as pool:
         done = [pool.submit(_gather, [seed, n], *part) for n, part in enumerate(parts)]
         rows = [future.result() for future in done]
-    glances, looks = (_looks_of([row for part in rows for row in part[which]]) for which in (0, 1))
-    return glances, looks
+    sparse, rims = (_samples_of([row for part in rows for row in part[which]]) for which in (0, 1))
+    return sparse, rims
 
 
 def _gather(seed: list[int], add: Any, *of: Any) -> tuple[list[_Row], list[_Row]]:
-    """The glances and looks that a part of the sources gives."""
+    """The sparse profiles and the rims that a part of the sources gives."""
     rng = np.random.default_rng(seed)
     gathering = _Gathering(rng)
     add(gathering, rng, seed[1], *of)
-    return gathering.glances, gathering.looks
+    return gathering.sparse, gathering.rims
 
 
 def _scenes(
@@ -471,7 +478,7 @@ def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatA
 
 def _contrast(image: ByteArray, camera: Camera, floor_xy: FloatArray) -> float:
     """Grey levels by which a disc (2,) is lighter than the floor."""
-    [grey], _ = glance(image, camera_numbers(camera), floor_xy[None], _RADIUS)
+    [grey], _ = sparse_profiles(image, camera_numbers(camera), floor_xy[None], _RADIUS)
     return float(np.nanmean(grey[:, 1:3]) - np.nanmean(grey[:, 5:7]))
 
 

@@ -1,12 +1,12 @@
 """Trains the networks that judge candidates (`detect.discs.rim_network`) on known truth.
 
-Plain NumPy: 240,000 looks and 13,000 weights take twenty minutes. Forward and backward pass are
+Plain NumPy: 240,000 samples and 13,000 weights take twenty minutes. Forward and backward pass are
 written out; the steps are Adam's with decoupled weight decay (I. Loshchilov and F. Hutter,
 Decoupled Weight Decay Regularization, ICLR 2019), their length rises and falls once.
 
-There are few buildings of known truth. So that the networks do not learn these by heart, each look
-is varied whenever it is used: mirrored, on another floor, in other light, partly hidden or stained,
-cut off, less sharp, or noisier.
+There are few buildings of known truth. So that the networks do not learn these by heart, each
+sample is varied whenever it is used: mirrored, on another floor, in other light, partly hidden or
+stained, cut off, less sharp, or noisier.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from tyro.conf import Positional
 
-from detect.discs.judgement import GLANCED_AT, LOOKED_AT
+from detect.discs.judgement import DENSE_RADII, SPARSE_RADII
 from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
 from redetect.array_types import Float32Array
 from redetect.storage import write_whole
 from tools.evaluation.figures import Figures, Study
-from tools.evaluation.rim_data import Looks, gather
+from tools.evaluation.rim_data import Samples, gather
 
 FloatArray = NDArray[np.floating]
 
 _BATCH = 256
-#: Share of the discs that a glance may lose.
-_LOST_AT_A_GLANCE = 0.02
+#: Share of the discs that the prescreening may lose.
+_LOST_BY_PRESCREENING = 0.02
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
-#: A look is never taken for certain.
+#: A sample is never taken for certain.
 _SMOOTHING = 0.01
-#: Shares of looks that are varied in each way, and how much. Of another look's deviations from its
-#: mean a part is added, mostly to the floor alone: from this distance on, with a transition of this
-#: width (nominal radii).
+#: Shares of samples that are varied in each way, and how much. Of another sample's deviations from
+#: its mean a part is added, mostly to the floor alone: from this distance on, with a transition of
+#: this width (nominal radii).
 _TEXTURED, _TEXTURE, _ONLY_FLOOR, _FLOOR_FROM = 0.35, (0.1, 0.7), 0.7, (1.08, 0.04)
 #: A gradient of N(0, x) grey levels per radius is added; grey values have the power exp(N(0, x)).
 _RELIT, _SIDE_LIGHT, _POWER = 0.5, 12.0, 0.35
-#: Each sample is averaged with its neighbours along the radius, which have up to this weight.
+#: Each grey value is averaged with its neighbours along the radius, which have up to this weight.
 _SOFT, _NEIGHBOUR = 0.3, 0.33
 #: A half-plane, a strip, a blot or a sector, with an edge of this width (nominal radii), shows
-#: another look, one grey value, or the same under light of the factor exp(N(0, x)).
+#: another sample, one grey value, or the same under light of the factor exp(N(0, x)).
 _COVERED, _EDGE, _SHADE = 0.3, (0.02, 0.15), 0.7
 #: The image ends at up to this distance from the centre, nominal radii.
 _CUT, _CUT_AT = 0.1, 1.2
@@ -56,7 +56,7 @@ _GAIN, _NOISE, _NOISY = 0.3, 4.0, 0.3
 
 
 class Shape(NamedTuple):
-    """How large networks are, how many are averaged, and how often each sees every look."""
+    """How large networks are, how many are averaged, and how often each sees every sample."""
 
     channels: int
     units: int
@@ -64,11 +64,11 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"glance": Shape(12, 8, 1, 30), "look": Shape(16, 24, 4, 40)}
+SHAPES = {"prescreening": Shape(12, 8, 1, 30), "classifier": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
-    """What the network sees of N looks."""
+    """What the network sees of N samples."""
 
     inputs: FloatArray  # (N, K, I)
     scales: FloatArray  # (N, SCALES)
@@ -76,13 +76,13 @@ class Batch(NamedTuple):
 
 
 def _distances(grey: FloatArray) -> Float32Array:
-    """Distances (M,) of the samples of (..., M) glances or looks, nominal radii."""
-    [at] = [at for at in (GLANCED_AT, LOOKED_AT) if len(at) == grey.shape[-1]]
+    """Distances (M,) of (..., M) sparse or dense profiles, nominal radii."""
+    [at] = [at for at in (SPARSE_RADII, DENSE_RADII) if len(at) == grey.shape[-1]]
     return at.astype(np.float32)
 
 
 def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArray) -> Batch:
-    """`detect.discs.rim_network.network_inputs` of N looks at light discs."""
+    """`detect.discs.rim_network.network_inputs` of N samples of light discs."""
     outside = np.isnan(grey)
     count = np.maximum((~outside).sum(axis=(1, 2), keepdims=True), 1)
     mean = np.sum(grey, axis=(1, 2), keepdims=True, where=~outside) / count
@@ -138,9 +138,9 @@ class _Member:
         mean, most, least = np.split((d_dense @ w_dense.T)[:, :-SCALES], 3, axis=-1)
         directions, channels = self._again.shape[1:]
         d_again = np.repeat((mean / directions)[:, None], directions, axis=1)
-        look, channel = np.ogrid[: len(d_odds), :channels]
-        d_again[look, self._most, channel] += most
-        d_again[look, self._least, channel] += least
+        sample, channel = np.ogrid[: len(d_odds), :channels]
+        d_again[sample, self._most, channel] += most
+        d_again[sample, self._least, channel] += least
         d_again = (d_again * (self._again > 0.0)).reshape(-1, channels)
         before, same, after = np.split((d_again @ w_again.T).reshape(self._around_seen.shape), 3, 2)
         d_around = np.roll(before, -1, axis=1) + same + np.roll(after, 1, axis=1)
@@ -159,39 +159,39 @@ def _neighbours(values: FloatArray) -> FloatArray:
 
 
 def _varied(
-    looks: Looks, chosen: NDArray[np.int64], others: NDArray[np.int64], rng: np.random.Generator
+    samples: Samples, chosen: NDArray[np.int64], others: NDArray[np.int64], rng: np.random.Generator
 ) -> Batch:
-    """Looks as they could have been; `others` are looks at what is no disc."""
+    """Samples as they could have been; `others` are of what is no disc."""
     n = len(chosen)
-    view = rng.integers(looks.grey.shape[1], size=n)
-    grey, scale = looks.grey[chosen, view], looks.pixels_per_radius[chosen, view]
+    view = rng.integers(samples.grey.shape[1], size=n)
+    grey, scale = samples.grey[chosen, view], samples.pixels_per_radius[chosen, view]
     mirrored = rng.random(n) < 0.5
     grey[mirrored], scale[mirrored] = grey[mirrored, ::-1], scale[mirrored, ::-1]
     for share, vary in _VARIATIONS:
         some = np.flatnonzero(rng.random(n) < share)
-        other = looks.grey[rng.choice(others, len(some)), 0]
+        other = samples.grey[rng.choice(others, len(some)), 0]
         grey[some] = vary(grey[some], other, rng)
     gain = np.exp(rng.normal(0.0, _GAIN, (n, 1, 1))).astype(np.float32)
     noise = rng.uniform(0.0, _NOISE, (n, 1, 1)) * np.where(rng.random((n, 1, 1)) < _NOISY, 3.0, 1.0)
     lit = gain * grey + noise.astype(np.float32) * rng.standard_normal(grey.shape, np.float32)
-    return batch_of(lit, scale, looks.features[chosen].astype(np.float32))
+    return batch_of(lit, scale, samples.features[chosen].astype(np.float32))
 
 
 def _positions(grey: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Angles (N, K, 1) from a random direction, and distances (M,) in nominal radii, of samples."""
-    looks, directions, _ = grey.shape
+    samples, directions, _ = grey.shape
     angle = np.linspace(0.0, 2.0 * np.pi, directions, endpoint=False, dtype=np.float32)[:, None]
-    first = rng.uniform(0.0, 2.0 * np.pi, (looks, 1, 1)).astype(np.float32)
+    first = rng.uniform(0.0, 2.0 * np.pi, (samples, 1, 1)).astype(np.float32)
     return angle - first, _distances(grey)
 
 
 def _each(values: FloatArray) -> FloatArray:
-    """One value for each of N looks, as (N, 1, 1)."""
+    """One value for each of N samples, as (N, 1, 1)."""
     return values.astype(np.float32)[:, None, None]
 
 
 def _textured(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Looks with the deviations of others added."""
+    """Samples with the deviations of others added."""
     n, (at, width) = len(grey), _FLOOR_FROM
     _, distance = _positions(grey, rng)
     floor = np.where(_each(rng.random(n)) < _ONLY_FLOOR, expit((distance - at) / width), 1.0)
@@ -200,7 +200,7 @@ def _textured(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> 
 
 
 def _relit(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Looks with light from one side, and brighter or darker."""
+    """Samples with light from one side, and brighter or darker."""
     n = len(grey)
     angle, distance = _positions(grey, rng)
     lit = grey + _each(rng.normal(0.0, _SIDE_LIGHT, n)) * distance * np.cos(angle)
@@ -209,14 +209,14 @@ def _relit(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatAr
 
 
 def _softened(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Looks that are less sharp."""
+    """Samples that are less sharp."""
     weight = _each(rng.uniform(0.0, _NEIGHBOUR, len(grey)))
     padded = np.pad(grey, ((0, 0), (0, 0), (1, 1)), mode="edge")
     return (1.0 - 2.0 * weight) * grey + weight * (padded[:, :, :-2] + padded[:, :, 2:])
 
 
 def _covered(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Looks of which a part is hidden, stained, or in another light."""
+    """Samples of which a part is hidden, stained, or in another light."""
     n = len(grey)
     angle, distance = _positions(grey, rng)
     x, y = distance * np.cos(angle), distance * np.sin(angle)
@@ -234,7 +234,7 @@ def _covered(grey: FloatArray, other: FloatArray, rng: np.random.Generator) -> F
 
 
 def _cut(grey: FloatArray, _: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Looks of which a part is outside the image."""
+    """Samples of which a part is outside the image."""
     angle, distance = _positions(grey, rng)
     farthest = _each(rng.uniform(0.0, _CUT_AT, len(grey)))
     return np.where(distance * np.cos(angle) > farthest, np.float32(np.nan), grey)
@@ -246,20 +246,20 @@ _VARIATIONS = (
 )  # fmt: skip
 
 
-def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int) -> _Member:
+def _train_member(samples: Samples, used: NDArray[np.int64], shape: Shape, seed: int) -> _Member:
     rng = np.random.default_rng(seed)
-    inputs, features = looks.grey.shape[-1] + OTHERS, looks.features.shape[1]
+    inputs, features = samples.grey.shape[-1] + OTHERS, samples.features.shape[1]
     member = _Member(_first_weights(inputs, features, shape, rng))
-    target = looks.is_disc * (1.0 - 2.0 * _SMOOTHING) + _SMOOTHING
-    weight = looks.weight / looks.weight[used].mean()
+    target = samples.is_disc * (1.0 - 2.0 * _SMOOTHING) + _SMOOTHING
+    weight = samples.weight / samples.weight[used].mean()
     first = [np.zeros_like(w) for w in member.weights]
     second = [np.zeros_like(w) for w in member.weights]
     steps = shape.epochs * -(-len(used) // _BATCH)
-    others = used[~looks.is_disc[used]]
+    others = used[~samples.is_disc[used]]
     orders = (rng.permutation(used) for _ in range(shape.epochs))
     batches = (order[k : k + _BATCH] for order in orders for k in range(0, len(order), _BATCH))
     for t, chosen in enumerate(batches, 1):
-        batch = _varied(looks, chosen, others, rng)
+        batch = _varied(samples, chosen, others, rng)
         odds = member.log_odds(batch)
         d_odds = (expit(odds) - target[chosen]) * weight[chosen] / len(chosen)
         gradient = member.gradient(d_odds.astype(np.float32))
@@ -278,11 +278,11 @@ def _train_member(looks: Looks, used: NDArray[np.int64], shape: Shape, seed: int
     return member
 
 
-def train(looks: Looks, used: NDArray[np.bool_], shape: Shape, seed: int) -> RimNetwork:
-    """Train networks on some of the looks. `used` (N,)."""
+def train(samples: Samples, used: NDArray[np.bool_], shape: Shape, seed: int) -> RimNetwork:
+    """Train networks on some of the samples. `used` (N,)."""
     index = np.flatnonzero(used)
-    mean, deviation = looks.features[used].mean(axis=0), looks.features[used].std(axis=0) + 1e-6
-    alike = looks._replace(features=(looks.features - mean) / deviation)
+    mean, deviation = samples.features[used].mean(axis=0), samples.features[used].std(axis=0) + 1e-6
+    alike = samples._replace(features=(samples.features - mean) / deviation)
     with ThreadPoolExecutor() as pool:  # NumPy releases the interpreter lock most of the time
         seeds = range(seed, seed + shape.members)
         trained = pool.map(lambda own: _train_member(alike, index, shape, own).weights, seeds)
@@ -299,26 +299,28 @@ def train(looks: Looks, used: NDArray[np.bool_], shape: Shape, seed: int) -> Rim
     )  # fmt: skip
 
 
-def train_glance(glances: Looks, used: NDArray[np.bool_], seed: int) -> RimNetwork:
+def train_prescreening(sparse: Samples, used: NDArray[np.bool_], seed: int) -> RimNetwork:
     """As `train`, for a network above 0 for all but a few of the discs."""
-    network = train(glances, used, SHAPES["glance"], seed)
-    discs = log_odds(network, glances, used & glances.is_disc)
-    least = np.quantile(discs, _LOST_AT_A_GLANCE).astype(np.float32)
+    network = train(sparse, used, SHAPES["prescreening"], seed)
+    discs = log_odds(network, sparse, used & sparse.is_disc)
+    least = np.quantile(discs, _LOST_BY_PRESCREENING).astype(np.float32)
     return network._replace(out_bias=network.out_bias - least)
 
 
-def train_all(glances: Looks, looks: Looks, seed: int) -> Networks:
-    """The networks of the detector, by all glances and looks."""
+def train_all(sparse: Samples, rims: Samples, seed: int) -> Networks:
+    """The networks of the detector, by all sparse profiles and rims."""
     return Networks(
-        train_glance(glances, np.ones(len(glances.is_disc), np.bool_), seed),
-        train(looks, np.ones(len(looks.is_disc), np.bool_), SHAPES["look"], seed),
+        train_prescreening(sparse, np.ones(len(sparse.is_disc), np.bool_), seed),
+        train(rims, np.ones(len(rims.is_disc), np.bool_), SHAPES["classifier"], seed),
     )
 
 
-def log_odds(network: RimNetwork, looks: Looks, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Log-odds of some looks: `detect.discs.rim_network.network_log_odds` in NumPy."""
+def log_odds(
+    network: RimNetwork, samples: Samples, chosen: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Log-odds of some samples: `detect.discs.rim_network.network_log_odds` in NumPy."""
     batch = batch_of(
-        looks.grey[chosen, 0], looks.pixels_per_radius[chosen, 0], looks.features[chosen]
+        samples.grey[chosen, 0], samples.pixels_per_radius[chosen, 0], samples.features[chosen]
     )
     mean = np.zeros(len(batch.inputs))
     for n, layers in enumerate(zip(*network, strict=True)):
@@ -348,12 +350,12 @@ class TrainRimNetwork(Study):
     force: bool = False  # Replace that file.
 
     def measured(self) -> Figures:
-        glances, looks = gather(
+        sparse, rims = gather(
             self.data, slice(0, self.frames, self.every), self.scenes, self.seed, self.without
         )
-        for kind, of in (("glances", glances), ("looks", looks)):
+        for kind, of in (("candidates", sparse), ("rims", rims)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
-        networks = train_all(glances, looks, self.seed)
+        networks = train_all(sparse, rims, self.seed)
         self.output.parent.mkdir(parents=True, exist_ok=True)
         weights: dict[str, Any] = {
             f"{sort}_{name}": values

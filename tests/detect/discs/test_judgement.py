@@ -13,7 +13,7 @@ from camera.kernels import camera_numbers
 from camera.model_checks import checked_pose
 from detect.circles import CircleDetections, detect_circles
 from detect.discs.evidence import paleness_penalty, sign_penalty
-from detect.discs.judgement import GLANCED_AT, glance
+from detect.discs.judgement import SPARSE_RADII, sparse_profiles
 from detect.settings import CircleSettings
 from lut import VoteTable
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, SHAPES, PaintedFloor, Shape
@@ -180,13 +180,13 @@ def test_a_disc_is_listed_if_its_centre_is_in_sight(
         assert len(found) == len(CLEAR_PLACES) + listed
 
 
-def test_a_glance_at_a_near_disc_follows_perspective(published_camera: Camera) -> None:
+def test_sparse_profiles_of_a_near_disc_follow_perspective(published_camera: Camera) -> None:
     pose = np.array(published_camera.robot_from_camera)
     pose[2, 3] = 0.25  # metres
     low = replace(published_camera, robot_from_camera=checked_pose("sensor2World", pose))
     place = (0.0, -0.4)
     image = PaintedFloor(low).disc(place, LIGHT).image(noise=0.0)
-    [grey], scale = glance(image, camera_numbers(low), np.array([place]), 0.1)
+    [grey], scale = sparse_profiles(image, camera_numbers(low), np.array([place]), 0.1)
     assert scale.min() > 20.0  # pixels
-    assert np.all(grey[:, GLANCED_AT < 1.0] > 0.5 * (LIGHT + FLOOR))
-    assert np.all(grey[:, GLANCED_AT > 1.0] < 0.5 * (LIGHT + FLOOR))
+    assert np.all(grey[:, SPARSE_RADII < 1.0] > 0.5 * (LIGHT + FLOOR))
+    assert np.all(grey[:, SPARSE_RADII > 1.0] < 0.5 * (LIGHT + FLOOR))

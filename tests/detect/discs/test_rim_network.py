@@ -38,14 +38,14 @@ def test_the_compiled_network_is_its_equation(seed: int, sign: float) -> None:
     expected, expected_scales = reference.inputs_of(grey, scale, sign)
     np.testing.assert_allclose(inputs[:, 1:-1].T, expected, atol=2e-6)
     np.testing.assert_allclose(scales[0], expected_scales, atol=2e-6)
-    [found] = network_log_odds(inputs, scales, features[None], trained_networks().look)
-    odds = reference.log_odds_of(expected, expected_scales, features, trained_networks().look)
+    [found] = network_log_odds(inputs, scales, features[None], trained_networks().classifier)
+    odds = reference.log_odds_of(expected, expected_scales, features, trained_networks().classifier)
     assert found == pytest.approx(odds, abs=1e-4)
 
 
-def test_several_looks_at_once_are_each_judged_as_alone() -> None:
+def test_several_samples_at_once_are_each_judged_as_alone() -> None:
     profiles, signs = [some_profiles(seed) for seed in range(5)], [1.0, -1.0, 1.0, 1.0, -1.0]
-    network = trained_networks().look
+    network = trained_networks().classifier
     alone = [odds_of(profiles[k : k + 1], signs[k : k + 1], network)[0] for k in range(5)]
     np.testing.assert_allclose(odds_of(profiles, signs, network), alone, atol=1e-5)
 
@@ -53,8 +53,8 @@ def test_several_looks_at_once_are_each_judged_as_alone() -> None:
 def test_turned_directions_and_a_dark_disc_are_the_same() -> None:
     grey, scale, features = some_profiles(3)
     turned = np.roll(grey, 7, axis=0), np.roll(scale, 7), features
-    looks = [(grey, scale, features), turned, (255.0 - grey, scale, features)]
-    odds, odds_turned, odds_dark = odds_of(looks, [1.0, 1.0, -1.0], trained_networks().look)
+    samples = [(grey, scale, features), turned, (255.0 - grey, scale, features)]
+    odds, odds_turned, odds_dark = odds_of(samples, [1.0, 1.0, -1.0], trained_networks().classifier)
     assert odds_turned == pytest.approx(odds, abs=1e-4)
     assert odds_dark == pytest.approx(odds, abs=1e-4)
 
@@ -67,6 +67,6 @@ def test_a_clear_disc_is_likelier_than_a_flat_floor() -> None:
     disc = 90.0 + 60.0 / (1.0 + np.exp((at - 1.0) / 0.08)) + noise
     whole = np.array([1.0, 0.0, 0.3, 0.02, 0.004, 0.3, 0.15])
     none = np.array([0.4, 4.0, 0.8, 0.2, 0.4, 0.3, 0.13])
-    looks = [(disc, scale, whole), (90.0 + noise, scale, none)]
-    clear, flat = odds_of(looks, [1.0, 1.0], trained_networks().look)
+    samples = [(disc, scale, whole), (90.0 + noise, scale, none)]
+    clear, flat = odds_of(samples, [1.0, 1.0], trained_networks().classifier)
     assert clear > flat + 2.0

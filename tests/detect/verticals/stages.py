@@ -63,7 +63,7 @@ def judge_tracks(
     steps: int | None = None,
     before: JudgedTracks | None = None,
 ) -> JudgedTracks:
-    """Lines through tracks, refined in all or some steps, their fates, and the tilt."""
+    """Lines through tracks, refined in all or some steps, their outcomes, and the tilt."""
     numbers = numbers_of(settings, table.row_aspect)
     filters = step_filters(replace(settings, refine_steps_px=settings.refine_steps_px[:steps]))
     judged = fit_and_judge(image, strip_of(table), tracks, filters, numbers, before)

@@ -1,18 +1,18 @@
-"""Fates by number and by name; filters that are tabulated against their formula."""
+"""Outcomes by number and by name; filters that are tabulated against their formula."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from detect.verticals.judgement import FATES, Fate
+from detect.verticals.judgement import OUTCOMES, Outcome
 from detect.verticals.refinement import SUBPIXELS, gaussian_steps
 
 
 def test_fates_are_called_what_they_are_in_words() -> None:
-    assert len(FATES) == len(Fate)
-    assert FATES[Fate.ACCEPTED] == "accepted"
-    assert FATES[Fate.BESIDE_A_STRONGER_EDGE] == "beside a stronger edge"
+    assert len(OUTCOMES) == len(Outcome)
+    assert OUTCOMES[Outcome.ACCEPTED] == "accepted"
+    assert OUTCOMES[Outcome.BESIDE_A_STRONGER_EDGE] == "beside a stronger edge"
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8, 3.0])

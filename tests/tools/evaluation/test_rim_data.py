@@ -1,4 +1,4 @@
-"""Looks of known truth: floors of photographs, and a disc's contrast."""
+"""Samples of known truth: floors of photographs, and a disc's contrast."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_dark_discs_are_seen_as_light_ones(published_camera: Camera) -> None:
     gathering = rim_data._Gathering(np.random.default_rng(4))
     truth = rim_data.Truth(dark=rim_data._images(camera, place))
     gathering.add(np.asarray(dark, np.uint8), camera, truth, (1.0, 1.0), "here")
-    for rows in (gathering.glances, gathering.looks):
+    for rows in (gathering.sparse, gathering.rims):
         [disc] = [grey for _, grey, _, is_disc, *_ in rows if is_disc]
         assert np.nanmin(disc) >= 0.0
         assert np.nanmean(disc[:, :, :3]) > np.nanmean(disc[:, :, -2:]) + 15.0

@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from detect.discs.judgement import LOOKED_AT
+from detect.discs.judgement import DENSE_RADII
 from detect.discs.rim import DIRECTIONS, STEPS
 from detect.discs.rim_network import OTHERS, network_inputs, network_log_odds
 from tools.evaluation import rim_network_training as training
-from tools.evaluation.rim_data import Looks
+from tools.evaluation.rim_data import Samples
 
 
-def looks_of(count: int, seed: int) -> Looks:
+def samples_of(count: int, seed: int) -> Samples:
     """Half of them discs, whose outer steps are darker; their features say nothing."""
     rng = np.random.default_rng(seed)
     is_disc = np.arange(count) % 2 == 0
-    grey = 120.0 + rng.normal(0.0, 8.0, (count, 2, DIRECTIONS, len(LOOKED_AT)))
+    grey = 120.0 + rng.normal(0.0, 8.0, (count, 2, DIRECTIONS, len(DENSE_RADII)))
     grey[is_disc, :, :, STEPS // 4 :] -= 40.0
-    return Looks(
+    return Samples(
         rng.normal(size=(count, 3)), grey.astype(np.float32),
         rng.uniform(4.0, 9.0, (count, 2, DIRECTIONS)).astype(np.float32),
         is_disc, np.ones(count), np.full(count, "here"),
@@ -26,13 +26,13 @@ def looks_of(count: int, seed: int) -> Looks:
 
 
 def test_the_gradient_is_that_of_finite_differences() -> None:
-    looks = looks_of(6, 1)
+    samples = samples_of(6, 1)
     batch = training.batch_of(
-        looks.grey[:, 0], looks.pixels_per_radius[:, 0], looks.features.astype(np.float32)
+        samples.grey[:, 0], samples.pixels_per_radius[:, 0], samples.features.astype(np.float32)
     )
     rng = np.random.default_rng(2)
     shape = training.Shape(5, 4, 1, 1)
-    first = training._first_weights(len(LOOKED_AT) + OTHERS, 3, shape, rng)
+    first = training._first_weights(len(DENSE_RADII) + OTHERS, 3, shape, rng)
     member = training._Member([w + 0.05 * rng.normal(size=w.shape) for w in first])
     d_odds = rng.normal(size=6)
     member.log_odds(batch)
@@ -50,9 +50,9 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 
 
 def test_training_learns_and_the_detector_computes_the_same() -> None:
-    looks, unseen = looks_of(400, 3), looks_of(40, 4)
+    samples, unseen = samples_of(400, 3), samples_of(40, 4)
     every = np.ones(400, np.bool_)
-    network = training.train(looks, every, training.Shape(6, 5, 2, 60), 1)
+    network = training.train(samples, every, training.Shape(6, 5, 2, 60), 1)
     odds = training.log_odds(network, unseen, every[:40])
     assert ((odds > 0.0) == unseen.is_disc).all()
     grey, scale = unseen.grey[:, 0], unseen.pixels_per_radius[:, 0].astype(float)
@@ -61,17 +61,19 @@ def test_training_learns_and_the_detector_computes_the_same() -> None:
     assert found == pytest.approx(odds, abs=1e-3)
 
 
-def test_a_glance_loses_few_discs() -> None:
-    looks = looks_of(400, 5)
+def test_the_prescreening_loses_few_discs() -> None:
+    samples = samples_of(400, 5)
     every = np.ones(400, np.bool_)
-    passed = training.log_odds(training.train_glance(looks, every, 1), looks, every) >= 0.0
-    assert passed[looks.is_disc].mean() >= 0.97
-    assert not passed[~looks.is_disc].any()
+    passed = (
+        training.log_odds(training.train_prescreening(samples, every, 1), samples, every) >= 0.0
+    )
+    assert passed[samples.is_disc].mean() >= 0.97
+    assert not passed[~samples.is_disc].any()
 
 
 def test_variations_of_looks_change_what_they_say() -> None:
-    rng, looks = np.random.default_rng(7), looks_of(60, 6)
-    grey, other = looks.grey[:30, 0], looks.grey[30:, 0] + 1000.0
+    rng, samples = np.random.default_rng(7), samples_of(60, 6)
+    grey, other = samples.grey[:30, 0], samples.grey[30:, 0] + 1000.0
     covered = training._covered(grey, other, rng)
     changed = np.abs(covered - grey) > 1.0
     assert (changed.mean(axis=(1, 2)) < 0.8).all()
@@ -94,8 +96,8 @@ def test_variations_of_looks_change_what_they_say() -> None:
 
 
 def test_looks_at_discs_remain_so_in_other_light() -> None:
-    looks, rng = looks_of(60, 8), np.random.default_rng(9)
-    grey = training._relit(looks.grey[:, 0], looks.grey[:, 1], rng)
+    samples, rng = samples_of(60, 8), np.random.default_rng(9)
+    grey = training._relit(samples.grey[:, 0], samples.grey[:, 1], rng)
     assert ((grey >= 0.0) & (grey <= 255.0)).all()
     step = grey[:, :, : STEPS // 4].mean(axis=(1, 2)) - grey[:, :, STEPS // 4 :].mean(axis=(1, 2))
-    assert ((step > 15.0) == looks.is_disc).all()
+    assert ((step > 15.0) == samples.is_disc).all()
