@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from redetect.bounds import MaybePath
+from camera.errors import ConversionError
+from redetect.bounds import Bounded, LimitOr0, MaybePath
 
 BoardKind = Literal["checkerboard", "charuco", "circles", "asymmetric-circles"]
 Format = Literal["cam", "opencv", "ros", "kalibr", "colmap"]
@@ -124,7 +125,7 @@ class Floor(BoardFlags):
 
 
 @dataclass(frozen=True)
-class Convert:
+class Convert(Bounded, error=ConversionError):
     """Convert a calibration from or to another program's format.
 
     Example: camera convert images/e/e.cam e.opencv.yaml
@@ -147,7 +148,7 @@ class Convert:
     #: Lines of the image: `same`; `halve`: the source is for full frames, the target for their even
     #: lines (`half`); `double`: the other way (`nohalf`).
     rows: Literal["same", "halve", "double"] = "same"
-    limit_px: float = 0.05  #: Largest accepted deviation, pixels.
+    limit_px: LimitOr0 = 0.05  #: Largest accepted deviation, pixels.
     #: The camera in a file with several, such as cam0 (Kalibr) or its number (COLMAP).
     camera_name: str = ""
     #: A .cam file whose pose is copied to the target .cam file; other formats have no pose, and

@@ -342,6 +342,10 @@ def test_the_command_converts_and_refuses(
     assert main(to_kalibr) == 1
     assert "--limit-px" in capsys.readouterr().err
     assert not kalibr.exists()
+    for limit in ("nan", "-1"):
+        with pytest.raises(SystemExit):
+            main([*to_kalibr, "--limit-px", limit])
+        assert capsys.readouterr().err == f"error: --limit-px is {limit}: expected 0 or more\n"
     assert main([*to_kalibr, "--limit-px", "0.2"]) == 0
     assert parse_kalibr(kalibr.read_text()).model == "fisheye"
     assert main(["convert", str(cam), str(tmp_path / "e.yaml")]) == 1
