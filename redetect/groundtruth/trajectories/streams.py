@@ -8,6 +8,7 @@ a row per pose: time (s), x, y (m), heading theta (rad), and for ground truth th
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -31,6 +32,7 @@ Interpolated = Literal["truth", "poses"]
 
 _POSE_COLUMNS = 4
 _COVARIANCE_COLUMNS = 13
+_MIRRORED = (5, 7), (6, 10), (9, 11)  # Columns of a covariance that are equal, up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,11 @@ def read_planar_poses(path: PathLike) -> PlanarPoses:
             raise GroundTruthError(
                 f"{path}:{line}: time {rows[-1][0]:.6f} s is before the row above: expected in "
                 "order"
+            )
+        pairs = [] if allowed == (_POSE_COLUMNS,) else [[rows[-1][k] for k in p] for p in _MIRRORED]
+        if not all(math.isclose(*p, rel_tol=1e-5, abs_tol=2 * RAWSEEDS_ROUNDING) for p in pairs):
+            raise GroundTruthError(
+                f"{path}:{line}: a covariance that is not symmetric: expected 3x3, row by row"
             )
     if not rows:
         raise GroundTruthError(f"{path}: contains no poses")
