@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from itertools import islice
+from operator import index
 from pathlib import Path
 from typing import Any, overload
 
@@ -64,6 +65,7 @@ class Recording:
         """
         if isinstance(number, slice):
             return [self[k] for k in range(len(self))[number]]
+        number = index(number)  # a TypeError if it is none
         at = number + len(self) if number < 0 else number
         with keywords_named():
             frames = self._run.frames if self._listed is None else self._listed

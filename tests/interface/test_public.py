@@ -301,6 +301,8 @@ def test_a_recording_is_a_sequence(demo: Path) -> None:
     for number in (3, -4):
         with pytest.raises(IndexError, match=f"e has no frame {number}"):
             _ = run[number]
+    with pytest.raises(TypeError, match="'float' object cannot be interpreted as an integer"):
+        _ = run[1.5]  # type: ignore[call-overload]
 
 
 def test_a_recording_of_unknown_length(demo: Path, demo_camera: rd.Camera, tmp_path: Path) -> None:
