@@ -29,6 +29,7 @@ from detect.errors import DetectError, FrameError
 from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray
+from redetect.landmarks import wrap_angle
 from redetect.messages import OneLineError, excerpt, imported_for, one_line
 from redetect.plane import rotation
 
@@ -247,6 +248,7 @@ class Bag(Source):
 
 def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPose, FloatArray]]:
     """Poses of a topic, each with the (3, 3) covariance of its twist, in the robot's frame."""
+    theta = 0.0
     with opened_bag(path) as reader:
         for recorded_s, message in messages(reader, path, topic):
             with understood(name):
@@ -264,7 +266,7 @@ def _odometry_poses(path: Path, topic: str, name: str) -> Iterator[tuple[TimedPo
                     f"{name}: at {time_s:.6f} s: expected a finite pose with an orientation and a "
                     f"finite covariance, no number above {FARTHEST:g}"
                 )
-            theta = heading_rad(q.x, q.y, q.z, q.w)
+            theta += float(wrap_angle(heading_rad(q.x, q.y, q.z, q.w) - theta))
             yield TimedPose(time_s, float(p.x), float(p.y), theta, planar), twist
 
 

@@ -31,9 +31,9 @@ LARGEST_GAP_S = 1.0  #: Longest interval between poses that is interpolated (s),
 _USUAL_GAPS, _SLOWEST_S = 1.5, 2.0
 #: Later times since 1970 are not in seconds.
 _LATEST_S = 1e11
-# A movement that is faster (m/s), and this many times as long as the one before, is a jump of the
-# odometry, as if it was reset. Steps over it have this covariance.
-_FASTEST_M_S, _LONGER = 50.0, 100.0
+# A movement that is faster (m/s or rad/s), and this many times as far as the one before, is a jump
+# of the odometry, as if it was reset. Steps over it have this covariance.
+_FASTEST, _FARTHER = 50.0, 100.0
 _LOST: dict[str, Any] = dict(zip(STEP_NUMBERS[3:], (1e6, 0.0, 1e6, 0.0, 0.0, 100.0)))
 #: Maps (forward, left, turn) to (left, backward, turn).
 DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -52,6 +52,7 @@ _END_SLACK_S = 1e-3
 class TimedPose:
     """A robot's pose: X forward, Y left (m), counterclockwise (rad), in a fixed frame.
 
+    Over time, theta counts full turns: one wheel's counter that jumps turns the robot many times.
     The (3, 3) covariance is that of (x, y, theta) since the start; zero if unknown.
     """
 
@@ -127,7 +128,8 @@ class PosesOverTime:
         self._poses = poses
         self._name, self._of_velocities = name, of_velocities
         self.jumps = self.jumped = False  # now, and since the last step
-        self._way_m, self._longest_s = 0.0, LARGEST_GAP_S
+        self._way_m = self._turn_rad = 0.0
+        self._longest_s = LARGEST_GAP_S
         self._before: TimedPose | None = None
         self._after = next(poses, None)
         if self._after is None:
@@ -143,6 +145,7 @@ class PosesOverTime:
             if self._after is None:
                 break
             way_m = math.hypot(self._after.x - self._before.x, self._after.y - self._before.y)
+            turn_rad = abs(self._after.theta - self._before.theta)
             seconds = self._after.time_s - self._before.time_s
             if seconds < 0.0:
                 raise DetectError(
@@ -154,10 +157,12 @@ class PosesOverTime:
                     f"{self._name}: the time {self._after.time_s:.0f}: expected seconds, not "
                     "nanoseconds"
                 )
-            fastest_m = max(_FASTEST_M_S * max(seconds, 1e-3), _LONGER * self._way_m)
-            is_guessed = self._of_velocities and seconds > self._longest_s
-            self.jumps = is_guessed or way_m > fastest_m
-            self.jumped, self._way_m = self.jumped or self.jumps, way_m
+            fastest = _FASTEST * max(seconds, 1e-3)
+            is_reset = way_m > max(fastest, _FARTHER * self._way_m)
+            is_reset |= turn_rad > max(fastest, _FARTHER * self._turn_rad)
+            self.jumps = is_reset or (self._of_velocities and seconds > self._longest_s)
+            self.jumped = self.jumped or self.jumps
+            self._way_m, self._turn_rad = way_m, turn_rad
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one
             end = after or before
@@ -171,13 +176,15 @@ class PosesOverTime:
 
 def tum_poses(path: Path) -> Generator[TimedPose, None, None]:
     """The poses of a TUM trajectory."""
+    theta = 0.0
     for place, row in rows_of_numbers(path, "TUM trajectory", "t x y z qx qy qz qw", DetectError):
         time_s, x, y, _, *quaternion = row
         if max(abs(x), abs(y)) > FARTHEST:
             raise DetectError(f"{place}: expected x and y of at most {FARTHEST:g} m")
         if abs(math.hypot(*quaternion) - 1.0) > _UNIT:
             raise DetectError(f"{place}: qx qy qz qw: expected a unit quaternion")
-        yield TimedPose(time_s, x, y, heading_rad(*quaternion))
+        theta += float(wrap_angle(heading_rad(*quaternion) - theta))
+        yield TimedPose(time_s, x, y, theta)
 
 
 def tick_poses(

@@ -294,6 +294,18 @@ def test_counters_of_ticks_may_overflow(turn: int, signed: bool, tmp_path: Path)
     np.testing.assert_allclose([p.theta for p in poses], -np.arange(6.0), atol=1e-9)
 
 
+def test_a_counter_that_starts_anew_is_a_jump(timed_run: Path, tmp_path: Path) -> None:
+    """Only the left one does: a circle of the wheel base's size, driven many times, in 50 ms."""
+    counts = [(30_000 + 20 * k, 30_000 + 20 * k) for k in range(30)]
+    rows = [(99.9 + 0.05 * k, left * (k < 20), right) for k, (left, right) in enumerate(counts)]
+    path = tmp_path / "a.ticks"
+    np.savetxt(path, rows)
+    options = SourceOptions(odometry=str(path), wheel_base_m=0.5, metres_per_tick=1e-3)
+    _, before, over = [frame.step for frame in open_source(timed_run, None, options).frames]
+    assert (before.dy, before.cxx) == pytest.approx((-0.2, 0.0))
+    assert over.cxx == 1e6
+
+
 @pytest.mark.parametrize(
     "counts",
     [[60_000 * k for k in range(6)], [-60_000 * k for k in range(6)], [0, 30_000, 60_000] * 3],
