@@ -250,16 +250,20 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
 
 
 def _ticks(counts: FloatArray) -> FloatArray:
-    """(N, 2) ticks since the row before; counters of 16 or 32 bits may overflow in between.
+    """(N, 2) ticks since the row before; counters of 8 to 32 bits may overflow in between.
 
     They are of the fewest bits, signed or not, that all counts of the file fit in. Only counters
     that usually change by little overflow: a fast one may jump as far without.
     """
     ticks = np.diff(counts, axis=0, prepend=counts[:1])
-    for turn in (2.0**16, 2.0**32):
+    for turn in (2.0**8, 2.0**10, 2.0**12, 2.0**14, 2.0**16, 2.0**24, 2.0**32):
         for least in (0.0, -0.5 * turn):
             if np.all((counts >= least) & (counts < least + turn)):
-                shorter = ticks - np.where(np.abs(ticks) > 0.75 * turn, np.copysign(turn, ticks), 0)
+                over = np.where(np.abs(ticks) > 0.75 * turn, np.copysign(turn, ticks), 0.0)
+                if turn < 2.0**16:  # so few counts may also be those of a short drive
+                    usual = np.abs(ticks[over == 0.0]).max(initial=0.0)
+                    over[np.abs(ticks - over) > 2.0 * usual] = 0.0
+                shorter = ticks - over
                 moves = np.abs(shorter[shorter != 0.0])
                 return shorter if np.median(np.append(moves, 0.0)) < 0.25 * turn else ticks
     return ticks
