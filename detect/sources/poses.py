@@ -134,6 +134,7 @@ class PosesOverTime:
         self._after = next(poses, None)
         if self._after is None:
             raise DetectError(f"{name}: no pose in it: expected odometry, or --odometry none")
+        self.first_s = self._after.time_s
 
     def at(self, time_s: float) -> TimedPose | None:
         """The pose at a time; None if unknown, or if a later one was requested before."""
@@ -212,6 +213,8 @@ def velocity_poses(path: Path) -> Generator[TimedPose, None, None]:
         columns = "t v omega sigma_v sigma_omega"
         last: list[float] = []
         for place, row in rows_of_numbers(path, "file of velocities", columns, DetectError):
+            if min(row[3:]) < 0.0:
+                raise DetectError(f"{place}: expected sigmas of 0 or more")
             time_s, speed, turning, *sigmas = last or row
             seconds = row[0] - time_s
             deviations = (math.sqrt(max(seconds, 0.0)) * sigma for sigma in sigmas)
@@ -296,10 +299,12 @@ class FramesAlongPoses(Frames):
             name, of_velocities = self._stream.name, self._stream.of_velocities
             poses = PosesOverTime(read, name, of_velocities=of_velocities)
             last: TimedPose | None = None
+            missed_s = math.nan
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)
                 if pose is None:
                     self.left_out += 1
+                    missed_s = missed_s if image.time_s is None else image.time_s
                     continue
                 if last is not None:
                     step = step_between(image.step.prefix, last, pose)
@@ -307,3 +312,9 @@ class FramesAlongPoses(Frames):
                 poses.jumped = poses.jumps
                 yield image
                 last = pose
+            if self.left_out and last is None:
+                raise DetectError(
+                    f"{name}: no pose at the time of any image; the first pose is of "
+                    f"{poses.first_s:.3f} s, the last image of {missed_s:.3f} s: expected seconds "
+                    "of one clock, in order"
+                )

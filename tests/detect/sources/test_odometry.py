@@ -140,6 +140,10 @@ def test_rows_and_images_without_each_other(small_run: Path, tmp_path: Path) -> 
         ("", r"a\.tum: no pose in it: expected odometry"),
         (tum_row(100.1, 0, 0, 0) + tum_row(100, 0, 0, 0), "comes after that of 100.1"),
         (tum_row(1, 0, 0, 0) + tum_row(1.7e18, 0, 0, 0), "expected seconds, not nanoseconds"),
+        (
+            tum_row(1e5, 0, 0, 0) + tum_row(1.1e5, 0, 0, 0),
+            r"the first pose is of 100000\.000 s, the last image of 101\.000 s",
+        ),
     ],
 )
 def test_malformed_trajectories(timed_run: Path, tmp_path: Path, content: str, told: str) -> None:
@@ -396,6 +400,7 @@ def test_poses_between_are_between(share: float, before: TimedPose, after: Timed
     ("content", "told"),
     [
         ("1 2 3\n", r":1: '1 2 3': expected 5 numbers: t v omega sigma_v sigma_omega"),
+        ("1 0 0 0 -0.1\n2 0 0 0 0\n", r":1: expected sigmas of 0 or more"),
         ("1 1e200 0 0 0\n2 0 0 0 0\n", r":2: expected distance and turn of at most"),
         ("2 0 0 0 0\n1 0 0 0 0\n101 0 0 0 0\n", r"the pose of 1\.0+ s comes after that of 2"),
     ],
