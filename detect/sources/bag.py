@@ -275,25 +275,35 @@ def _summed(poses: Iterator[tuple[TimedPose, FloatArray]]) -> Generator[TimedPos
 
     Each movement adds the growth of the pose's covariance, by a movement or, if it is diagonal (a
     driver that ignores how errors of the heading move positions), of its diagonal; if that has not
-    grown (a driver that publishes a constant), the twist's covariance over the time step.
+    grown (a driver that publishes a constant), the twist's covariance over the time step. If that
+    is zero, too, the movement is of unknown covariance, and so is a step that contains it.
+
+    A filter that corrects a pose moves it, too: by errors of the covariance that it takes away.
     """
     before: TimedPose | None = None
-    total = np.zeros((3, 3))
+    total, unknown = np.zeros((3, 3)), 0.0
     for pose, twist in poses:
         if before is not None:
+            by_rate = np.eye(3)
+            by_rate[:2, :2] = rotation(pose.theta)
+            by_rate *= pose.time_s - before.time_s
+            by_twist = by_rate @ twist @ by_rate.T
             grown = pose.covariance - carried(before.covariance, before, pose)
-            scale = float(np.abs(pose.covariance).max())
-            if np.linalg.eigvalsh(grown)[0] < -_INDEFINITE * scale:
+            values, axes = np.linalg.eigh(grown)
+            is_growth = values[0] >= -_INDEFINITE * float(np.abs(pose.covariance).max())
+            if not is_growth:
                 diagonal = np.diagonal(pose.covariance - before.covariance)
-                ignored = np.count_nonzero(pose.covariance) == 3 and diagonal.min() >= 0.0
-                grown = np.diag(diagonal) if ignored else np.zeros((3, 3))
+                if np.count_nonzero(pose.covariance) == 3:
+                    grown = np.diag(diagonal) * (diagonal.min() >= 0.0)
+                elif np.any(diagonal):
+                    grown = (axes * np.abs(values)) @ axes.T + by_twist
+                else:
+                    grown = np.zeros((3, 3))
             if not np.any(grown):
-                by_rate = np.eye(3)
-                by_rate[:2, :2] = rotation(pose.theta)
-                by_rate *= pose.time_s - before.time_s
-                grown = by_rate @ twist @ by_rate.T
+                grown = by_twist
+            unknown += not (is_growth or np.any(grown))
             total = carried(total, before, pose) + grown
-        yield replace(pose, covariance=total)
+        yield replace(pose, covariance=total, unknown=unknown)
         before = pose
 
 

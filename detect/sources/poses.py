@@ -61,6 +61,7 @@ class TimedPose:
     y: float
     theta: float
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    unknown: float = 0.0  #: Movements since the start whose covariance is unknown, not in it
 
 
 class PoseStream(NamedTuple):
@@ -80,7 +81,7 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
 
     The covariances of poses are assumed to grow with the path: that of the later pose is that of
     the earlier one, propagated, plus that of the movement, independent of it. If that is missing
-    or singular, the covariance of the step is zero, which means unknown.
+    or singular, or unknown in part, the covariance of the step is zero, which means unknown.
     """
     cos, sin = np.cos(before.theta), np.sin(before.theta)
     moved = np.array([after.x - before.x, after.y - before.y])
@@ -91,7 +92,8 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     grown = after.covariance - carried(before.covariance, before, after)
     smallest, _, largest = np.linalg.eigvalsh(grown)
     scale = float(np.abs(after.covariance).max())
-    if smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
+    is_known = after.unknown == before.unknown
+    if is_known and smallest > max(_INDEFINITE * largest, _ROUNDING * scale):
         to_dataset = DATASET_FROM_ROBOTICS @ robot_from_fixed
         c = to_dataset @ grown @ to_dataset.T + _ROUNDED * np.eye(3)
     return Step(prefix, *pose.tolist(), *c[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist())
@@ -116,6 +118,7 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
         before.y + share * (after.y - before.y),
         before.theta + share * float(wrap_angle(after.theta - before.theta)),
         carried(before.covariance, before, after, share) + share * grown,
+        before.unknown + share * (after.unknown - before.unknown),
     )
 
 

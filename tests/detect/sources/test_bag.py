@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import sys
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,10 @@ from detect.options import SourceOptions
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import eight_bits, gray_of_pixels, read_image
 from detect.sources.opening import open_source
+from detect.sources.poses import TimedPose, step_between
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
 from redetect.landmarks.frames import read_times
+from redetect.plane import rotation
 from tests.detect.commands import Captured, rows_in
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 from tests.pictures import read_grey
@@ -164,6 +167,56 @@ def test_variances_that_are_added_up(tmp_path: Path) -> None:
     for frame in list(open_source(ros.write(tmp_path / "d", said)).frames)[1:]:
         step = frame.step
         assert (step.cxx, step.cyy, step.cphiphi) == pytest.approx((2e-4, 2e-4, 1e-4))
+
+
+def test_a_step_is_unknown_if_a_part_of_it_is(tmp_path: Path) -> None:
+    ros, said = Ros(), []
+    for k, variance in enumerate((0.1, 0.2, 0.15, 0.25, 0.3, 0.35, 0.4)):
+        odometry = ros.odometry(0.3 * k, 0.0, 0.0, 1.0 + k, variance * np.eye(3))
+        said.append(Said("/odom", 1.0 + k, odometry))
+        if k % 3 == 0:
+            image = ros.image(np.zeros((4, 4), np.uint8), "mono8", 1.0 + k)
+            said.append(Said("/i", 1.0 + k, image))
+    steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
+    assert [step.cphiphi for step in steps] == pytest.approx([0.0, 0.0, 0.15])
+
+
+def test_steps_of_a_filter_that_corrects_its_heading(tmp_path: Path) -> None:
+    """Monte Carlo: white noise of odometry, and a compass that is read at every fifth message."""
+    rng, ros, said = np.random.default_rng(7), Ros(), []
+    sigmas, compass = np.array([4e-3, 2e-3, 8e-3]), 0.03
+    truth, found, covariance = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    truths = []
+    for k in range(1500):
+        move = np.array([0.02, 0.0, 0.01 * np.sin(0.01 * k)])
+        ends = []
+        for pose, moved in ((truth, move), (found, move + sigmas * rng.normal(size=3))):
+            along = np.eye(3)
+            along[:2, :2] = rotation(pose[2])
+            shift = along @ moved
+            ends.append(pose + shift)
+        truth, found = ends
+        carry = np.eye(3)
+        carry[:2, 2] = -shift[1], shift[0]
+        covariance = carry @ covariance @ carry.T + along @ np.diag(sigmas**2) @ along.T
+        if k % 5 == 4:
+            gain = covariance[:, 2] / (covariance[2, 2] + compass**2)
+            found = found + gain * (truth[2] + compass * rng.normal() - found[2])
+            covariance = covariance - np.outer(gain, covariance[2])
+        time_s, (x, y, theta) = 1.0 + 0.1 * k, found.tolist()
+        said.append(Said("/odom", time_s, ros.odometry(x, y, theta, time_s, covariance)))
+        if k % 8 == 0:
+            image = ros.image(np.zeros((4, 4), np.uint8), "mono8", time_s)
+            said.append(Said("/i", time_s, image))
+            truths.append(TimedPose(time_s, truth[0], truth[1], truth[2]))
+    steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
+    errors = []
+    for s, (before, after) in zip(steps[1:], pairwise(truths), strict=True):
+        true = step_between("e", before, after)
+        error = np.array([s.dx - true.dx, s.dy - true.dy, s.dphi - true.dphi])
+        c = [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]]
+        errors.append(error @ np.linalg.solve(c, error) / 3.0)
+    assert np.mean(errors) == pytest.approx(1.0, abs=0.15)
 
 
 def test_covariances_of_twists_where_those_of_poses_do_not_grow(tmp_path: Path) -> None:
