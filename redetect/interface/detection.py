@@ -323,6 +323,8 @@ class RecordedFrame:
         if axes not in MEANING:
             meant = " or ".join(f"{word} ({words})" for word, words in MEANING.items())
             raise DetectError(f"axes is {excerpt(axes)}: expected {meant}; robotics are REP 103's")
+        if not isinstance(line_settings, LineSettings | None):
+            raise DetectError(f"{excerpt(line_settings)}: expected rd.LineSettings(...)")
         chosen = settings_of(settings, radius_m, polarity)
         plan = FramePlan(
             self.camera,

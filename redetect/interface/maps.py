@@ -162,6 +162,8 @@ class Localization(Poses):
 
     def distance(self, reference: Path2D) -> Mapping[str, float]:
         """Distance from another path of the same run in the same map, m and rad."""
+        if not isinstance(reference, Path2D):
+            raise SlamError(f"{excerpt(reference)}: expected a path, as of a map or localization")
         return path_distance(self.path, reference.poses)
 
     def _repr_png_(self) -> bytes:

@@ -233,9 +233,11 @@ ANY: Any = rd
         (lambda one: ANY.detect(one.image, {}), "expected a Camera, or the name of its .cam file"),
         (lambda one: ANY.detect(one.image, one.camera, "auto"), "expected metres, which"),
         (lambda one: ANY.detect(one.image, one.camera, settings={}), "expected rd.CircleSettings"),
+        (lambda one: ANY.detect(one.image, one.camera, line_settings={}), "expected rd.LineSettin"),
         (lambda one: ANY.detect(one.image, one.camera, axes="rep103"), "robotics are REP 103's"),
         (lambda _: ANY.open(["e"]), "expected the name of a run"),
         (lambda _: ANY.open("images/e/images"), "named by `camera`; `camera calibrate`"),
+        (lambda _: ANY.open("images/e", odometry=5), "5: expected a name as odometry"),
         (lambda _: ANY.open("images/e", wheel_base_m=-1), "wheel_base_m is -1: expected 0 or more"),
         (lambda one: ANY.compare("images/e", [one.frame]), "expected a Detection, or the name"),
         (lambda one: ANY.compare(one, [one]), "expected a run folder"),
@@ -295,6 +297,7 @@ def test_a_recording_is_a_sequence(demo: Path) -> None:
     run = rd.open(demo, frames=3)
     names = [frame.name for frame in run]
     assert len(run) == 3
+    assert run[1].step.dy == rd.open(demo, odometry=demo / "e.txt", times=None)[1].step.dy
     assert [run[k].name for k in (-3, -2, -1)] == names
     assert [frame.name for frame in run[::-1]] == names[::-1]
     assert [frame.name for frame in run[1:9]] == names[1:]
@@ -376,6 +379,8 @@ def test_map_and_localisation(demo: Path, tmp_path: Path) -> None:
         rd.localize(demo, landmarks, association="all")  # type: ignore[arg-type]
     with pytest.raises(rd.Error, match=r"^1 poses: expected 81, as in this run"):
         in_memory.distance(landmarks.path.part(0, 1))
+    with pytest.raises(rd.Error, match="expected a path, as of a map"):
+        in_memory.distance(landmarks)  # type: ignore[arg-type]
     with pytest.raises(rd.Error, match="force, reference: of the command only"):
         rd.localize(demo, landmarks, reference="path.csv", force=True)  # type: ignore[call-arg]
     with pytest.raises(rd.Error, match="calibrat: no such option: expected stem, camera,"):
