@@ -119,6 +119,16 @@ def test_odometry_with_another_clock_is_found(
     assert f"of the interval between frames {way} them" in capsys.readouterr().out
 
 
+def test_odometry_that_drives_backward_is_said_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _run(3)
+    backward = replace(run, steps=run.steps * [-1.0, -1.0, 1.0])
+    write_frames(tmp_path / "map.circles", frames_of_discs(backward))
+    assert main(["map", str(tmp_path)]) == 0
+    assert "% shorter; forward is -Y in STEP rows" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.8])
 def test_slam_map_says_what_odometry_does_wrong(
     scale: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]

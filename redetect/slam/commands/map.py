@@ -100,10 +100,15 @@ def doubts_of(check: OdometryCheck, mapped: MappedRun) -> list[str]:
     """What does not fit, in words: large and significant errors of odometry, or of rows."""
     least = _SIGNIFICANT * max(mapped.table.root, 1.0)
     lines = []
+    of_length = (
+        "is it in metres, is the discs' radius right (--radius-m), does the camera lean or have "
+        "another height (--calibrate)?"
+    )
+    if check.length < -1.0:
+        of_length = "forward is -Y in STEP rows, X in other poses, and up in counts of wheels"
     for value, sigma, smallest, ways, text in (
         (100.0 * check.length, 100.0 * check.length_sigma, _LEAST_PERCENT, ("longer", "shorter"),
-         "its steps would have to be {0:.1f} % {1}; is it in metres, is the discs' radius right "
-         "(--radius-m), does the camera lean or have another height (--calibrate)?"),
+         "its steps would have to be {0:.1f} % {1}; " + of_length),
         (check.turn_per_metre, check.turn_per_metre_sigma, _LEAST_TURN, ("left", "right"),
          "it would have to turn to the {1} by {0:.3f} rad more in each metre"),
         (check.lag_frames, check.lag_frames_sigma, _LEAST_LAG, ("behind", "ahead of"),
