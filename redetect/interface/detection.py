@@ -304,6 +304,7 @@ class RecordedFrame:
         return self.frame.step
 
     @cached_property
+    @keywords_named()
     def image(self) -> NDArray[np.uint8]:
         """(H, W) grey values; `detect.errors.FrameError` if they cannot be read."""
         return read_image(self.frame, self.camera)

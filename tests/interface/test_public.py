@@ -320,6 +320,9 @@ def test_a_recording_of_unknown_length(demo: Path, demo_camera: rd.Camera, tmp_p
     names = [frame.name for frame in run]
     assert len(names) == 3
     assert run[2].name == names[2]
+    other = rd.open(path, replace(demo_camera, width=2 * demo_camera.width))
+    with pytest.raises(rd.Error, match=r"of these images by `camera`$"):
+        _ = other[0].image
     for call in (lambda: len(run), lambda: run[-1], lambda: run[-2:]):
         with pytest.raises(rd.Error, match="known only once all frames"):
             call()
