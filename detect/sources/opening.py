@@ -152,15 +152,15 @@ def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None
         poses = source.poses(named)
     elif named.endswith((".tum", ".velocities")):
         read = tum_poses if named.endswith(".tum") else velocity_poses
-        of_velocities = read is velocity_poses
-        poses = PoseStream(named, Path(named), lambda: read(Path(named)), of_velocities)
+        of_arcs = read is velocity_poses
+        poses = PoseStream(named, Path(named), lambda: read(Path(named)), of_arcs)
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
             raise DetectError(
                 f"{named}: wheel ticks: expected --wheel-base-m and --metres-per-tick above 0"
             )
-        poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels))
+        poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels), True)
     elif named and named != "none":
         if not isinstance(source, ImageFiles):
             raise DetectError(

@@ -67,13 +67,13 @@ class TimedPose:
 class PoseStream(NamedTuple):
     """Poses of the robot over time: their name in messages, their file, and their reader.
 
-    With `of_velocities`, nothing is known of the movement between poses that are far apart.
+    With `of_arcs`, between poses that are far apart the robot may have driven anything but an arc.
     """
 
     name: str
     path: Path
     read: Callable[[], Generator[TimedPose, None, None]]
-    of_velocities: bool = False
+    of_arcs: bool = False
 
 
 def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
@@ -125,11 +125,9 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 class PosesOverTime:
     """Poses in order, read once; requests must be in order, too."""
 
-    def __init__(
-        self, poses: Iterator[TimedPose], name: str, *, of_velocities: bool = False
-    ) -> None:
+    def __init__(self, poses: Iterator[TimedPose], name: str, *, of_arcs: bool = False) -> None:
         self._poses = poses
-        self._name, self._of_velocities = name, of_velocities
+        self._name, self._of_arcs = name, of_arcs
         self.jumps = self.jumped = False  # now, and since the last step
         self._way_m = self._turn_rad = 0.0
         self._longest_s = LARGEST_GAP_S
@@ -164,7 +162,7 @@ class PosesOverTime:
             fastest = _FASTEST * max(seconds, 1e-3)
             is_reset = way_m > max(fastest, _FARTHER * self._way_m)
             is_reset |= turn_rad > max(fastest, _FARTHER * self._turn_rad)
-            self.jumps = is_reset or (self._of_velocities and seconds > self._longest_s)
+            self.jumps = is_reset or (self._of_arcs and seconds > self._longest_s)
             self.jumped = self.jumped or self.jumps
             self._way_m, self._turn_rad = way_m, turn_rad
         before, after = self._before, self._after
@@ -299,8 +297,8 @@ class FramesAlongPoses(Frames):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
         with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
-            name, of_velocities = self._stream.name, self._stream.of_velocities
-            poses = PosesOverTime(read, name, of_velocities=of_velocities)
+            name, of_arcs = self._stream.name, self._stream.of_arcs
+            poses = PosesOverTime(read, name, of_arcs=of_arcs)
             last: TimedPose | None = None
             missed_s = math.nan
             for image in images:

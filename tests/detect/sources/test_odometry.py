@@ -222,6 +222,20 @@ def test_a_gap_of_velocities_is_no_movement_at_the_last_one(
     assert over.cxx == 1e6  # nothing is known of it
 
 
+def test_a_gap_of_ticks_is_no_arc(timed_run: Path, tmp_path: Path) -> None:
+    """Ahead, a quarter turn, and ahead, in 5 s without a row: the sums of ticks are of any path."""
+    way, side = 1.0, 0.25 * math.pi / 2
+    rows = [(99.0 + 0.1 * k, 0.0, 0.0) for k in range(15)]
+    rows += [(105.4 + 0.1 * k, 2.0 * way - side, 2.0 * way + side) for k in range(5)]
+    path = tmp_path / "a.ticks"
+    np.savetxt(path, rows)
+    times = [format_time(PREFIXES[k], at) for k, at in enumerate((100.0, 100.4, 105.5))]
+    (timed_run / "s.times").write_text("\n".join(times) + "\n")
+    options = SourceOptions(odometry=str(path), wheel_base_m=0.5, metres_per_tick=1.0)
+    _, before, over = [frame.step for frame in open_source(timed_run, None, options).frames]
+    assert (before.cxx, over.cxx) == (0.0, 1e6)
+
+
 def test_poses_a_second_apart_are_near_enough(timed_run: Path, tmp_path: Path) -> None:
     times = [98.99, 100.0, 101.02, 102.01]
     (tmp_path / "a.tum").write_text("".join(tum_row(t, t - 98.0, 0.0, 0.0) for t in times))
