@@ -118,7 +118,7 @@ def read_planar_poses(path: PathLike) -> PlanarPoses:
         wrong = apart > 2.0 * RAWSEEDS_ROUNDING + 1e-5 * np.abs(covariances).max(axis=(1, 2))
         if wrong.any():
             raise GroundTruthError(
-                f"{path}:{lines[wrong.argmax()]}: a covariance that is not symmetric: expected 3 x 3"
+                f"{path}:{lines[wrong.argmax()]}: a covariance that is not symmetric, 3 x 3"
             )
     return PlanarPoses(table[:, 0].copy(), table[:, 1:4].copy(), covariances)
 
