@@ -127,12 +127,12 @@ def useful_terms(
     poses do not confirm, a spurious scale of turns results (regression dilution). Over seconds, and
     over gaps, such an estimate makes predictions worse.
     """
-    thin = problem.thinned()
+    thin = problem.thinned().split(math.inf)
     kept = deviations > 0.0
 
     def aic(terms: BoolArray) -> float:
-        found = thin.innovations(noise, (means * terms, deviations * terms))
-        return found.deviance + _COST_OF_TERM * np.count_nonzero(terms)
+        found = (part.innovations(noise, (means * terms, deviations * terms)) for part in thin)
+        return sum(part.deviance for part in found) + _COST_OF_TERM * np.count_nonzero(terms)
 
     best = aic(kept)
     # Terms that were hardly measured keep their uncertainty.
@@ -267,21 +267,24 @@ def fuse(
         least = np.array([min(covered[name][1], 1.0) for name in problem.streams])
         learn = problem.with_covariances(least[:, None, None] ** 2 * problem.measured.covariances)
         noise = maximum_likelihood_noise(learn)
-        inflation = variance_inflation(learn, noise)
-    smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
+    # Before the errors over seconds, to which slips would contribute.
+    problem = problem.with_slips(noise)
+    if settings.learn_noise:
+        inflation = variance_inflation(replace(learn, slips=problem.slips), noise)
+    smoothed, spread, innovations = problem.smooth(noise, inflation)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
     kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], _systematic_deviations(spread))
     if not np.all(kept):
         names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
         fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
-        problem = replace(problem, settings=replace(settings, **fewer))
-        smoothed, spread, innovations, slips = problem.smooth(noise, inflation)
+        problem = replace(problem, settings=replace(settings, **fewer)).with_slips(noise)
+        smoothed, spread, innovations = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.
     at = np.searchsorted(problem.times_s, inside)
     path = _path(inside, smoothed[at], spread[at])
-    states, spreads = problem.filtered(noise, slips)
+    states, spreads = problem.filtered(noise)
     restarted = innovations.restarted > 0
     # The errors of a localisation are stationary.
     localisation = None
@@ -306,7 +309,7 @@ def fuse(
         localisation=localisation,
         repaired={name: count for name, (_, count) in usable.items()},
         jitter={name: jitter for name, (_, jitter) in covered.items()},
-        slips_s=slipped_intervals(problem.times_s, slips),
+        slips_s=slipped_intervals(problem.times_s, problem.slips),
         pauses_s=tuple(pause for pause in pauses if pause[1] > first and pause[0] < last),
     )
 

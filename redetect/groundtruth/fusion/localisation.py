@@ -81,7 +81,7 @@ def as_localisation(
     if np.max(np.ptp(odometry.poses[:, :2], axis=0)) < _LEAST_EXTENT_M:
         return None
     thin = problem.thinned()
-    if len(thin.streams) < _FEWEST or len(problem.split(_LEAST_GAP_S)) < 2:
+    if len(thin.streams) < _FEWEST or np.max(np.diff(problem.measured_s)) <= _LEAST_GAP_S:
         return None
     own, _ = interpolate_poses(odometry, thin.measured_s)
     measured = PlanarPoses(thin.measured_s, *thin.measured[1:])
@@ -112,7 +112,8 @@ def as_localisation(
         _HEADING_CORRELATION_S,
     )
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
-    if not deviance < thin.innovations(noise).deviance:
+    by_movements = (part.innovations(noise).deviance for part in thin.split(math.inf))
+    if not deviance < sum(by_movements):
         return None
     aligned = moved_poses(odometry, motion)
     design = _by_motion_and_point(aligned.poses, centre)

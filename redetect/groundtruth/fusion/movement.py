@@ -75,7 +75,6 @@ class Smoothed(NamedTuple):
     states: FloatArray  # (N, 6)
     covariances: FloatArray  # (N, 6, 6)
     innovations: kernels.Innovations
-    slips: FloatArray  # (N, 3): variances of movements that were added where odometry slipped
 
 
 def _follow_from_end(
@@ -113,6 +112,7 @@ class MovementProblem:
     # (N, 4): more distance (m) and turn (rad) that pauses may hide, and, of a movement to a
     # measurement within a pause, additional variances (m^2, rad^2)
     unseen: FloatArray
+    slips: FloatArray  # (N, 3): variances that are added to movements where odometry slipped
     measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     settings: FuseSettings
@@ -142,12 +142,14 @@ class MovementProblem:
             times_s=self.times_s[begin:end],
             controls=self.controls[begin:end],
             unseen=self.unseen[begin:end],
+            slips=self.slips[begin:end],
             measured=some.measured._replace(nodes=some.measured.nodes - begin),
         )
 
     def split(self, longest_s: float) -> list[MovementProblem]:
-        """The parts between gaps in the measurements longer than this, without the gaps."""
-        cuts = np.flatnonzero(np.diff(self.measured_s) > longest_s) + 1
+        """The parts between slips and gaps in the measurements longer than this, without these."""
+        slipped = np.diff(np.cumsum(self.slips[:, 0])[self.measured.nodes]) > 0.0
+        cuts = np.flatnonzero(slipped | (np.diff(self.measured_s) > longest_s)) + 1
         parts = np.split(self.measured.nodes, cuts)
         return [self._part(int(own[0]), int(own[-1]) + 1) for own in parts]
 
@@ -179,12 +181,14 @@ class MovementProblem:
         """The problem with other covariances of its measurements."""
         return replace(self, measured=self.measured._replace(covariances=covariances))
 
-    def filtered(self, noise: FloatArray, slips: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone, with the variances
-        `slips` (N, 3) of movements added.
-        """
+    def with_slips(self, noise: FloatArray) -> MovementProblem:
+        """The problem with the slips that are found with odometry's random errors `noise` (4,)."""
+        return replace(self, slips=self.slips + slip_variances(self, self._variances(noise)))
+
+    def filtered(self, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (N, 6) and covariances (N, 6, 6) of the forward filter alone."""
         history = kernels.empty_history(len(self.times_s))
-        self.forward(self._variances(noise) + slips, history=history)
+        self.forward(self._variances(noise), history=history)
         return history.filtered, history.filtered_covariance
 
     def smooth(self, noise: FloatArray, looser_in_gaps: float = 1.0) -> Smoothed:
@@ -198,8 +202,6 @@ class MovementProblem:
         after = np.flatnonzero(np.diff(self.measured_s) > UNMEASURED_S)
         for begin, end in zip(nodes[after], nodes[after + 1]):
             variances[begin + 1 : end + 1] *= looser_in_gaps
-        slips = slip_variances(self, variances)
-        variances += slips
         history = kernels.empty_history(len(self.times_s))
         innovations, kidnapped = self._filtered_with_cuts(variances, history)
         states, covariances = kernels.smooth_backward(history)
@@ -217,7 +219,7 @@ class MovementProblem:
             states, covariances = kernels.smooth_backward(history)
             if np.max(np.abs(states[:, 2] - before[:, 2])) < _SETTLED_RAD:
                 break
-        smoothed = Smoothed(states, covariances, innovations, slips)
+        smoothed = Smoothed(states, covariances, innovations)
         for begin, end in gaps:
             odometry = kernels.Odometry(self.controls[begin : end + 1], variances[begin : end + 1])
             _follow_from_end(smoothed, odometry, begin, bool(kidnapped[end]))
@@ -269,7 +271,7 @@ class MovementProblem:
         rest = by_turn * turn + by_way * way + hidden + inputs.CREEP_RAD2_PER_S * passed
         rest += any_turn
         way = way + hidden_way
-        return np.column_stack([along * way + aside, across * way + aside, rest])
+        return np.column_stack([along * way + aside, across * way + aside, rest]) + self.slips
 
     def forward(
         self,
@@ -315,6 +317,7 @@ def movement_problem(
         times_s=node_times,
         controls=controls,
         unseen=unseen,
+        slips=np.zeros((len(node_times), 3)),
         measured=kernels.MeasuredPoses(nodes, found.poses, found.covariances),
         streams=names,
         settings=settings,

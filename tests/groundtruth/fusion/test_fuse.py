@@ -70,7 +70,7 @@ def test_it_is_the_least_squares_solution(systematic: float) -> None:
     truth, odometry = drive(rng, 6.0, settings, rate_hz=5.0)
     laser = measure(rng, truth, truth.times_s[[0, 3, 4, 9, 20, 28]], LASER_COVARIANCE / 25)
     problem = movement_problem(odometry, {"laser": laser}, settings)
-    states, spreads, _, _ = problem.smooth(noise_of(settings))
+    states, spreads, _ = problem.smooth(noise_of(settings))
     within = odometry.times_s <= laser.times_s[-1]
     own = odometry.poses[within]
 

@@ -19,11 +19,13 @@ WHEELS = FuseSettings(distance_sigma=0.006, lateral_sigma=0.001, turn_sigma=0.00
 FINE = np.diag([4e-6, 4e-6, 1e-5])
 
 
-def slipping(own: PlanarPoses, from_s: float, to_s: float, extra_m: float) -> PlanarPoses:
-    """Odometry whose wheels spin: it measures a way that nobody drove."""
+def slipping(
+    own: PlanarPoses, from_s: float, to_s: float, extra_m: float, turned_rad: float = 0.0
+) -> PlanarPoses:
+    """Odometry whose wheels spin: it measures a way that nobody drove, or a turn."""
     steps = between(own.poses[:-1], own.poses[1:])
     during = (own.times_s[1:] > from_s) & (own.times_s[1:] <= to_s)
-    steps[during, 0] += extra_m / np.count_nonzero(during)
+    steps[during] += np.array([extra_m, 0.0, turned_rad]) / np.count_nonzero(during)
     return PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), own.poses[0]))
 
 
@@ -44,6 +46,20 @@ def test_wheels_that_spin_do_not_carry_the_path_away(extra_m: float) -> None:
     assert len(fusion.rejected) < 0.01 * len(laser)
     assert fusion.slips_s
     assert all(19.8 < begin < end < 23.0 for begin, end in fusion.slips_s)
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.6])
+def test_a_slip_does_not_make_gaps_less_certain(turned_rad: float) -> None:
+    rng = np.random.default_rng(25)
+    truth, own = drive(rng, 90.0, WHEELS)
+    times = np.arange(0.0, 89.9, 0.08)
+    laser = measure(rng, truth, times[(times < 40.0) | (times > 60.0)], FINE)
+    found = []
+    for odometry in (own, slipping(own, 20.0, 20.5, 0.3, turned_rad)):
+        path = fuse(odometry, {"laser": laser}).poses
+        assert path.covariances is not None
+        found.append(np.sqrt(path.covariances[path.during(45.0, 55.0), 0, 0].max()))
+    assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
 def test_a_burst_of_wrong_poses_is_no_slip() -> None:
