@@ -204,7 +204,11 @@ class Tracker:
         if count < LEAST_READINGS:
             gate_m = self.settings.gate_m
             raise GeometryError(f"{count} readings within {gate_m:g} m of the outline")
-        found = self._refined(seen, start, self.prior_m[i])
+        # The ICP is pulled by people beside the robot, so also without it: what fits more readings.
+        found = min(
+            (self._refined(seen, at, self.prior_m[i]) for at in (start, predicted)),
+            key=lambda one: one.chi2 - GATE_SIGMA**2 * one.used,
+        )
         pose, used, chi2 = found.pose, found.used, found.chi2
         if used < LEAST_READINGS:
             raise GeometryError(f"{used} readings on the outline")

@@ -405,6 +405,23 @@ def test_a_passer_by_is_marked_and_the_effect_bounded(
 # --- the command
 
 
+def test_somebody_right_behind_the_robot_does_not_pull_its_pose(
+    scanners: tuple[Scanner, ...], tables: FixedScanners
+) -> None:
+    angles = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
+    body = np.stack([0.14 * np.cos(angles), 0.25 * np.sin(angles)], axis=-1)
+    behind = np.array([-0.57, 0.0, 0.0])  # a gap of 3 cm
+
+    def somebody(t: float) -> FloatArray:
+        return sides(body, compose(circle(t), behind)) if t > 2.0 else np.empty((0, 4))
+
+    sets = sets_of_scans(record(scanners, circle, (0.0, 8.0), FRONTED, 5, somebody, rate_hz=15.0))
+    track = track_by_lasers(sets, tables, Robot(FRONTED, 1.0, 1.0))
+    assert np.all(track.is_determined)
+    exact = np.array([circle(t) for t in sets.times_s])
+    assert np.max(np.abs(track.poses - exact)[:, :2]) < 0.015
+
+
 def test_the_command_writes_the_same_bytes_again(
     tmp_path: Path, scanners: tuple[Scanner, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
