@@ -57,11 +57,23 @@ def perform_network(command: Network) -> int:
     extra = {
         "made_by": outputs.provenance(command.settings),
         "reduced_cost": adjusted.chi2_per_dof,
+        "disagreement": estimate.disagreement,
         "residuals": table,
     }
     session.write_network(command.output, network, extra, overwrite=command.force)
     outputs.print_table(table)
     outputs.print_sigmas("camera", list(estimate.names), estimate.covariance)
+    if estimate.disagreement > 1.0:
+        outputs.warn(
+            "the boards' pictures contradict each other (the standard deviations were multiplied "
+            f"by {estimate.disagreement**0.5:.1f}): was a board moved between the pictures of one "
+            "placement, or is a calibration wrong?"
+        )
+    elif estimate.connections < 1:
+        outputs.warn(
+            "each connection of cameras is by a single placement: nothing shows whether a board "
+            "was moved between its pictures"
+        )
     print(f"{command.output}: {len(estimate.names)} cameras")
     return 0
 

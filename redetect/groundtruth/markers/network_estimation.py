@@ -12,6 +12,7 @@ from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
@@ -21,7 +22,10 @@ from redetect.groundtruth.markers.pairs import chained_poses
 from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories import se3
+from redetect.least_squares.solver import whitening
 
+# Probability below which views disagree not by chance.
+_BY_CHANCE = 1e-3
 _PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
@@ -31,10 +35,14 @@ class NetworkEstimate:
 
     names: tuple[str, ...]  # The cameras
     world_from_camera: FloatArray  # (C, 4, 4)
-    covariance: FloatArray  # (6 C, 6 C): joint, scaled by the residuals
+    covariance: FloatArray  # (6 C, 6 C): joint, scaled by the residuals and by `disagreement`
     offset: FloatArray | None  # (4, 4): `first_from_second` of the double board, adjusted
     adjusted: adjustment.AdjustedBundle
     views: tuple[BoardView, ...]  # The bundle's views
+    # Squared differences of the views' own poses of boards from the network's, in those that the
+    # residuals imply; 1 if chance explains them
+    disagreement: float
+    connections: int  # Degrees of freedom of these: 0 if nothing shows whether a board was moved
 
 
 def estimate_network(
@@ -70,14 +78,42 @@ def estimate_network(
     except GeometryError as error:
         raise GroundTruthError(f"the network cannot be adjusted: {error}") from None
     body_from_part = dict(zip(parts, adjusted.bundle.chain.body_from_part))
+    disagreement, connections = _disagreement(adjusted)
     return NetworkEstimate(
         names,
         adjusted.bundle.chain.world_from_camera,
-        adjusted.camera_covariance * adjusted.chi2_per_dof,
+        adjusted.camera_covariance * adjusted.chi2_per_dof * disagreement,
         body_from_part.get(SECOND),
         adjusted,
         views,
+        disagreement,
+        connections,
     )
+
+
+def _disagreement(adjusted: adjustment.AdjustedBundle) -> tuple[float, int]:
+    """`NetworkEstimate.disagreement`, and its degrees of freedom.
+
+    A moved board hardly changes the residuals of its many corners, but all of them by one motion,
+    so the part of each view's residuals that another pose of its board would remove is compared
+    with the rest.
+    """
+    part = adjusted.bundle.only(adjusted.used)
+    by_pose = adjustment.project_chain_with_jacobians(part.chain, part.seen).by_camera
+    white = whitening(part.seen.covariances)
+    residuals = (white @ adjusted.residuals[adjusted.used][..., None])[..., 0]
+    by_pose, rest, views = white @ by_pose, 0.0, np.unique(part.view)
+    for view in views:
+        own = residuals[part.view == view].ravel()
+        q = np.linalg.qr(by_pose[part.view == view].reshape(-1, 6))[0]
+        rest += float(own @ own - np.sum((q.T @ own) ** 2))
+    freedom = residuals.size - 6 * len(views)
+    connections = adjusted.degrees_of_freedom - freedom
+    variance = rest / freedom
+    squared = (adjusted.cost - rest) / variance
+    if connections < 1 or chdtrc(connections, squared) > _BY_CHANCE:
+        return 1.0, connections
+    return squared / connections * variance / adjusted.chi2_per_dof, connections
 
 
 def _camera_from_board(view: BoardView, setup: BoardsFile) -> FloatArray:

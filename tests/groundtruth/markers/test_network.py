@@ -29,6 +29,7 @@ from redetect.groundtruth.markers.network_estimation import (
     estimate_network,
     hand_eye,
 )
+from redetect.groundtruth.markers.poses import solve_camera
 from redetect.groundtruth.settings import NetworkSettings
 from redetect.groundtruth.trajectories import se3
 from tests.groundtruth.markers.scene import hall_cameras, lens
@@ -150,6 +151,20 @@ def test_a_board_in_the_wrong_image_is_left_out() -> None:
     estimate = estimated(found)
     assert not estimate.adjusted.used.all()
     assert np.abs(errors_of(estimate)).max() < 0.01
+
+
+def test_a_board_that_was_moved_between_two_pictures_is_noticed() -> None:
+    found = shots(0.15, 21, per_pair=4)
+    assert estimated(found).disagreement == 1.0
+    view = found[1][1]
+    pose = solve_camera(lens(), BOARD.points, view.corners, "iterative")[0]
+    moved = pose @ se3.exp(np.array([0.01, 0.005, 0.0, 0.0, 0.0, 0.0]))
+    found[1][1] = replace(view, corners=lens().project(se3.apply(moved, BOARD.points)))
+    estimate = estimated(found)
+    assert estimate.disagreement > 5.0
+    error = errors_of(estimate).ravel()
+    assert error @ np.linalg.solve(estimate.covariance, error) / len(error) < 10.0
+    assert estimated(shots(0.15, 22, per_pair=1)).connections == 0
 
 
 def test_what_does_not_determine_a_network_is_refused() -> None:
