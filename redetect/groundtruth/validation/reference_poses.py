@@ -309,7 +309,13 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
     """
     names = tuple(survey.fiducials)
     drawn = np.stack([survey.fiducials[name] for name in names])
-    ends = np.array([(names.index(a), names.index(b)) for a, b, _ in distances]).reshape(-1, 2)
+    fewest = 2 * len(names) - 3
+    undetermined = GroundTruthError(
+        f"{len(distances)} distances do not determine the positions of {len(names)} fiducials"
+    )
+    if len(distances) < fewest:
+        raise undetermined
+    ends = np.array([(names.index(a), names.index(b)) for a, b, _ in distances])
     measured = np.array([distance_m for _, _, distance_m in distances])
 
     def residuals(flat: FloatArray) -> FloatArray:
@@ -317,10 +323,8 @@ def survey_fiducials(survey: Survey, distances: list[FiducialDistance]) -> Surve
         return np.asarray(np.hypot(apart[:, 0], apart[:, 1]) - measured)
 
     found = least_squares(residuals, drawn.ravel(), xtol=1e-12, ftol=1e-12)
-    if np.linalg.matrix_rank(found.jac, tol=1e-6) < 2 * len(names) - 3:
-        raise GroundTruthError(
-            f"{len(measured)} distances do not determine the positions of {len(names)} fiducials"
-        )
+    if np.linalg.matrix_rank(found.jac, tol=1e-6) < fewest:
+        raise undetermined
     places = found.x.reshape(-1, 2)
     motion = fitted(places, drawn)
     variances = survey.sigma_m**2 * np.linalg.pinv(found.jac.T @ found.jac, rcond=1e-9)

@@ -74,6 +74,7 @@ def test_deviations_are_those_of_the_errors() -> None:
     assert low < squared < high
 
 
-def test_too_few_distances_are_refused() -> None:
+@pytest.mark.parametrize("count", [0, 5])
+def test_too_few_distances_are_refused(count: int) -> None:
     with pytest.raises(GroundTruthError, match="not determine the positions of 5 fiducials"):
-        survey_fiducials(SURVEY, measured()[:5])
+        survey_fiducials(SURVEY, measured()[:count])
