@@ -382,6 +382,15 @@ def _rejected(inputs: Inputs) -> list[Part]:
     restarts = _entry(fused, "restarts_s", list)
     words = f"Fusion used {used or 'nothing'}; rejected {len(rejected)}; {len(restarts)} restarts."
     content.append(Part("text", words))
+    for key, what in (
+        ("slips_s", "contradicts the measured poses, as after a slip of the wheels"),
+        ("odometry_pauses_s", "pauses"),
+    ):
+        if spans := [span for span in _entry(fused, key, list) if isinstance(span, list)]:
+            times = "; ".join(
+                " to ".join(_number(t, 1.0, 3) for t in s) for s in spans[:_MOST_ROWS]
+            )
+            content.append(Part("problem", f"Odometry {what}, {len(spans)} times (s): {times}."))
     if rejected:
         worst = sorted(rejected, key=lambda r: -_float(r.get("squared_innovation")))[:_MOST_ROWS]
         entries = [

@@ -172,6 +172,7 @@ def test_hostile_text_from_files_is_only_text(session: Path) -> None:
         "refused": [{"index": HOSTILE, "status": HOSTILE, "reason": HOSTILE}, HOSTILE],
         "rejected": [{"stream": HOSTILE, "time_s": 1e999, "squared_innovation": HOSTILE}, 5],
         "used": {HOSTILE: HOSTILE}, "restarts_s": HOSTILE,
+        "slips_s": [[HOSTILE], 3], "odometry_pauses_s": HOSTILE,
         "scanners": [{"name": HOSTILE, "suspect": 1}, None], "sets": {HOSTILE: HOSTILE},
     }  # fmt: skip
     for name in ("fused.json", "laser.json", "aligned.json", "validation/validation.json"):
@@ -272,6 +273,15 @@ def test_the_same_session_gives_the_same_page(
     session: Path, unchanged: tuple[Inputs, bytes]
 ) -> None:
     assert report_page(gather(session), "1.2.3") == unchanged[1]
+
+
+def test_slips_and_pauses_of_odometry_are_said(session: Path) -> None:
+    fused = {"slips_s": [[20.0, 21.5]], "odometry_pauses_s": [[1.0, 4.0], [7.0, 9.0]]}
+    (session / "fused.json").write_text(json.dumps(fused))
+    assert main(["report", str(session)]) == 0
+    text = Page((session / "report.html").read_bytes()).text
+    assert "slip of the wheels, 1 times (s): 20.000 to 21.500." in text
+    assert "pauses, 2 times (s): 1.000 to 4.000; 7.000 to 9.000." in text
 
 
 def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
