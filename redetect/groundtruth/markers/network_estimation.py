@@ -26,6 +26,8 @@ from redetect.least_squares.solver import whitening
 
 # Probability below which views disagree not by chance.
 _BY_CHANCE = 1e-3
+# Corners of a view this many times as far from where they are expected as most are wrong.
+_WRONG_CORNER = 5.0
 _PosedShots = Sequence[Sequence[tuple[BoardView, FloatArray]]]
 
 
@@ -70,7 +72,7 @@ def estimate_network(
         offset = _estimated_offset(seen) if offset is None else offset
         parts |= {FIRST: np.eye(4), SECOND: offset}
     poses, bodies = _chained(names, seen, parts)
-    bundle, views = _bundle(setup, parts, seen, poses, bodies, settings.corner_sigma_px)
+    bundle, views = _bundle(setup, parts, seen, poses, bodies, settings)
     try:
         adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
@@ -204,9 +206,12 @@ def _bundle(
     seen: _PosedShots,
     poses: FloatArray,
     bodies: Mapping[int, FloatArray],
-    corner_sigma_px: float,
+    settings: NetworkSettings,
 ) -> tuple[adjustment.Bundle, tuple[BoardView, ...]]:
-    """Bundle of all views; its first body is the world, the others are the double boards."""
+    """Bundle of all views; its first body is the world, the others are the double boards.
+
+    Without single corners that do not fit their board's own pose, such as hidden ones.
+    """
     names, order = sorted(setup.cameras), list(parts)
     body_index = {number: body for body, number in enumerate(bodies, 1)}
     views = [view for shot in seen for view, _ in shot]
@@ -223,7 +228,7 @@ def _bundle(
         part,
         np.concatenate([setup.boards[view.board].points for view in views]),
         np.concatenate([view.corners for view in views]),
-        np.tile(corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
+        np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
     free = np.ones(len(names) + len(order) + 1 + len(bodies), dtype=np.bool_)
     free[len(names) : len(names) + len(order) + 1] = False
@@ -245,4 +250,11 @@ def _bundle(
         np.repeat(np.arange(len(views)), counts),
         priors,
     )
-    return bundle, tuple(views)
+    right = []
+    for view, pose in (one for shot in seen for one in shot):
+        expected = setup.cameras[view.camera].project(
+            se3.apply(pose, setup.boards[view.board].points)
+        )
+        off = np.linalg.norm(view.corners - expected, axis=1)
+        right.append(off <= max(settings.outlier_px, _WRONG_CORNER * float(np.median(off))))
+    return bundle.only(np.concatenate(right)), tuple(views)

@@ -153,6 +153,22 @@ def test_a_board_in_the_wrong_image_is_left_out() -> None:
     assert np.abs(errors_of(estimate)).max() < 0.01
 
 
+def test_a_single_wrong_corner_is_left_out() -> None:
+    found = shots(0.03, 8)
+    exact = estimated(found, sigma_px=0.03)
+    for shot, corner in ((3, 7), (9, 40)):
+        view = found[shot][1]
+        corners = view.corners.copy()
+        corners[corner] += 8.0
+        found[shot][1] = replace(view, corners=corners)
+    estimate = estimated(found, sigma_px=0.03)
+    assert len(estimate.adjusted.used) == len(exact.adjusted.used) - 2
+    assert np.all(estimate.adjusted.used)
+    np.testing.assert_allclose(
+        np.diagonal(estimate.covariance), np.diagonal(exact.covariance), rtol=0.1
+    )
+
+
 def test_a_board_that_was_moved_between_two_pictures_is_noticed() -> None:
     found = shots(0.15, 21, per_pair=4)
     assert estimated(found).disagreement == 1.0
