@@ -283,7 +283,8 @@ def _place(at: tuple[float, float], scene: _Examined) -> str:
     x, y = camera.floor_from_pixel(at).tolist()
     if not math.isfinite(x):
         return f"({u:g}, {v:g}) does not see the floor: it is above the horizon of the calibration."
-    words = f"({u:g}, {v:g}) sees the floor {-y:.2f} m in front and {x:.2f} m to the left"
+    side = "left" if x >= 0.0 else "right"
+    words = f"({u:g}, {v:g}) sees the floor {-y:.2f} m in front and {abs(x):.2f} m to the {side}"
     per_row = float(np.hypot(*camera.floor_jacobian(at)[:, 1]))
     if per_row > settings.far_limit_m_per_px:
         return (

@@ -499,6 +499,8 @@ def test_places_where_nothing_can_be_found(
         ((900.0, 100.0), "outside the image"),
         ((377.0, 70.0), "too far"),
         ((3.0, 285.0), "too near to the border"),
+        ((3.0, 200.0), " m to the left"),
+        ((764.0, 200.0), " m to the right"),
     ):
         why = rd.explain(demo_image, demo_camera, at)
         assert words in why.place, at
