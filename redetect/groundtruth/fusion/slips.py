@@ -2,7 +2,7 @@
 
 After a slip the measured poses contradict odometry for good, although they agree with each other.
 Without more, a filter rejects them until it gives up. So odometry's variances are increased where
-a long run of rejections begins, for as long as makes the measurements fit again. A run after which
+a run of rejections begins, for as long as makes the measurements fit again. A run after which
 the measurements return to the path as predicted is one of gross errors of theirs, and is left out.
 """
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from redetect.groundtruth.fusion.movement import MovementProblem
 
 #: Least duration of a gap without measurements; rejections after a gap are attributed to it.
-UNMEASURED_S = 1.0
-# Least number of consecutive rejections, and the same at the end of a segment, where it is not
-# known whether the measurements would have returned.
-_LEAST_RUN, _LEAST_LAST_RUN = 10, 20
+UNMEASURED_S = 1.5
+# Least number and duration (s) of consecutive rejections, and their least number at the end of a
+# segment, where it is not known whether the measurements would have returned.
+_LEAST_RUN, _LEAST_RUN_S, _LEAST_LAST_RUN = 3, 0.2, 20
 # A squared innovation beyond this share of the gate is no return to the predicted path.
-_NO_RETURN = 1.0 / 3.0
+_NO_RETURN = 0.6
 # Number of measurements until which odometry slips, and its possible rates (m/s, rad/s), as tried,
 # with the cost of a measurement: one that contradicts nothing any more costs about as much as a
 # rejected one.
@@ -48,7 +48,7 @@ def slip_variances(problem: MovementProblem, variances: FloatArray) -> FloatArra
     for _ in range(_ROUNDS):
         runs = [
             (begin, end)
-            for begin, end in _runs(found, nodes)
+            for begin, end in _runs(found, nodes, times_s)
             if begin not in hopeless
             and times_s[begin] - times_s[begin - 1] <= UNMEASURED_S
             and _is_slip(found, times_s, (begin, end), gate)
@@ -109,12 +109,16 @@ def _stretches(mask: BoolArray) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
 
 
-def _runs(found: Innovations, nodes: IntArray) -> list[tuple[int, int]]:
-    """Begin and end of long runs of rejections after an accepted measurement, including the one at
+def _runs(found: Innovations, nodes: IntArray, times_s: FloatArray) -> list[tuple[int, int]]:
+    """Begin and end of runs of rejections after an accepted measurement, including the one at
     which the filter restarted.
     """
     rejected = ~found.accepted | (found.restarted[nodes] == AFTER_REJECTIONS)
-    return [(a, b) for a, b in _stretches(rejected) if a > 0 and b - a >= _LEAST_RUN]
+    return [
+        (a, b)
+        for a, b in _stretches(rejected)
+        if a > 0 and b - a >= _LEAST_RUN and times_s[b - 1] - times_s[a - 1] >= _LEAST_RUN_S
+    ]
 
 
 def _is_slip(found: Innovations, times_s: FloatArray, run: tuple[int, int], gate: float) -> bool:

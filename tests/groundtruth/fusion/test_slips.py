@@ -62,6 +62,32 @@ def test_a_slip_does_not_make_gaps_less_certain(turned_rad: float) -> None:
     assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
+@pytest.mark.parametrize(("seed", "slip"), [(0, (0.05, 0.1)), (2, (0.3, 0.0))])
+def test_slips_between_sparse_poses(seed: int, slip: tuple[float, float]) -> None:
+    """Few poses contradict odometry until the filter is uncertain enough to accept them."""
+    rng = np.random.default_rng(seed)
+    truth, own = drive(rng, 60.0, WHEELS)
+    laser = measure(rng, truth, np.arange(0.013 + 0.05 * seed, 59.8, 0.5), FINE)
+    fusion = fuse(slipping(own, 20.0, 20.5, *slip), {"laser": laser})
+    near = fusion.poses.during(19.0, 22.0)
+    assert len(fusion.slips_s) == 1
+    assert len(fusion.rejected) == 0
+    assert float(np.mean(normalised_error(fusion.poses, truth)[near])) / 3.0 < 2.0
+
+
+@pytest.mark.parametrize(("every_s", "seed"), [(0.04, 1), (0.02, 3)])
+def test_bursts_of_wrong_poses_side_by_side_are_no_slips(every_s: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, own = drive(rng, 60.0, WHEELS)
+    laser = measure(rng, truth, np.arange(0.013 + 0.1 * seed * every_s, 59.8, every_s), FINE)
+    poses = laser.poses.copy()
+    for begin in rng.integers(5, len(poses) - 8, 5):
+        poses[begin : begin + 6] += rng.normal(0.0, 0.3, 3)
+    fusion = fuse(own, {"laser": PlanarPoses(laser.times_s, poses, laser.covariances)})
+    assert fusion.slips_s == ()
+    assert errors_m(fusion, truth).max() < 0.02
+
+
 def test_a_burst_of_wrong_poses_is_no_slip() -> None:
     """A second of poses half a metre off, all by as much: the path stays where it was."""
     rng = np.random.default_rng(22)
