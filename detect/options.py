@@ -115,14 +115,10 @@ class Circles(DetectorFlags):
 
     Example: detect circles images/e --draw /tmp/discs, or:
     detect circles drive.mcap --camera front.cam --odometry /odom
-
-    Parameters
-    ----------
-    preset : str
-        Defaults of the other flags: `published` reproduces the data set's rows (all of them and
-        only those), `report` has the parameters that the report prints.
     """
 
+    #: Defaults of the other flags: `published` reproduces the data set's rows (all of them and only
+    #: those), `report` has the parameters that the report prints.
     preset: DetectorPreset = "default"
     #: Tilt for which discs are corrected: that of the frames in a file (from `detect lines`), or
     #: `none`. By default they are not corrected either, but some images are examined for how much
@@ -144,14 +140,10 @@ class Lines(DetectorFlags):
 
     Example: detect lines images/e --join-threshold 0.006, or:
     detect lines drive.avi --camera front.cam --frames 100
-
-    Parameters
-    ----------
-    preset : str
-        Defaults of the other flags: `published` reproduces the data set's own rows as far as they
-        are known, `report` has the parameters that the report prints.
     """
 
+    #: Defaults of the other flags: `published` reproduces the data set's own rows as far as they
+    #: are known, `report` has the parameters that the report prints.
     preset: DetectorPreset = "default"
     #: The tilt file to write; by default the output's name with the extension .tilt.
     tilt_output: MaybePath = None
