@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from camera import Camera, read_camera
@@ -144,30 +145,30 @@ def _source(name: Path, options: SourceOptions) -> Source:
 
 def _frames(source: Source, options: SourceOptions) -> tuple[Frames, Path | None]:
     """The frames of a source along the given odometry, and the odometry's file."""
-    named = options.odometry
+    named, path = options.odometry, Path(options.odometry)
     poses: PoseStream | None
     if options.times and not isinstance(source, ImageFiles):
         raise DetectError(f"{source.name}: --times {options.times}: its images have their own")
-    if named.startswith("/") and not (Path(named).suffix or Path(named).exists()):
+    if named.startswith("/") and not (path.suffix or path.exists()):
         poses = source.poses(named)
-    elif named.endswith((".tum", ".velocities")):
-        read = tum_poses if named.endswith(".tum") else velocity_poses
-        of_arcs = read is velocity_poses
-        poses = PoseStream(named, Path(named), lambda: read(Path(named)), of_arcs)
+    elif named.endswith(".tum"):
+        poses = PoseStream(named, path, partial(tum_poses, path))
+    elif named.endswith(".velocities"):
+        poses = PoseStream(named, path, partial(velocity_poses, path), of_arcs=True)
     elif named.endswith(".ticks"):
         wheels = options.wheel_base_m, options.metres_per_tick
         if not all(0.0 < number < math.inf for number in wheels):
             raise DetectError(
                 f"{named}: wheel ticks: expected --wheel-base-m and --metres-per-tick above 0"
             )
-        poses = PoseStream(named, Path(named), lambda: tick_poses(Path(named), *wheels), True)
+        poses = PoseStream(named, path, partial(tick_poses, path, *wheels), of_arcs=True)
     elif named and named != "none":
         if not isinstance(source, ImageFiles):
             raise DetectError(
                 f"{named}: STEP rows belong to image files: expected a trajectory (.tum), "
                 f"ticks (.ticks), velocities (.velocities), a bag's topic or none for {source.name}"
             )
-        return source.along(Path(named)), Path(named)
+        return source.along(path), path
     else:
         poses = None if named else source.poses(None)
     if poses is None:

@@ -125,16 +125,15 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
 class PosesOverTime:
     """Poses in order, read once; requests must be in order, too."""
 
-    def __init__(self, poses: Iterator[TimedPose], name: str, *, of_arcs: bool = False) -> None:
-        self._poses = poses
-        self._name, self._of_arcs = name, of_arcs
+    def __init__(self, poses: Iterator[TimedPose], stream: PoseStream) -> None:
+        self._poses, self._name, self._of_arcs = poses, stream.name, stream.of_arcs
         self.jumps = self.jumped = False  # now, and since the last step
         self._way_m = self._turn_rad = 0.0
         self._longest_s = LARGEST_GAP_S
         self._before: TimedPose | None = None
         self._after = next(poses, None)
         if self._after is None:
-            raise DetectError(f"{name}: no pose in it: expected odometry, or --odometry none")
+            raise DetectError(f"{self._name}: no pose in it: expected odometry, or --odometry none")
         self.first_s = self._after.time_s
 
     def at(self, time_s: float) -> TimedPose | None:
@@ -297,8 +296,7 @@ class FramesAlongPoses(Frames):
     def __iter__(self) -> Generator[RunFrame, None, None]:
         self.left_out = 0
         with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
-            name, of_arcs = self._stream.name, self._stream.of_arcs
-            poses = PosesOverTime(read, name, of_arcs=of_arcs)
+            poses = PosesOverTime(read, self._stream)
             last: TimedPose | None = None
             missed_s = math.nan
             for image in images:
@@ -315,7 +313,7 @@ class FramesAlongPoses(Frames):
                 last = pose
             if self.left_out and last is None:
                 raise DetectError(
-                    f"{name}: no pose at the time of any image; the first pose is of "
+                    f"{self._stream.name}: no pose at the time of any image; the first pose is of "
                     f"{poses.first_s:.3f} s, the last image of {missed_s:.3f} s: expected seconds "
                     "of one clock, in order"
                 )
