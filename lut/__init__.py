@@ -8,7 +8,6 @@ from lut.outlines import DiscShape as DiscShape
 from lut.outlines import DiscTable as DiscTable
 from lut.outlines import TableError as TableError
 from lut.outlines import build_disc_table as build_disc_table
-from lut.outlines import ring as ring
 from lut.verticals import VerticalTable as VerticalTable
 from lut.verticals import build_vertical_table as build_vertical_table
 from lut.votes import VoteShape as VoteShape

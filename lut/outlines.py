@@ -82,12 +82,6 @@ def fingerprint(camera: Camera, *shapes: Any) -> ByteArray:
     return np.array(bytearray(digest))
 
 
-def ring(radius_m: float, samples: int) -> FloatArray:
-    """(samples, 2) equally spaced points on a circle about the origin, metres."""
-    angle = 2.0 * np.pi * np.arange(samples) / samples
-    return radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
 @lru_cache(maxsize=2)
 def floor_positions(camera: Camera) -> FloatArray:
     """(H, W, 2) floor position (robot X, Y, metres) of each pixel; NaN above the horizon."""
@@ -143,8 +137,9 @@ def _sample_pixels(
     """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
     outside, paired = width * height, shape.least_pairs > 0
     least = 0.0 if paired else -0.5
-    unit = ring(1.0, shape.samples)
-    unit = np.concatenate([unit[0::2], unit[1::2]])
+    angle = 2.0 * np.pi * np.arange(shape.samples) / shape.samples
+    angle = np.concatenate([angle[0::2], angle[1::2]])
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     def pixels_of(radii: FloatArray) -> IntArray:
         """(N, K, 2) for (1 or N, 1, 2) radii of both outlines."""

@@ -24,8 +24,9 @@ from detect.circles import (
 from detect.discs.positions import published_positions
 from detect.errors import DetectError, FrameError
 from detect.lines import detect_lines
+from detect.projection import circle_on_floor
 from detect.settings import REPORT, CircleSettings, Polarity
-from lut import DiscTable, VoteTable, build_vertical_table, cached_disc_table, ring
+from lut import DiscTable, VoteTable, build_vertical_table, cached_disc_table
 from lut.outlines import floor_positions
 from tests.detect.line_scene import mirrored
 from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
@@ -146,7 +147,7 @@ def test_suppression_alone_makes_one_disc_one_row(
 def test_disc_partly_behind_the_lower_border(published_camera: Camera) -> None:
     """A disc as near as centres may be: 12 px above the lower border, which cuts it."""
     place = published_camera.floor_from_pixel(np.array([380.0, 276.0]))
-    outline = published_camera.project_floor(place + ring(0.10, 64))
+    outline = published_camera.project_floor(circle_on_floor(place, 0.10, 64))
     assert outline[:, 1].max() > published_camera.height
     image = PaintedFloor(published_camera).disc(place).image()
     assert_found_once(detect(image, published_camera), place[None], within_m=0.005)
@@ -156,7 +157,7 @@ def test_disc_partly_behind_the_lower_border(published_camera: Camera) -> None:
 def test_disc_at_the_side_border(published_camera: Camera, side: int) -> None:
     u = 14.0 if side < 0 else published_camera.width - 15.0
     place = published_camera.floor_from_pixel(np.array([u, 200.0]))
-    outline = published_camera.project_floor(place + ring(0.10, 64))
+    outline = published_camera.project_floor(circle_on_floor(place, 0.10, 64))
     assert outline[:, 0].min() < 0 or outline[:, 0].max() > published_camera.width - 1
     image = PaintedFloor(published_camera).disc(place, DARK).image()
     assert_found_once(detect(image, published_camera), place[None], within_m=0.01)

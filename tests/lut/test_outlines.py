@@ -13,13 +13,8 @@ from hypothesis import assume, event, given
 from hypothesis import strategies as st
 
 from camera import Camera
-from lut import (
-    DiscShape,
-    DiscTable,
-    TableError,
-    build_disc_table,
-    ring,
-)
+from detect.projection import circle_on_floor
+from lut import DiscShape, DiscTable, TableError, build_disc_table
 from lut.outlines import floor_positions
 from redetect.array_types import BoolArray, IntArray
 from redetect.landmarks import read_frames
@@ -47,7 +42,8 @@ def plain_outlines(camera: Camera, shape: DiscShape) -> Outlines:
     """The definition: floor position -> ring -> image -> nearest pixel."""
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     floor_xy = camera.floor_from_pixel(np.stack([u, v], axis=-1).astype(float))
-    rings = [ring(radius, shape.samples) for radius in (shape.inner_radius_m, shape.outer_radius_m)]
+    radii = shape.inner_radius_m, shape.outer_radius_m
+    rings = [circle_on_floor((0.0, 0.0), radius, shape.samples) for radius in radii]
     seen = camera.project_floor(floor_xy[:, :, None] + np.concatenate(rings))
     with np.errstate(invalid="ignore"):
         nearest = np.floor(seen + 0.5)
@@ -246,7 +242,7 @@ def test_samples_that_the_camera_cannot_see_at_all_do_not_vote() -> None:
     camera = wide_and_low()
     shape = DiscShape(0.1, 0.5, samples=16, border_px=0, far_limit_m_per_px=1.0)
     table = build_disc_table(camera, shape)
-    rings = np.concatenate([ring(0.1, 16), ring(0.5, 16)])
+    rings = np.concatenate([circle_on_floor((0.0, 0.0), radius, 16) for radius in (0.1, 0.5)])
     undefined = np.isnan(camera.project_floor(table.floor_xy[:, :, None] + rings)).any(axis=-1)
     assert (undefined & table.usable[..., None]).any()
     assert_table_is(table, plain_outlines(camera, shape))
@@ -282,7 +278,7 @@ def test_a_camera_that_is_not_above_the_floor_is_refused(
 
 
 def test_rings_are_equally_spaced_circles_that_begin_to_the_left() -> None:
-    points = ring(0.14, 16)
+    points = circle_on_floor((0.0, 0.0), 0.14, 16)
     assert np.hypot(*points.T) == pytest.approx(0.14)
     assert points[0] == pytest.approx([0.14, 0.0])
     assert points[4] == pytest.approx([0.0, 0.14])

@@ -9,8 +9,9 @@ import pytest
 
 from camera import Camera
 from detect.circles import detect_circles
+from detect.projection import circle_on_floor
 from detect.settings import CircleSettings
-from lut import VoteShape, build_vote_table, cached_vote_table, ring
+from lut import VoteShape, build_vote_table, cached_vote_table
 from lut.votes import radius_px
 from tests.detect.painted_floor import PaintedFloor
 
@@ -59,7 +60,7 @@ def test_a_camera_that_looks_straight_down_finds_discs() -> None:
 
 def test_sizes_are_those_of_the_outlines(published_camera: Camera) -> None:
     pixel = [500.0, 180.0]
-    outline = published_camera.floor_from_pixel(pixel) + ring(0.05, 64)
+    outline = circle_on_floor(published_camera.floor_from_pixel(pixel), 0.05, 64)
     x, y = published_camera.project_floor(outline).T
     area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
     found = radius_px(0.05, published_camera.floor_jacobian(pixel))

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.projection import circle_on_floor
 from detect.settings import Polarity
-from lut import DiscShape, ring
+from lut import DiscShape
 from redetect.array_types import BoolArray, FloatArray, IntArray
 
 
@@ -40,9 +41,8 @@ class PlainOutlines:
 def plain_outlines(camera: Camera, shape: DiscShape, usable: BoolArray) -> PlainOutlines:
     """Project the outlines of the usable centres, some thousands at a time."""
     height, width = camera.height, camera.width
-    rings = np.concatenate(
-        [ring(shape.inner_radius_m, shape.samples), ring(shape.outer_radius_m, shape.samples)]
-    )
+    radii = shape.inner_radius_m, shape.outer_radius_m
+    rings = np.concatenate([circle_on_floor((0.0, 0.0), r, shape.samples) for r in radii])
     rows, columns = np.nonzero(usable)
     index = np.empty((len(rows), len(rings)), np.int64)
     for k in range(0, len(rows), 10_000):

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from camera import Camera, parse_camera
 from detect.circles import detect_circles, disc_shape
 from detect.discs.quality import Limits, centres_of
+from detect.projection import circle_on_floor
 from detect.settings import REPORT, CircleSettings, Polarity
-from lut import DiscShape, DiscTable, build_disc_table, ring
+from lut import DiscShape, DiscTable, build_disc_table
 from tests.camera.strategies import cameras
 from tests.reference.centres import PlainOutlines, plain_best_centres, plain_outlines, plain_quality
 from tools.benchmark.material import scaled_camera
@@ -176,7 +177,10 @@ def test_any_camera_image_and_threshold(
 def _samples_are_clear(camera: Camera, shape: DiscShape, table: DiscTable) -> bool:
     rows, columns = np.nonzero(table.usable)
     rings = np.concatenate(
-        [ring(radius, shape.samples) for radius in (shape.inner_radius_m, shape.outer_radius_m)]
+        [
+            circle_on_floor((0.0, 0.0), radius, shape.samples)
+            for radius in (shape.inner_radius_m, shape.outer_radius_m)
+        ]
     )
     centres = camera.floor_from_pixel(np.stack([columns, rows], axis=-1).astype(float))
     seen = camera.project_floor(centres[:, None] + rings) + 0.5

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from camera import Camera
 from detect.cli import main
 from detect.drawing.frame import SIGMA_COLOUR, draw_rows, line_curves, sigma_bars
-from detect.projection import DiscProjection
+from detect.projection import DiscProjection, circle_on_floor
 from detect.row_files import ImageRows, circle_settings_of
 from detect.settings import CircleSettings
 from detect.sources.interface import SomeFrames
 from detect.sources.opening import open_source
-from lut import ring
 from redetect.landmarks import CircleLandmark, Frame, LineLandmark, Step, circle_landmarks
 from redetect.landmarks.files import read_head
 from tests.detect.commands import Captured, assert_refused
@@ -107,7 +106,7 @@ def test_matched_extra_and_missed_have_colours_of_their_own(
         ((-0.6, -1.5), (255, 60, 255)),
         ((0.7, -1.6), (60, 60, 255)),
     ):
-        edge = np.array([colour_at(p) for p in project(centre + ring(0.1, 32))])
+        edge = np.array([colour_at(p) for p in project(circle_on_floor(centre, 0.1, 32))])
         assert np.median(np.abs(edge - expected).sum(axis=1)) < 120, centre
     for bearing, expected in ((0.3, (255, 60, 255)), (-0.4, (60, 60, 255))):
         row = vertical(published_camera, bearing, 0.002)
@@ -124,7 +123,7 @@ def test_without_reference_nothing_is_missed_or_extra(
 ) -> None:
     rows = ImageRows(circles=Frame(STEP, discs((0.2, -1.3))))
     canvas = draw_rows(image, DiscProjection(published_camera, SETTINGS), rows).astype(int)
-    seen = published_camera.project_floor(np.array([0.2, -1.3]) + ring(0.1, 32))
+    seen = published_camera.project_floor(circle_on_floor((0.2, -1.3), 0.1, 32))
     edge = np.rint(2.0 * seen + 0.5).astype(int)
     apart = np.abs(canvas[edge[:, 1], edge[:, 0]] - (0, 170, 255)).sum(axis=1)
     assert np.median(apart) < 120

@@ -8,10 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
 from detect.drawing.frame import draw_rows
-from detect.projection import DiscProjection
+from detect.projection import DiscProjection, circle_on_floor
 from detect.row_files import ImageRows
 from detect.settings import CircleSettings
-from lut import ring
 from redetect.landmarks import Frame, Step, circle_landmarks
 from tests.pictures import changed
 
@@ -49,13 +48,13 @@ def test_outlines_and_number_are_drawn(image: NDArray[np.uint8], published_camer
     np.testing.assert_array_equal(image, before)
     marked = changed(canvas, image)
     for radius in (SETTINGS.inner_radius_m, SETTINGS.radius_m, SETTINGS.outer_radius_m):
-        u, v = np.rint(drawn_at(published_camera, place + ring(radius, 48))).astype(int).T
+        u, v = np.rint(drawn_at(published_camera, circle_on_floor(place, radius, 48))).astype(int).T
         assert marked[v, u].mean() > 0.95
     # Between the outlines the image shows.
-    u, v = np.rint(drawn_at(published_camera, place + ring(0.03, 16))).astype(int).T
+    u, v = np.rint(drawn_at(published_camera, circle_on_floor(place, 0.03, 16))).astype(int).T
     assert not marked[v, u].any()
     # The quality is to the right of the outline.
-    outline = drawn_at(published_camera, place + ring(SETTINGS.outer_radius_m, 64))
+    outline = drawn_at(published_camera, circle_on_floor(place, SETTINGS.outer_radius_m, 64))
     u0, v0 = np.rint([outline[:, 0].max(), outline[:, 1].mean()]).astype(int)
     assert marked[v0 - 8 : v0 + 8, u0 + 4 : u0 + 50].sum() > 60
 
@@ -64,7 +63,7 @@ def test_the_rest_is_the_image(image: NDArray[np.uint8], published_camera: Camer
     place = (0.2, -1.3)
     canvas = drawn(image, published_camera, place)
     v, u = np.nonzero(changed(canvas, image))
-    seen = drawn_at(published_camera, place + ring(SETTINGS.outer_radius_m, 64))
+    seen = drawn_at(published_camera, circle_on_floor(place, SETTINGS.outer_radius_m, 64))
     left, top = seen.min(axis=0)
     right, bottom = seen.max(axis=0)
     assert u.min() >= left - 2
