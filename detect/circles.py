@@ -44,13 +44,14 @@ from lut import (
 from lut.outlines import fingerprint, floor_positions
 from lut.votes import largest_disc_px
 from redetect.array_types import BoolArray, FloatArray, GreyImage, IntArray
+from redetect.landmarks import CircleLandmark, circle_landmarks
 from redetect.tables import ByContent
 
 #: Lower bound of an image's noise in the noise floor: one grey level, its resolution.
 _LEAST_NOISE = 1.0
 #: The same in fits: that of rounded grey values.
 _ROUNDING_NOISE = 0.3
-_SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
+SIGNS: dict[Polarity, int] = {"any": 0, "light": 1, "dark": -1}
 _NOISE_ROWS = 16  #: Number of rows from which an image's noise is estimated.
 #: Lowest gradient of an edge that votes, and in images full of edges, grey levels per pixel.
 _FAINT_EDGE, _EDGE = 2.0, 4.0
@@ -78,6 +79,11 @@ class CircleDetections(ByContent):
 
     def __len__(self) -> int:
         return len(self.quality)
+
+    def landmarks(self) -> tuple[CircleLandmark, ...]:
+        """Rows for a landmark file, without identifiers."""
+        unknown = np.full(len(self), -1)
+        return circle_landmarks(self.floor_xy, self.quality, self.covariance, unknown)
 
     def where(self, chosen: BoolArray) -> CircleDetections:
         """The discs that a boolean mask selects."""
@@ -258,7 +264,7 @@ def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> H
     """Centres for which edges vote."""
     usual = min(max(steep_gradient(scene.image, _NOISE_ROWS), _FAINT_EDGE), _EDGE)
     edge = max(usual, _EDGE_NOISE * settings.noise_floor * max(scene.noise, _LEAST_NOISE))
-    return hough_candidates(scene.image, table, scene.radius, _SIGNS[settings.polarity], edge)
+    return hough_candidates(scene.image, table, scene.radius, SIGNS[settings.polarity], edge)
 
 
 def judged(
@@ -295,7 +301,7 @@ def _by_quality(
         noise = estimate_noise(image, _NOISE_ROWS)
         weakest = max(weakest, settings.noise_floor * max(noise, _LEAST_NOISE))
     least = math.nextafter(settings.threshold, 1.0)
-    limits = Limits(least, weakest, _SIGNS[settings.polarity])
+    limits = Limits(least, weakest, SIGNS[settings.polarity])
     pixels, quality, _ = centres_of(image, table, limits)
     if settings.stride == 0.0:
         qualities = np.zeros(image.shape)

@@ -18,6 +18,7 @@ import numpy as np
 
 from camera import Camera
 from detect.circles import (
+    SIGNS,
     CircleDetections,
     adjusted_log_odds,
     detect_circles,
@@ -248,7 +249,7 @@ def _candidates(scene: _Examined) -> Iterator[Candidate]:
         best = int(np.argmin(away - 1e-3 * (judgement.log_odds > 0.0)))
         row = float(votes[best]), float(judgement.step[best])
         yield Candidate(u, v, x, y, *row, "disc", float(found.evidence[k]), settings.evidence)
-    sign = {"any": 0.0, "light": 1.0, "dark": -1.0}[settings.polarity]
+    sign = SIGNS[settings.polarity]
     pixels = camera.project_floor(judgement.floor_xy)
     for k in np.flatnonzero(~taken).tolist():
         outcome, value = Outcome(judgement.outcome[k]), float(judgement.value[k])

@@ -6,7 +6,7 @@ Workers import this module; a process that delegates the work does not need the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby, zip_longest
@@ -42,14 +42,12 @@ from redetect.array_types import GreyImage
 from redetect.interrupts import interrupts_deferred
 from redetect.landmarks import (
     CircleLandmark,
+    Frame,
     FrameTilt,
-    Landmark,
     LandmarkError,
-    circle_landmarks,
-    format_levelling,
+    format_frame,
     format_no_tilt,
     format_outline_tilt,
-    format_record,
     format_tilt,
     tilt_as_written,
 )
@@ -237,23 +235,20 @@ def _rows_of(task: FrameTask, found: FrameDetections, plan: FramePlan) -> FrameR
 
 def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> dict[str, str]:
     step = task.frame.step
-    head = f"{format_record(step)}\n"
     rows = {"times": time_row(task)}
     if found.lines is not None:
         lines = found.lines.landmarks()
         if task.known.lines:
             lines = carry_ids(lines, task.known.lines)
-        rows["lines"] = head + _text(lines)
+        rows["lines"] = _text(Frame(step, lines))
         tilt = found.tilt
         own = format_no_tilt(step.prefix, len(found.lines)) if tilt is None else format_tilt(tilt)
         rows["tilt"] = f"{own}\n"
         if found.outline_tilt is not None:
             rows["tilt"] += f"{format_outline_tilt(found.outline_tilt)}\n"
     if found.discs is not None and found.unlevelled is not None:
-        level = found.discs.levelled_by
-        note = "" if level is None else f"{format_levelling(level)}\n"
         discs = _disc_rows(found.discs, found.unlevelled, task.known)
-        rows["circles"] = head + note + _text(discs)
+        rows["circles"] = _text(Frame(step, discs, found.discs.levelled_by))
         if plan.json:
             values = zip(discs, found.discs.pixels.tolist(), found.discs.evidence.tolist())
             records = [
@@ -269,22 +264,21 @@ def _rows_by_kind(task: FrameTask, found: FrameDetections, plan: FramePlan) -> d
             ]
             rows["json"] = json_record({"frame": step.prefix, "discs": records})
     if found.markers is not None:
-        rows["markers"] = head + _text(found.markers.landmarks())
+        rows["markers"] = _text(Frame(step, found.markers.landmarks()))
     return rows
 
 
-def _text(rows: Iterable[Landmark]) -> str:
-    return "".join(f"{format_record(row)}\n" for row in rows)
+def _text(frame: Frame) -> str:
+    return format_frame(frame).decode("utf-8", "surrogateescape")
 
 
 def _disc_rows(
     discs: CircleDetections, unlevelled: CircleDetections, known: KnownOfFrame
-) -> list[CircleLandmark]:
+) -> tuple[CircleLandmark, ...]:
     """The rows, each with the IDs of a known row of the same disc, or of a map's disc, or -1."""
-    unknown = np.full(len(discs), -1)
-    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
+    rows = discs.landmarks()
     if not (known.discs or known.mapped):
-        return list(rows)
+        return rows
     ids = [row.ids for row in rows]
     if known.discs:
         alike = discs if known.discs_level else unlevelled
@@ -298,7 +292,7 @@ def _disc_rows(
         xy, spread = discs.floor_xy[without], discs.covariance[without]
         for k, own in zip(without, ids_of_rows(xy, left, spread, _MAP_SIGMA_M)):
             ids[k] = own or (-1,)
-    return [replace(row, ids=own) for row, own in zip(rows, ids)]
+    return tuple(replace(row, ids=own) for row, own in zip(rows, ids))
 
 
 def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:

@@ -27,7 +27,7 @@ from detect.settings import CircleSettings, Polarity
 from detect.sources.interface import RunFrame, read_image, still
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
-from redetect.landmarks import Frame, FrameTilt, Step, circle_landmarks
+from redetect.landmarks import Frame, FrameTilt, Step
 from redetect.landmarks.axes import MEANING, Axes, covariance_from_dataset, from_dataset
 from redetect.messages import counted, excerpt, keywords_named, path_of
 from redetect.tables import ByContent, Table, covariance_columns, html_picture, html_table
@@ -382,8 +382,6 @@ def _detection(
     assert found.lines is not None
     verticals, lines, discs = found.lines, found.lines.lines, found.discs
     pixels = image_positions(camera, discs.floor_xy, discs.levelled_by)
-    unknown = np.full(len(discs), -1)
-    rows = circle_landmarks(discs.floor_xy, discs.quality, discs.covariance, unknown)
     return Detection(
         Discs(
             u=pixels[:, 0], v=pixels[:, 1], xy=from_dataset(discs.floor_xy, axes),
@@ -395,7 +393,7 @@ def _detection(
             top=camera.distort(lines.ends[:, :2]), bottom=camera.distort(lines.ends[:, 2:]),
         ),
         _tilt_of(found.tilt, axes), axes, step.prefix, found.image, camera, settings,
-        frame=Frame(step, (*rows, *verticals.landmarks()), discs.levelled_by),
+        frame=Frame(step, (*discs.landmarks(), *verticals.landmarks()), discs.levelled_by),
         frame_tilt=found.tilt,
     )  # fmt: skip
 
