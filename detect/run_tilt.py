@@ -51,7 +51,7 @@ _UNSURE_STATED_RAD, _UNSURE_RAD = math.radians(0.5), _OFFSET_RAD
 #: Correlated share of the variance of a frame's error (a scene stays visible), and its correlation.
 LASTING_SHARE, LASTING = 0.5, 0.9
 #: Share of frames with an outlier, a consensus of wrong lines, and its standard deviation (rad).
-STRAY_SHARE, STRAY_RAD = 0.02, math.radians(2.0)
+OUTLIER_SHARE, OUTLIER_RAD = 0.02, math.radians(2.0)
 #: Share of frames with a momentary tilt (a wheel on a sill or a cable), and its size (rad).
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
 _LEAST_RAD = math.radians(0.02)  #: Least standard deviation of a frame's tilt (rad).
@@ -138,7 +138,7 @@ def tilt_of_run(
         nothing = np.full_like(verticals.tilt, np.nan)
         outlines = FrameTilts(nothing, nothing)
     series = [_Series(*axis) for axis in zip(*map(np.transpose, (*verticals, *outlines)))]
-    found = _learned(series)
+    found = _estimated(series)
     offsets = [one.offset for one in found]
     exact = _share_exact(offsets)
     # If the calibration has a covariance, that covers the verticals and the height.
@@ -261,14 +261,14 @@ def _log_density(difference: FloatArray, variance: FloatArray) -> float:
     log_good, log_bad = (
         math.log(share) - 0.5 * (np.log(spread) + difference**2 / spread)
         for share, spread in (
-            (1.0 - 2.0 * STRAY_SHARE, variance),
-            (2.0 * STRAY_SHARE, variance + STRAY_RAD**2),
+            (1.0 - 2.0 * OUTLIER_SHARE, variance),
+            (2.0 * OUTLIER_SHARE, variance + OUTLIER_RAD**2),
         )
     )
     return float(np.logaddexp(log_good, log_bad).sum())
 
 
-def _learned(series: Sequence[_Series]) -> list[_Axis]:
+def _estimated(series: Sequence[_Series]) -> list[_Axis]:
     """Maximum likelihood estimates of the axes' parameters.
 
     The factors are determined by the differences of verticals and outlines; without these they are
@@ -319,13 +319,13 @@ def _learned(series: Sequence[_Series]) -> list[_Axis]:
 
     found = np.zeros(len(is_free))
     found[is_free] = minimize(cost_of_free, found[is_free], method="BFGS", options=_SEARCH).x
-    learned = []
+    estimated = []
     for k, axis in enumerate(axes_of(found)):
         step = np.zeros(len(found))
         step[1 + 5 * k] = 0.2
         curvature = (cost(found + step) - 2.0 * cost(found) + cost(found - step)) / 0.2**2
-        learned.append(axis._replace(lean_variance=_UNIT_RAD**2 / max(curvature, 1e-4)))
-    return learned
+        estimated.append(axis._replace(lean_variance=_UNIT_RAD**2 / max(curvature, 1e-4)))
+    return estimated
 
 
 def _share_exact(offsets: Sequence[float]) -> float:
@@ -346,7 +346,7 @@ def _share_exact(offsets: Sequence[float]) -> float:
 
 
 @kernel()
-def _weighed(share: float, off: float, variance: float) -> float:
+def _weighted_density(share: float, off: float, variance: float) -> float:
     """A normal density, times a share."""
     return share * math.exp(-0.5 * min(off * off / variance, 1000.0)) / math.sqrt(variance)
 
@@ -385,9 +385,9 @@ def smooth_axis(
             to_x, to_u = xx + load * xu, xu + load * uu
             white = (1.0 - LASTING_SHARE) * sigma[k] ** 2 + _LEAST_RAD**2
             good = to_x + load * to_u + white
-            bad = good + STRAY_RAD**2
-            log_good = math.log((1.0 - STRAY_SHARE) / math.sqrt(good)) - 0.5 * off * off / good
-            log_bad = math.log(STRAY_SHARE / math.sqrt(bad)) - 0.5 * off * off / bad
+            bad = good + OUTLIER_RAD**2
+            log_good = math.log((1.0 - OUTLIER_SHARE) / math.sqrt(good)) - 0.5 * off * off / good
+            log_bad = math.log(OUTLIER_SHARE / math.sqrt(bad)) - 0.5 * off * off / bad
             larger = max(log_good, log_bad)
             total = math.exp(log_good - larger) + math.exp(log_bad - larger)
             log_likelihood += larger + math.log(total)
@@ -424,9 +424,9 @@ def smooth_axis(
         # The residual of the measurement: noise, an outlier, or a jump.
         left = deviation[k] - x
         good = xx + sigma[k] ** 2
-        jumped = _weighed(JUMP_SHARE, left, good + JUMP_RAD**2)
-        others = _weighed(1.0 - JUMP_SHARE - STRAY_SHARE, left, good)
-        others += _weighed(STRAY_SHARE, left, good + STRAY_RAD**2)
+        jumped = _weighted_density(JUMP_SHARE, left, good + JUMP_RAD**2)
+        others = _weighted_density(1.0 - JUMP_SHARE - OUTLIER_SHARE, left, good)
+        others += _weighted_density(OUTLIER_SHARE, left, good + OUTLIER_RAD**2)
         share = jumped / (jumped + others)
         believed = JUMP_RAD**2 / (good + JUMP_RAD**2)
         smoothed[k] += share * believed * left

@@ -24,7 +24,7 @@ from detect.options import Tune
 from detect.projection import DiscProjection
 from detect.report.figures import DATA, MARK
 from detect.runs.plan import FramePlan, FramesByImage, FrameTask
-from detect.runs.stream import with_first_look
+from detect.runs.stream import with_initial_tilt
 from detect.runs.workers import WorkerPool, Workers, default_jobs, local_workers
 from detect.settings import UNREFINED, CircleSettings
 from detect.settings_files import read_settings, word_value
@@ -185,7 +185,7 @@ def tune_run(
     with closing(WorkerPool(workers)) as pool:
         # Each setting as if it was alone: what some frames show of the tilt depends on it.
         plans = [
-            with_first_look(run, FramePlan(run.camera, circles=each), pool) for each in settings
+            with_initial_tilt(run, FramePlan(run.camera, circles=each), pool) for each in settings
         ]
         work = (task._replace(plan=plan) for plan in plans for task in tasks)
         done = chain.from_iterable(pool.detect_chunks(work, plans[0]))

@@ -40,7 +40,7 @@ _CAPTURE_LAYER_PX, _CAPTURE_PX, _CAPTURE_WIDTHS = 1.5, 0.7, 0.02
 #: Markers whose cells are blurred by more than this (in cells) are not fitted.
 _HOPELESS_BLUR_CELLS = 0.75
 #: The first, coarse fit may explain less variance than the full fit must, by this much.
-_FIRST_LOOK_SLACK = 0.1
+_COARSE_SLACK = 0.1
 #: If the edges of a marker and its fit disagree by more than this (mean normalised squared
 #: difference, including the edges' systematic error), the marker is not flat, or distorted by an
 #: uncalibrated lens: the measured edges are then used.
@@ -233,15 +233,15 @@ def _marker_at(
     likely = likely_patterns(cells, templates, blur_cells)
     if not likely:
         return NO_PATTERN
-    looks = [
-        (look, template)
+    coarse_fits = [
+        (coarse, template)
         for template in likely
-        if (look := fit_marker(picture, refined, templates, template, first_look=True)) is not None
+        if (coarse := fit_marker(picture, refined, templates, template, coarse=True)) is not None
     ]
-    if not looks:
+    if not coarse_fits:
         return NOT_FITTED
-    first, template = max(looks, key=lambda look: look[0].explained)
-    if first.explained < settings.least_explained - _FIRST_LOOK_SLACK:
+    first, template = max(coarse_fits, key=lambda each: each[0].explained)
+    if first.explained < settings.least_explained - _COARSE_SLACK:
         return UNEXPLAINED
     fit = fit_marker(picture, refined._replace(corners=first.corners), templates, template)
     if fit is None:

@@ -55,7 +55,7 @@ _LEAST_NOISE = 0.3
 _SPARE_PIXELS = 12
 #: Approximate largest number of pixels in a fit, and its number of steps: a coarse fit is enough to
 #: decide whether it may be that marker.
-_FIRST_LOOK, _WHOLE_FIT = (450, 5), (3000, 12)
+_COARSE, _FULL = (450, 5), (3000, 12)
 
 
 class PatternFit(NamedTuple):
@@ -80,13 +80,13 @@ def fit_marker(
     templates: Templates,
     template: int,
     *,
-    first_look: bool = False,
+    coarse: bool = False,
 ) -> PatternFit | None:
     """Fit a marker of a known pattern by the Gauss-Newton method, starting from its edges.
 
     None if there is no such marker nearby.
     """
-    most_pixels, steps = _FIRST_LOOK if first_look else _WHOLE_FIT
+    most_pixels, steps = _COARSE if coarse else _FULL
     corners, blur_px = start.corners, start.blur_px
     middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
     cell_px = templates.dictionary.cell * float(np.hypot(*(middles[:2] - middles[2:]).T).min())

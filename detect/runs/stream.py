@@ -202,7 +202,7 @@ def detect_run(
     with ExitStack() as stack:
         pool = stack.enter_context(closing(WorkerPool(workers)))
         plan = replace(job.plan, json="json" in job.places)
-        plan = with_first_look(job.run, plan, pool)
+        plan = with_initial_tilt(job.run, plan, pool)
         if plan.circles != job.plan.circles and plan.circles:
             summary.unlevelled_deg = plan.circles.tilt_sigma_deg
         job, summary.lean = replace(job, plan=plan), plan.lean
@@ -225,7 +225,7 @@ def detect_run(
     return summary
 
 
-def with_first_look(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePlan:
+def with_initial_tilt(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> FramePlan:
     """The plan with what some frames of a run show of its tilt.
 
     That is the camera's lean and, if positions are not levelled by the run, the usual tilt.
