@@ -13,14 +13,15 @@ from __future__ import annotations
 import hashlib
 from dataclasses import astuple, dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
+from camera.kernels import camera_numbers, project_floor_point, published_camera_numbers
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from redetect.compiled import kernel
 from redetect.messages import OneLineError
 
 #: Least share of an outline's samples inside the image.
@@ -105,10 +106,16 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
-    down, numbers = size_down(floor_xy), camera_numbers(camera)
-    if shape.least_pairs > 0:
+    down, paired = size_down(floor_xy), shape.least_pairs > 0
+    if paired:
         by_row = camera.floor_jacobian_published(camera.pixel_grid())[..., 1]
-        down, numbers = np.hypot(by_row[..., 0], by_row[..., 1]), published_camera_numbers(camera)
+        down = np.hypot(by_row[..., 0], by_row[..., 1])
+    numbers = published_camera_numbers(camera) if paired else camera_numbers(camera)
+    angle = 2.0 * np.pi * np.arange(shape.samples) / shape.samples
+    angle = np.concatenate([angle[0::2], angle[1::2]])
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    radii = shape.inner_radius_m, shape.outer_radius_m
+    outlines = _Outlines(*radii, unit, paired, float(shape.apart_px))
     candidate = pixels_within(down, shape.border_px, shape.far_limit_m_per_px)
     step = np.fmax(np.ceil(shape.stride_m / down), 1.0)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
@@ -116,7 +123,7 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     for row in np.flatnonzero(candidate.any(axis=1)).tolist():
         across = np.flatnonzero(candidate[row])
         centres = floor_xy[row, across], down[row, across]
-        seen = _sample_pixels(numbers, camera.width, camera.height, *centres, shape)
+        seen = _sample_pixels(numbers, camera.width, camera.height, *centres, outlines)
         inside = np.count_nonzero(seen < camera.height * camera.width, axis=1).min(axis=1)
         usable = np.flatnonzero(inside >= enough)
         kept = usable[_strided(across[usable], step[row, across[usable]])]
@@ -130,33 +137,45 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     )
 
 
+class _Outlines(NamedTuple):
+    """Positions of the samples relative to a centre."""
+
+    inner: float  # radii, metres
+    outer: float
+    unit: FloatArray  # (K, 2) directions, every second one first
+    paired: bool  # whether samples count in pairs, which are moved apart if on the same pixel
+    apart_px: float
+
+
+@kernel()
 def _sample_pixels(
     numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, down: FloatArray,
-    shape: DiscShape,
+    outlines: _Outlines,
 ) -> NDArray[np.uint32]:  # fmt: skip
     """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
-    outside, paired = width * height, shape.least_pairs > 0
-    least = 0.0 if paired else -0.5
-    angle = 2.0 * np.pi * np.arange(shape.samples) / shape.samples
-    angle = np.concatenate([angle[0::2], angle[1::2]])
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-    def pixels_of(radii: FloatArray) -> IntArray:
-        """(N, K, 2) for (1 or N, 1, 2) radii of both outlines."""
-        xy = centre_xy[:, None, None] + radii[..., None] * unit[:, None]
-        pixels = project_floor_points(numbers, xy.reshape(-1, 2)).reshape(xy.shape)
-        inside = np.all((pixels >= least) & (pixels + 0.5 < [width, height]), axis=-1)
-        column, row = np.moveaxis(np.where(inside[..., None], pixels + 0.5, 0.0).astype(int), -1, 0)
-        return np.where(inside, row * width + column, outside)
-
-    radii = np.array([[[shape.inner_radius_m, shape.outer_radius_m]]])
-    pixel = pixels_of(radii)
-    if paired:
-        alike = (pixel[..., :1] == pixel[..., 1:]) & (pixel[..., :1] < outside)
-        apart = shape.apart_px * down[:, None, None] * np.array([-1.0, 1.0])
-        pixel = np.where(alike, pixels_of(radii + apart), pixel)
-        pixel[(pixel == outside).any(axis=-1)] = outside
-    return pixel.astype(np.uint32)
+    outside = width * height
+    samples = np.empty((len(centre_xy), len(outlines.unit), 2), np.uint32)
+    least = 0.0 if outlines.paired else -0.5
+    radius = np.empty(2)
+    pixel = np.empty(2, np.int64)
+    for i in range(len(centre_xy)):
+        for k in range(len(outlines.unit)):
+            radius[0], radius[1] = outlines.inner, outlines.outer
+            for _ in range(2):
+                for j in range(2):
+                    x = centre_xy[i, 0] + radius[j] * outlines.unit[k, 0]
+                    y = centre_xy[i, 1] + radius[j] * outlines.unit[k, 1]
+                    u, v = project_floor_point(numbers, x, y)
+                    inside = u >= least and v >= least and u + 0.5 < width and v + 0.5 < height
+                    pixel[j] = int(v + 0.5) * width + int(u + 0.5) if inside else outside
+                if not (outlines.paired and pixel[0] == pixel[1] and pixel[0] < outside):
+                    break
+                radius[0] -= outlines.apart_px * down[i]
+                radius[1] += outlines.apart_px * down[i]
+            if outlines.paired and (pixel[0] == outside or pixel[1] == outside):
+                pixel[:] = outside
+            samples[i, k, 0], samples[i, k, 1] = pixel[0], pixel[1]
+    return samples
 
 
 def size_down(floor_xy: FloatArray) -> FloatArray:
