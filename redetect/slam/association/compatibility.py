@@ -57,11 +57,11 @@ def compatible(
     innovations, predicted_covariance, noise = arrays
     n, _, width = innovations.shape
     squared = individual_distances(innovations, predicted_covariance, noise)
-    gates = chi_squared_gates(gate_probability, width, n)
+    gates = chi_squared_gates(gate_probability, width, max(n, 1))
     if method == "nearest":
-        return pair_nearest_first(squared, gates[1] if n else 0.0)
+        return pair_nearest_first(squared, gates[1])
     candidates = np.argsort(squared, axis=1, kind="stable")
-    counts = np.sum(squared <= gates[1], axis=1) if n else np.zeros(0, np.int64)
+    counts = np.sum(squared <= gates[1], axis=1)
     # Rows with few candidates first, since they constrain the search most.
     rows = np.argsort(counts, kind="stable")
     rows = rows[counts[rows] > 0]
