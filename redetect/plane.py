@@ -20,6 +20,14 @@ def rotation(theta_rad: ArrayLike) -> FloatArray:
     return np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
 
 
+def with_heading(matrices: FloatArray) -> FloatArray:
+    """(..., 3, 3) from (..., 2, 2) for a pose's position, with 1 for its heading."""
+    whole = np.zeros((*matrices.shape[:-2], 3, 3))
+    whole[..., :2, :2] = matrices
+    whole[..., 2, 2] = 1.0
+    return whole
+
+
 def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
     """(..., 3) poses a_from_c; the heading is wrapped."""
     a, b = np.asarray(a_from_b, dtype=np.float64), np.asarray(b_from_c, dtype=np.float64)

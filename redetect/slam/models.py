@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
 from redetect.bounds import Bounded, NotNegative, Positive
-from redetect.plane import apply, between, rotation
+from redetect.plane import apply, between, rotation, with_heading
 from redetect.slam.errors import SlamError
 
 #: Typical height of the camera above the floor (m).
@@ -57,14 +57,6 @@ def move(pose: ArrayLike, step: ArrayLike) -> FloatArray:
     before, moved = np.broadcast_arrays(pose, step)
     xy, theta = apply(before, moved[..., :2]), (before + moved)[..., 2:]
     return np.concatenate([xy, theta], axis=-1, dtype=np.float64)
-
-
-def with_heading(matrices: FloatArray) -> FloatArray:
-    """(..., 3, 3) from (..., 2, 2) for a pose's position, with 1 for its heading."""
-    whole = np.zeros((*matrices.shape[:-2], 3, 3))
-    whole[..., :2, :2] = matrices
-    whole[..., 2, 2] = 1.0
-    return whole
 
 
 def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:

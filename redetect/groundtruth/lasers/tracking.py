@@ -36,7 +36,7 @@ from redetect.groundtruth.lasers.tracking_kernels import (
 from redetect.groundtruth.settings import LaserSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, compose, invert, rotation
+from redetect.plane import apply, compose, invert, rotation, with_heading
 
 # Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
@@ -433,8 +433,7 @@ def track_by_lasers(
             break
         moved_m += off_m
     if sigma_m > 0.5 * allowed_m:
-        turned = np.tile(np.eye(3), (len(sets), 1, 1))
-        turned[:, :2, :2] = rotation(track.poses[:, 2])
+        turned = with_heading(rotation(track.poses[:, 2]))
         covariances = track.covariances + turned @ by_outline @ np.swapaxes(turned, 1, 2)
         track = replace(track, outline_sigma_m=sigma_m, covariances=covariances)
     return track

@@ -20,7 +20,7 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import wrap_angle
-from redetect.plane import fitted, rotation
+from redetect.plane import fitted, rotation, with_heading
 from redetect.storage import write_bytes
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
@@ -222,8 +222,7 @@ def planar_alignment(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
 
 def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     """Poses, and their covariances, after a rigid motion (x, y, theta) of the world."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(motion[2])
+    turn = with_heading(rotation(motion[2]))
     covariances = None if poses.covariances is None else turn @ poses.covariances @ turn.T
     return PlanarPoses(poses.times_s, poses.poses @ turn.T + motion, covariances)
 

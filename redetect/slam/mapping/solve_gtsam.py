@@ -18,11 +18,10 @@ import numpy as np
 from redetect.landmarks import wrap_angle
 from redetect.least_squares.solver import Minimum
 from redetect.messages import imported_for
-from redetect.plane import rotation
+from redetect.plane import rotation, with_heading
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import Weighting, cost
-from redetect.slam.models import with_heading
 
 # Discs lie on the floor to a micrometre.
 _HEIGHT_ROOT_INFORMATION = 1e6
