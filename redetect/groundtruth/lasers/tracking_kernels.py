@@ -71,9 +71,7 @@ class NewReadings(NamedTuple):
 
     def where(self, chosen: BoolArray) -> NewReadings:
         """Those chosen."""
-        return NewReadings(
-            self.points[chosen], self.scanner[chosen], self.direction[chosen], self.range_m[chosen]
-        )
+        return NewReadings._make(each[chosen] for each in self)
 
 
 class OutlinePose(NamedTuple):
