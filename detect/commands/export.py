@@ -22,7 +22,7 @@ from detect.errors import DetectError
 from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
-from redetect.landmarks.columns import TABLES, TableName, Value, table_of, values_of
+from redetect.landmarks.columns import TABLE_OF, TABLES, TableName, Value, values_of
 from redetect.landmarks.frames import numbered_tilts, read_times
 from redetect.messages import counted, imported_for
 from redetect.storage import demand_place, write_whole
@@ -115,7 +115,7 @@ def read_tables(
             elif rate_hz is not None:
                 time_s = frame / rate_hz
         row = (frame, image, time_s, *values_of(record))
-        tables.setdefault(table_of(record), []).append(row)
+        tables.setdefault(TABLE_OF[type(record)], []).append(row)
     return dict(sorted(tables.items(), key=lambda table: (table[0] != named, table[0])))
 
 

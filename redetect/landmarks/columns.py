@@ -22,7 +22,8 @@ from redetect.landmarks.records import (
 Kind = Literal["text", "number", "whole number", "whole numbers"]
 TableName = Literal["steps", "circles", "lines", "markers", "tilts"]
 Value = str | float | int | tuple[int, ...] | None
-_TABLE_BY_TYPE: dict[type, TableName] = {
+#: The table to which a record belongs, by its type.
+TABLE_OF: dict[type, TableName] = {
     Step: "steps",
     CircleLandmark: "circles",
     LineLandmark: "lines",
@@ -121,11 +122,6 @@ _OWN_COLUMNS: dict[TableName, tuple[Column, ...]] = {
 }
 #: The columns of each table.
 TABLES = {name: (*FRAME_COLUMNS, *own) for name, own in _OWN_COLUMNS.items()}
-
-
-def table_of(record: Step | Landmark | FrameTilt) -> TableName:
-    """The table to which a record belongs."""
-    return _TABLE_BY_TYPE[type(record)]
 
 
 def values_of(record: Step | Landmark | FrameTilt) -> tuple[Value, ...]:
