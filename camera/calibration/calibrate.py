@@ -36,7 +36,6 @@ _WRONG_POINT = 8.0
 _FEWEST_POINTS = 8
 # Pictures that leave the ratio of the scales more uncertain than this leave it open.
 _ASPECT_SIGMA = 0.003
-_DEFAULT = CalibrationSettings()
 
 
 def largest_rms_px(width: int) -> float:
@@ -144,10 +143,7 @@ class Calibration:
 
 
 def calibrate(
-    views: Sequence[BoardView],
-    board: Board,
-    size: tuple[int, int],
-    settings: CalibrationSettings = _DEFAULT,
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
     """Calibrate a camera by views of a board, by the reprojection error.
 
