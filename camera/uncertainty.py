@@ -30,10 +30,10 @@ _BEARINGS = np.linspace(-np.pi, np.pi, 145)
 _ELEVATIONS = np.linspace(-0.7, 0.7, 57)
 
 
-def pixel_grid(width: int, height: int, columns: int = _COLUMNS, rows: int = _ROWS) -> FloatArray:
-    """(rows * columns, 2) pixels from corner to corner of an image."""
-    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, columns), np.linspace(0.0, height - 1.0, rows))
-    return np.stack([u, v], axis=-1).reshape(-1, 2)
+def pixel_grid(width: int, height: int) -> FloatArray:
+    """(37 * 49, 2) pixels from corner to corner of an image, row by row."""
+    columns, rows = np.linspace(0.0, width - 1.0, _COLUMNS), np.linspace(0.0, height - 1.0, _ROWS)
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
 def intrinsics_of(camera: Camera) -> FloatArray:

@@ -160,7 +160,7 @@ def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True)
 
     NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
     """
-    pixels = pixel_grid(camera.width, camera.height, 49, 37)
+    pixels = pixel_grid(camera.width, camera.height)
     rays = camera.unproject(pixels)
     rotation = np.eye(3)
     if rotate:
