@@ -12,14 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from camera.distortion import (
-    RADIUS_LIMIT,
-    Lens,
-    distorted_jacobian,
-    one_to_one_radius,
-    radial_factor,
-    tangential_shift,
-)
+from camera import distortion
 from camera.errors import CalibrationError
 from camera.model_checks import border_pixels
 from redetect.array_types import FloatArray
@@ -64,23 +57,23 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _BORDER_PLACES = 9
 
 
-def lens_of(intrinsics: FloatArray) -> Lens:
+def lens_of(intrinsics: FloatArray) -> distortion.Lens:
     """The distortion of an intrinsics vector."""
     a2, a3, b1, b2, b3, p1, p2, k1, k2, k3 = intrinsics[4:].tolist()
-    return Lens((a2, a3, b1, b2, b3), (k1, k2, k3), (p1, p2))
+    return distortion.Lens((a2, a3, b1, b2, b3), (k1, k2, k3), (p1, p2))
 
 
-def _normalised(lens: Lens, points_camera: FloatArray) -> FloatArray:
+def _normalised(lens: distortion.Lens, points_camera: FloatArray) -> FloatArray:
     """(N, 2) undistorted normalised coordinates of points; NaN where the lens does not see them."""
     z = points_camera[:, 2:]
     xy = points_camera[:, :2] / np.where(z > 0.0, z, np.nan)
-    within = np.hypot(xy[:, :1], xy[:, 1:]) <= one_to_one_radius(lens)
+    within = np.hypot(xy[:, :1], xy[:, 1:]) <= distortion.one_to_one_radius(lens)
     return np.where(within, xy, np.nan)
 
 
-def _distorted(lens: Lens, xy: FloatArray) -> FloatArray:
-    factor = radial_factor(np.hypot(xy[:, 0], xy[:, 1]), lens)
-    return np.asarray(xy * factor[:, None] + tangential_shift(xy, lens.tangential))
+def _distorted(lens: distortion.Lens, xy: FloatArray) -> FloatArray:
+    factor = distortion.radial_factor(np.hypot(xy[:, 0], xy[:, 1]), lens)
+    return np.asarray(xy * factor[:, None] + distortion.tangential_shift(xy, lens.tangential))
 
 
 def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
@@ -118,7 +111,7 @@ def project_points(
     by_intrinsics[:, :, [10, 9]] = scale[:, None] * by_q
     by_intrinsics[:, :, 11:14] = by_factor * (r[:, None] ** [2, 4, 6])[:, None, :]
 
-    by_xy = scale[:, None] * distorted_jacobian(xy, lens)
+    by_xy = scale[:, None] * distortion.distorted_jacobian(xy, lens)
     by_depth = -by_xy @ xy[:, :, None]
     by_point = np.concatenate([by_xy, by_depth], axis=-1) / points_camera[:, 2, None, None]
     return scale * seen + offset, by_intrinsics, by_point
@@ -148,16 +141,16 @@ def _is_within(
 ) -> bool:
     """Whether the image, enlarged by a margin, is within a share of the largest radius."""
     lens = lens_of(intrinsics)
-    r = share * min(one_to_one_radius(lens), RADIUS_LIMIT)
+    r = share * min(distortion.one_to_one_radius(lens), distortion.RADIUS_LIMIT)
     border = (border_pixels(width, height, _BORDER_PLACES) - intrinsics[2:4]) / intrinsics[:2]
     reach = _reach(r, lens, border)
     return bool(np.all(np.hypot(border[:, 0], border[:, 1]) * (1.0 + margin) < reach))
 
 
-def _reach(r: float, lens: Lens, towards: FloatArray) -> FloatArray:
+def _reach(r: float, lens: distortion.Lens, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
     if not any(lens.tangential):  # the same in all directions
-        return np.asarray(r * radial_factor(np.array(r), lens))
+        return np.asarray(r * distortion.radial_factor(np.array(r), lens))
     edge = _distorted(lens, r * _DIRECTIONS)
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),

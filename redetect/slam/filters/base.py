@@ -21,6 +21,7 @@ from redetect.bounds import PROBABILITY, Bounded
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import Path2D
 from redetect.plane import apply, rotation
+from redetect.slam import models
 from redetect.slam.association.compatibility import (
     chi_squared_gates,
     compatible,
@@ -28,13 +29,6 @@ from redetect.slam.association.compatibility import (
 )
 from redetect.slam.association.registration import GlobalPose
 from redetect.slam.errors import SlamError
-from redetect.slam.models import (
-    common_tilt_jacobian,
-    disc_in_robot,
-    move,
-    move_jacobians,
-    tilt_jacobian,
-)
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import DEFAULT_GATE_PROBABILITY, Association
 
@@ -187,8 +181,8 @@ class Filter(ABC):
     def predict(self, step: FloatArray, noise: FloatArray) -> None:
         """Predict the pose after an odometry step (3,) of covariance (3, 3)."""
         at = self._linearised
-        pose = move(self._state[_POSE], step)
-        by_pose, by_step = move_jacobians(self._state[_POSE], step)
+        pose = models.move(self._state[_POSE], step)
+        by_pose, by_step = models.move_jacobians(self._state[_POSE], step)
         by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
         self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose)
 
@@ -215,16 +209,16 @@ class Filter(ABC):
         numbers = np.concatenate([self._moving, of_discs.ravel(), of_lines.ravel()])
         first = len(self._moving)
         jacobian = np.zeros((2 * d + e, len(numbers)))
-        seen = disc_in_robot(pose, self._state[of_discs])
+        seen = models.disc_in_robot(pose, self._state[of_discs])
         if self._tilt.stop > self._tilt.start:
-            jacobian[: 2 * d, self._tilt] = common_tilt_jacobian(seen).reshape(-1, 2)
+            jacobian[: 2 * d, self._tilt] = models.common_tilt_jacobian(seen).reshape(-1, 2)
         by_disc = np.zeros((d, 2, d, 2))
         by_disc[np.arange(d), :, np.arange(d)] = turn.T
         jacobian[: 2 * d, first : first + 2 * d] = by_disc.reshape(2 * d, 2 * d)
         jacobian[: 2 * d, :2] = np.tile(-turn.T, (d, 1))
         sway = np.zeros((len(jacobian), 2))
         if self.tilt_sigma_rad:
-            sway[: 2 * d] = self.tilt_sigma_rad * tilt_jacobian(seen).reshape(-1, 2)
+            sway[: 2 * d] = self.tilt_sigma_rad * models.tilt_jacobian(seen).reshape(-1, 2)
         bearing = np.zeros(0)
         if e:
             points, by_numbers = self.line_points(of_lines)

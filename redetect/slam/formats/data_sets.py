@@ -33,14 +33,7 @@ from redetect.landmarks.axes import covariance_from_dataset, to_dataset
 from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
 from redetect.plane import apply, between, chain_steps, compose, invert
 from redetect.slam.errors import SlamError
-from redetect.slam.formats.ranges import (
-    Noise,
-    Sightings,
-    discs_of_ranges,
-    estimate_noise,
-    places_of,
-    with_noise,
-)
+from redetect.slam.formats import ranges
 from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.storage.bounded import read_content, rows_of_numbers
 
@@ -138,7 +131,7 @@ class _Log(NamedTuple):
         return rows, np.maximum(times - self.times[rows], 0.0)
 
 
-def _seen_by_robot(odometry: Path, *, calibrated: bool) -> Sightings:
+def _seen_by_robot(odometry: Path, *, calibrated: bool) -> ranges.Sightings:
     """The measurements beside a robot's odometry; sightings of other robots are ignored.
 
     Calibrated ones have ranges instead of depths, still too long.
@@ -168,7 +161,7 @@ def _seen_by_robot(odometry: Path, *, calibrated: bool) -> Sightings:
                 "odometry as they are"
             )
         range_m = range_m / np.cos(bearing_rad)
-    return Sightings(times, frame, range_m, bearing_rad, ids[order])
+    return ranges.Sightings(times, frame, range_m, bearing_rad, ids[order])
 
 
 class Response(NamedTuple):
@@ -200,7 +193,7 @@ def read_robot(
     sigma_rad: float | None = None,
     *,
     calibrated: bool = True,
-) -> tuple[Recording, Response | None, Noise | None]:
+) -> tuple[Recording, Response | None, ranges.Noise | None]:
     """A robot's log, with landmarks as discs; `SlamError` if a file cannot be used.
 
     Calibrated, steps are as the robot follows its commands (`response_of`), not as commanded, and
@@ -225,22 +218,22 @@ def read_robot(
         places = np.full((len(seen.ids), 2), np.nan)
         if (file := odometry.with_name(LANDMARKS)).exists():
             true = read_landmarks(file).discs
-            places = places_of(seen.ids, true.ids, true.xy)
+            places = ranges.places_of(seen.ids, true.ids, true.xy)
         response = response_of(velocity, seen, sigma, places)
         seen = seen._replace(range_m=seen.range_m / response.depth)
         log = _driven_by(velocity, response)
     steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
+    rows = ranges.discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
     run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
     if calibrated and sigma_m is None and sigma_rad is None:
-        run, noise = estimate_noise(run, seen, sigma)
+        run, noise = ranges.estimate_noise(run, seen, sigma)
     elif calibrated and sigma_m is None:
-        run = with_noise(run, seen, sigma)
+        run = ranges.with_noise(run, seen, sigma)
     return run, response, noise
 
 
 def response_of(
-    velocity: FloatArray, seen: Sightings, sigma: FloatArray, places: FloatArray
+    velocity: FloatArray, seen: ranges.Sightings, sigma: FloatArray, places: FloatArray
 ) -> Response:
     """How a robot follows its commands and measures depths, as the landmarks show it.
 
@@ -424,7 +417,7 @@ def read_drive(
     frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
     of_ranges = _RAW_SIGMA_M if sigma_m is None else sigma_m
     of_bearings = _RAW_SIGMA_RAD if sigma_rad is None else sigma_rad
-    rows = discs_of_ranges(trees[:, 0], trees[:, 1], of_ranges, of_bearings)
+    rows = ranges.discs_of_ranges(trees[:, 0], trees[:, 1], of_ranges, of_bearings)
     log = _driven(time / 1000.0, speed, steering)
     steps = log.steps(np.append(log.times[0], times))
     return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
