@@ -21,7 +21,7 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.least_squares.solver import Block, normal_equations, stack
-from redetect.plane import apply, between, chain_steps, compose, invert, log_motion, rotation
+from redetect.plane import apply, between, compose, invert, log_motion, rotation
 from redetect.slam.association.loops import (
     SHARED_BY_ONE_PLACE,
     SUBMAP_FRAMES,
@@ -79,20 +79,19 @@ def solve_path(
     recording: Recording,
     circle_labels: IntArray,
     line_labels: IntArray,
-    path: FloatArray | None = None,
+    path: FloatArray,
     line_xy: FloatArray | None = None,
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
     sigma_scale: float = 1.0,
 ) -> LabelledMap:
-    """Least squares over all poses and landmarks, from a path (by default odometry) on.
+    """Least squares over all poses and landmarks, from a path (N + 1, 3) on.
 
     Labels count from 0 without gaps. Lines have their initial positions `line_xy` (L, 2) as priors;
     rows of lines with NaN are ignored, without `line_xy` all rows of lines. `sigma_scale` is a
     factor on the discs' standard deviations.
     """
     circles, lines = recording.circles, recording.lines
-    poses = chain_steps(recording.steps) if path is None else path
     places = np.full((int(line_labels.max(initial=-1)) + 1, 2), np.nan)
     if line_xy is not None:
         places[:] = line_xy
@@ -104,10 +103,10 @@ def solve_path(
     )
     graph = with_lines(graph_of_recording(labelled), labelled.lines, np.flatnonzero(known))
     graph = replace(graph, camera_xy=np.asarray(camera_xy, np.float64), line_prior=places[known])
-    seen = apply(poses[graph.disc_pose], graph.disc_xy)
+    seen = apply(path[graph.disc_pose], graph.disc_xy)
     totals = [np.bincount(graph.disc_index, seen[:, a], len(graph.disc_ids)) for a in (0, 1)]
     disc_xy = np.stack(totals, axis=-1) / graph.disc_row_counts[:, None]
-    start = Estimate(poses, disc_xy, places[known])
+    start = Estimate(path, disc_xy, places[known])
     minimum = solve(graph, start, Weighting(loss="huber"), tolerance=_TOLERANCE)
     found = minimum.at
     places[known] = found.line_xy

@@ -182,17 +182,15 @@ class _Run(NamedTuple):
         return loops.submaps_of(self.frames, at.labels, at.xy, count, length=length, **limits)
 
     def solved(self, labels: IntArray, path: FloatArray | None) -> _Solved:
-        recording, none, line_xy = self.recording, np.zeros(0, dtype=np.int64), None
-        if not self.by_discs:
-            start = chain_steps(recording.steps) if path is None else path
-            line_xy = intersect_bearings(recording, start, labels, camera_xy=self.camera_xy)
-        discs, lines = (labels, none) if self.by_discs else (none, labels)
-        scale, camera_xy = self.settings.sigma_scale, self.camera_xy
-        found = solve_path(
-            recording, discs, lines, path, line_xy, camera_xy=camera_xy, sigma_scale=scale
-        )
-        xy = found.circle_xy if self.by_discs else found.line_xy
-        return _Solved(labels, found.path, xy, found.cost)
+        recording, none, camera_xy = self.recording, np.zeros(0, dtype=np.int64), self.camera_xy
+        start = chain_steps(recording.steps) if path is None else path
+        if self.by_discs:
+            scale = self.settings.sigma_scale
+            found = solve_path(recording, labels, none, start, sigma_scale=scale)
+            return _Solved(labels, found.path, found.circle_xy, found.cost)
+        line_xy = intersect_bearings(recording, start, labels, camera_xy=camera_xy)
+        found = solve_path(recording, none, labels, start, line_xy, camera_xy=camera_xy)
+        return _Solved(labels, found.path, found.line_xy, found.cost)
 
 
 def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
