@@ -96,10 +96,7 @@ def _pairs_of_equal_length(moved: FloatArray, unsorted: FloatArray) -> _EqualPai
 
 @kernel()
 def _agreement(
-    moved: FloatArray,
-    motion: tuple[float, float, float, float],
-    equal: _EqualPairs,
-    enough: int,
+    moved: FloatArray, motion: tuple[float, float, float, float], equal: _EqualPairs, enough: int
 ) -> tuple[int, float]:
     """Number of landmarks that a motion puts on others, and their squared distances' sum (m^2).
 
