@@ -400,8 +400,6 @@ def _merged_lines(
     camera_xy: ArrayLike,
 ) -> IntArray:
     """Labels of lines, those at the same position in the map merged, -1 for clutter."""
-    if len(labels) == 0:
-        return labels
     for _ in range(_MOST_ROUNDS):
         xy = intersect_bearings(recording, path, labels, camera_xy=camera_xy)
         submaps = loops.submaps_of(recording.lines.frame, labels, xy, len(recording))
