@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -90,10 +91,7 @@ def perform_calibrate(options: Calibrate) -> int:
         polynomial=_WHETHER[options.polynomial],
         keep_outliers=options.keep_outliers,
     )
-
-    def images() -> Iterator[tuple[str, GreyImage]]:
-        return calibration_images(options.images, options.max_images)
-
+    images = partial(calibration_images, options.images, options.max_images)
     if board.kind == "checkerboard":
         board = true_board(images(), board)
     views, size = find_views(images(), board)

@@ -16,10 +16,7 @@ from redetect.groundtruth.validation import scoring
 def perform(command: Score) -> int:
     """Carry out ``groundtruth score``; returns the exit code."""
     check_outputs((command.json,), command.force)
-    solution, truth = (
-        streams.read_planar_poses(command.poses),
-        streams.read_planar_poses(command.truth),
-    )
+    solution, truth = map(streams.read_planar_poses, (command.poses, command.truth))
     relations = None if command.relations is None else scoring.read_relations(command.relations)
     poses, truth, unmatched = streams.matched_streams(
         solution, truth, largest_gap_s=command.largest_gap_s, interpolate=command.interpolate

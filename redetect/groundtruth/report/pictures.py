@@ -367,7 +367,6 @@ def draw_errors(errors: ReferenceErrors, score: PoseScore) -> bytes:
             low, high = axes.get_ylim()
             axes.set_ylim(low, high + 0.22 * (high - low))  # space for the legend
             axes.legend(loc="upper center", ncols=4, fontsize=8, framealpha=0.9)
-
     return content.getvalue()
 
 
