@@ -1,16 +1,11 @@
 """Reference poses of a robot at rest from distances of points on it to surveyed points.
 
-``fiducials.json`` lists both kinds of points; ``distances.csv`` has the head
-``pose,t,point,fiducial,distance_m`` and a row per distance, measured while the robot was at rest.
-
 All minima are searched, from starts in all directions, because distances to two points, or to
 points on a line, also fit mirrored poses. A pose is accepted only if it is determined, no other
 fits nearly as well, and its distances agree within their noise.
 
-Tape measurements in the building are compared with the drawing: ``dimensions.csv`` has the head
-``name,x1_m,y1_m,x2_m,y2_m,measured_m`` and a row for each distance between two points of the
-drawing; ``fiducial_distances.csv`` has the head ``a,b,distance_m`` and a row for each distance
-between two fiducials.
+Tape measurements in the building are compared with the drawing: distances between two points of it,
+and between two fiducials. All files have a row per distance (docs/groundtruth/sessions.md).
 """
 
 from __future__ import annotations
