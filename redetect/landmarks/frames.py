@@ -1,17 +1,8 @@
-"""Files with a row per frame: its tilt, from the building's verticals, or its time.
-
-Tilt files; ``#`` comments and blank lines are skipped:
-
-    TILT <image> <pitch> <roll> <cPP> <cPR> <cRR> <lines>
-    NOTILT <image> <lines>
-    TILT_D <image> <pitch> <roll> <cPP> <cPR> <cRR> <discs>
+"""Files with a row per frame: its tilt, by the building's verticals, or its time (docs/formats.md).
 
 Pitch and roll (radians) are the rotation vector (pitch, roll, 0) about the robot's X and Y axes
-that levels measured directions; its covariance and the number of verticals that agree with it
-follow. A frame with too few of them has a NOTILT row. A TILT_D row after either is the same
-frame's tilt from the outlines of discs; readers of tilts skip it.
-
-Files of times have a row ``<image> <seconds>`` for each frame, with ``#`` comments.
+that levels measured directions. A frame with too few verticals has a NOTILT row. A TILT_D row after
+either is the same frame's tilt from the outlines of discs; readers of tilts skip it.
 """
 
 from __future__ import annotations

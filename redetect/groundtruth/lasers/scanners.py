@@ -1,13 +1,8 @@
 """Planar laser scanners, the robot that they see, their scans over time, and the files.
 
-``scanners.json``, ``robot.json``
-    If a scanner's beams are symmetric, as SICK's are, its x axis is along its middle beam; beams
-    are counted counter-clockwise. Poses of fixed scanners are in the world, those of scanners on
-    board in the robot's frame.
-``<name>.scans.npz``
-    `times_s` (N,) float64 and `ranges_mm` (N, readings) uint16, nothing pickled.
-``<name>.scans.csv``, ``<name>.scans.csv.gz``
-    rows t, r0, r1, ... in seconds and metres, optionally with a running number before t.
+If a scanner's beams are symmetric, as SICK's are, its x axis is along its middle beam; beams are
+counted counter-clockwise. Poses of fixed scanners are in the world, those of scanners on board in
+the robot's frame. The files are described in docs/groundtruth/sessions.md.
 """
 
 from __future__ import annotations

@@ -1,16 +1,4 @@
-"""Checkerboards, and ``boards.json``, which lists the images and the board in each.
-
-::
-
-    {"boards": {"first": {"columns": 7, "rows": 6, "square_m": 0.11}, "second": {...},
-                "world": {...}},
-     "world_from_board": {"translation_m": [...], "quaternion_xyzw": [...]},
-     "first_from_second": {"translation_m": [...], "quaternion_xyzw": [...], "sigmas": [...]},
-     "images": [{"camera": "a", "image": "a/images/0001.png", "placement": 0, "board": "first"}]}
-
-``first`` and ``second`` are the double board; ``first_from_second`` may have ``sigmas`` or a
-``covariance``, and is estimated if absent. Images of one placement were taken without moving the
-board. A camera's calibration is ``<camera>/<camera>.cam`` beside the file.
+"""Checkerboards, and ``boards.json`` (docs/groundtruth.md), which lists the images of each.
 
 A board's frame is that of `camera.boards.board`: origin at the middle of its inner corners, x
 right, y up, z out of the print, oriented so that the top left square is black. With one even and
