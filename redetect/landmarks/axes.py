@@ -1,13 +1,9 @@
-"""Axes of the data set's robot, and those of other tools.
+"""Axes of the data set's robot, X left and Y backward, and those of other tools, X forward, Y left.
 
-The data set's robot has X left and Y backward; other tools expect X forward and Y left. A rotation
-about Z by 90 degrees, ``p_robotics = Rz p_dataset`` with ``(x, y) -> (-y, x)``, converts the first
-to the second. It is applied to both the robot's frame and the map's: a pose or step T becomes
-Rz T Rz^-1, that is, its position is rotated and its angle is unchanged. Covariances become
-Rz C Rz^T; if only the means were rotated, ellipses would have the wrong orientation. Bearings are
-0 forward, positive to the left, in both.
-
-Only numbers and signs are exchanged, without rounding: the conversion back gives the same bits.
+A rotation about Z by 90 degrees, ``(x, y) -> (-y, x)``, converts the first to the second, both the
+robot's frame and the map's (docs/slam/formats.md): positions and covariances are rotated, angles
+and bearings stay. Only numbers and signs are exchanged, without rounding: the conversion back gives
+the same bits.
 """
 
 from __future__ import annotations

@@ -1,15 +1,10 @@
-"""A run as a g2o graph, written and read: poses, discs, steps of odometry, measurements of discs.
+"""A run as a g2o graph, written and read: poses, discs and their measurements.
 
-Rows are ``VERTEX_SE2 number x y theta``, ``VERTEX_XY number x y``, ``EDGE_SE2 from to dx dy dphi``
-and ``EDGE_SE2_XY pose disc x y``, edges with the upper triangle of their information matrix row by
-row, and ``FIX`` of the first pose; X forward, Y left. Poses are numbered from 0, the start; disc n
-is vertex B + n, where B is the smallest power of ten above the last pose's number.
-
-The error of an EDGE_SE2 is measured in the axes at the *end* of the step, (measured)^-1 * (from^-1
-* to), while the covariance of a STEP row is of dx and dy in the axes before it: the information is
-rotated by dphi, so that a graph's error equals that of this project's models.
-
-Comments are at the end: GTSAM's reader ignores all edges after the first unknown row.
+Rows are described in docs/slam/formats.md. The error of an EDGE_SE2 is measured in the axes at the
+*end* of the step, (measured)^-1 * (from^-1 * to), while the covariance of a STEP row is of dx and
+dy in the axes before it: the information is rotated by dphi, so that a graph's error equals that of
+this project's models. Comments are at the end: GTSAM's reader ignores all edges after the first
+unknown row.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Tables of a run for GTSAM, MRPT and the like.
+"""Tables of a run for GTSAM, MRPT and the like, with columns as in docs/slam/formats.md.
 
-``odometry.csv`` has each step with two covariances: in the axes before the step, as in the data
-set's rows and MRPT's Gaussian poses, and in the axes at its end (``end_``), as for the errors of
-GTSAM's BetweenFactorPose2 and g2o's EDGE_SE2. ``discs.csv`` and ``bearings.csv`` have the
-measurements, with steps counted from 1.
+Steps have two covariances: in the axes before the step, as in the data set's rows and MRPT's
+Gaussian poses, and in those at its end (``end_``), as for the errors of GTSAM's BetweenFactorPose2
+and g2o's EDGE_SE2.
 """
 
 from __future__ import annotations
