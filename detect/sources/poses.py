@@ -128,7 +128,7 @@ class PosesOverTime:
     def __init__(self, poses: Iterator[TimedPose], stream: PoseStream) -> None:
         self._poses, self._name, self._of_arcs = poses, stream.name, stream.of_arcs
         self.jumps = self.jumped = False  # now, and since the last step
-        self._way_m = self._turn_rad = 0.0
+        self._distance_m = self._turn_rad = 0.0
         self._longest_s = LARGEST_GAP_S
         self._before: TimedPose | None = None
         self._after = next(poses, None)
@@ -145,7 +145,7 @@ class PosesOverTime:
             self._before, self._after = self._after, next(self._poses, None)
             if self._after is None:
                 break
-            way_m = math.hypot(self._after.x - self._before.x, self._after.y - self._before.y)
+            distance_m = math.hypot(self._after.x - self._before.x, self._after.y - self._before.y)
             turn_rad = abs(self._after.theta - self._before.theta)
             seconds = self._after.time_s - self._before.time_s
             if seconds < 0.0:
@@ -159,11 +159,11 @@ class PosesOverTime:
                     "nanoseconds"
                 )
             fastest = _FASTEST * max(seconds, 1e-3)
-            is_reset = way_m > max(fastest, _FARTHER * self._way_m)
+            is_reset = distance_m > max(fastest, _FARTHER * self._distance_m)
             is_reset |= turn_rad > max(fastest, _FARTHER * self._turn_rad)
             self.jumps = is_reset or (self._of_arcs and seconds > self._longest_s)
             self.jumped = self.jumped or self.jumps
-            self._way_m, self._turn_rad = way_m, turn_rad
+            self._distance_m, self._turn_rad = distance_m, turn_rad
         before, after = self._before, self._after
         if before is None or after is None:  # before the first pose, or after the last one
             end = after or before
@@ -195,8 +195,8 @@ def tick_poses(
 
     def arcs() -> Iterator[_Arc]:
         rows = list(rows_of_numbers(path, "file of wheel ticks", "t left right", DetectError))
-        ways = metres_per_tick * _ticks(np.reshape([row[1:] for _, row in rows], (-1, 2)))
-        for (place, row), (left, right) in zip(rows, ways.tolist()):
+        driven = metres_per_tick * _ticks(np.reshape([row[1:] for _, row in rows], (-1, 2)))
+        for (place, row), (left, right) in zip(rows, driven.tolist()):
             yield _Arc(place, row[0], 0.5 * (left + right), (right - left) / wheel_base_m)
 
     return _poses_along(arcs())
@@ -229,7 +229,7 @@ class _Arc(NamedTuple):
 
     place: str
     time_s: float
-    way_m: float
+    distance_m: float
     turn_rad: float
     sigma_m: float = 0.0  # of either coordinate
     sigma_rad: float = 0.0  # of the heading
@@ -240,8 +240,11 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
     for place, time_s, *movement in arcs:
         if not max(map(abs, movement)) <= FARTHEST:
             raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
-        way_m, turn_rad, sigma_m, sigma_rad = movement
-        chord, middle = way_m * float(np.sinc(turn_rad / math.tau)), pose.theta + 0.5 * turn_rad
+        distance_m, turn_rad, sigma_m, sigma_rad = movement
+        chord, middle = (
+            distance_m * float(np.sinc(turn_rad / math.tau)),
+            pose.theta + 0.5 * turn_rad,
+        )
         dx, dy = chord * math.cos(middle), chord * math.sin(middle)
         after = TimedPose(time_s, pose.x + dx, pose.y + dy, pose.theta + turn_rad)
         # Errors of the heading arise all along the way: the mean of their effects, and its scatter.

@@ -34,10 +34,10 @@ class OdometryNoise(Bounded, error=SlamError):
 
     def covariance(self, steps: FloatArray) -> FloatArray:
         """(N, 3, 3) covariances of (N, 3) steps dx, dy (m), dphi (rad)."""
-        way, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
-        of_way = (self.per_metre * way) ** 2 + self.least_m**2
-        of_turn = (self.per_radian * turn) ** 2 + (self.turn_per_metre * way) ** 2
-        diagonal = np.stack([of_way, of_way, of_turn + self.least_rad**2], axis=-1)
+        distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
+        of_distance = (self.per_metre * distance) ** 2 + self.least_m**2
+        of_turn = (self.per_radian * turn) ** 2 + (self.turn_per_metre * distance) ** 2
+        diagonal = np.stack([of_distance, of_distance, of_turn + self.least_rad**2], axis=-1)
         return np.asarray(diagonal[:, :, None] * np.eye(3))
 
     def sentence(self) -> str:
@@ -76,9 +76,9 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
     """
     before, moved = np.broadcast_arrays(pose, step)
     turn = rotation(before[..., 2])
-    way = np.einsum("...ij,...j->...i", turn, moved[..., :2])
+    shift = np.einsum("...ij,...j->...i", turn, moved[..., :2])
     by_pose = with_heading(np.broadcast_to(np.eye(2), turn.shape))
-    by_pose[..., 0, 2], by_pose[..., 1, 2] = -way[..., 1], way[..., 0]
+    by_pose[..., 0, 2], by_pose[..., 1, 2] = -shift[..., 1], shift[..., 0]
     return by_pose, with_heading(turn)
 
 

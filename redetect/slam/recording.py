@@ -119,9 +119,9 @@ class Recording:
     @property
     def lost(self) -> IntArray:
         """Steps whose odometry gives no information on the robot's motion."""
-        way = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
+        position = np.linalg.eigvalsh(self.step_covariance[:, :2, :2])[:, -1]
         turn = self.step_covariance[:, 2, 2]
-        return np.flatnonzero((way > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
+        return np.flatnonzero((position > MOST_STEP_SIGMA_M**2) | (turn > MOST_STEP_SIGMA_RAD**2))
 
     @property
     def common_tilt_variance(self) -> float:

@@ -1,4 +1,4 @@
-"""The clocks' offset to a tenth of a second, from turns and ways over a second at many offsets.
+"""The clocks' offset to a tenth of a second, from turns and distances in a second at many offsets.
 
 The refinement of the clock needs a start within a second. Offsets of many seconds, and robots that
 hardly turn, are found here: the movements of both streams are compared at all offsets of a grid. An
@@ -24,9 +24,9 @@ _FEWEST_SAMPLES = 20
 _LONGEST_SESSION_S = 1e6
 # Movements are not interpolated over longer gaps, or this many of a stream's usual intervals.
 _LONGEST_GAP_S, _INTERVALS = 1.0, 3.0
-# Errors of odometry's turns and ways, as a share of what is usual in the ground truth.
+# Errors of odometry's turns and distances, as a share of what is usual in the ground truth.
 _SHARE = 0.1
-_LEAST_TURN_RAD, _LEAST_WAY_M = 1e-3, 1e-3
+_LEAST_TURN_RAD, _LEAST_DISTANCE_M = 1e-3, 1e-3
 # Least duration of the parts before and after the clock was set, and least step (s).
 _LEAST_PART_S, _LEAST_JUMP_S = 10.0, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
@@ -67,7 +67,7 @@ def best_split(
 
 @dataclass(frozen=True, eq=False)
 class Movements:
-    """Turns (rad) and ways (m) over windows of a second, on a grid of times."""
+    """Turns (rad) and distances (m) over windows of a second, on a grid of times."""
 
     first: int  # Step of the grid, since time 0, of the first one
     values: FloatArray  # (N, 2)
@@ -172,11 +172,11 @@ class OffsetSearch:
             return None
         values = np.concatenate([one.values[one.known] for one in moved])
         noise = np.mean([one.noise for one in moved], axis=0) + self._own.noise
-        floor = np.array([_LEAST_TURN_RAD, _LEAST_WAY_M])
+        floor = np.array([_LEAST_TURN_RAD, _LEAST_DISTANCE_M])
         usual = np.sqrt(np.array([np.mean(values[:, 0] ** 2), np.var(values[:, 1])]))
         weights = 1.0 / (noise + (_SHARE * usual) ** 2 + floor**2)
-        # Odometry without ways, as from a gyroscope, has nothing to compare.
-        if np.max(self._own.values[self._own.known, 1]) < _LEAST_WAY_M:
+        # Odometry without distances, as from a gyroscope, has nothing to compare.
+        if np.max(self._own.values[self._own.known, 1]) < _LEAST_DISTANCE_M:
             weights[1] = 0.0
         stride = 1 + len(values) // _MOST_SAMPLES
         return _Compared(self._own, np.concatenate(at)[::stride], values[::stride], weights)

@@ -66,10 +66,10 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
     pauses of odometry, at the robot's usual rates.
     """
     arcs = log_motion(between(odometry.poses[:-1], odometry.poses[1:]))
-    way, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
+    distance, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
     turned, _ = _within(odometry.times_s, turn, _DISTINCT_OVER_S)
     distinct = np.where(np.abs(turned) > _DISTINCT_RAD, turn, 0.0)
-    arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, way, turn)])
+    arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, distance, turn)])
     last = len(odometry) - 2
     at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
     share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
@@ -112,22 +112,22 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
     return np.asarray(np.subtract(*ends)), to_s - from_s
 
 
-def _unseen(times_s: FloatArray, way: FloatArray, turn: FloatArray) -> FloatArray:
+def _unseen(times_s: FloatArray, distance: FloatArray, turn: FloatArray) -> FloatArray:
     """(N - 1, 4) distance and turn that pauses may hide beyond the arcs over them; usual ones."""
     paused = _paused(times_s)
-    hidden = np.zeros((len(way), 4))
+    hidden = np.zeros((len(distance), 4))
     if not np.any(paused) or np.all(paused):
         return hidden
     usual = []
-    for steps in (way, turn):
+    for steps in (distance, turn):
         total, passed = _within(times_s, steps, 0.5 * _USUAL_RATES_OVER_S)
         usual.append(float(np.quantile((np.abs(total) / passed)[~paused], _USUAL_RATES_QUANTILE)))
     passed = np.diff(times_s)[paused]
-    for column, (rate, steps) in enumerate(zip(usual, (way, turn))):
+    for column, (rate, steps) in enumerate(zip(usual, (distance, turn))):
         hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
         hidden[paused, 2 + column] = rate * passed
     # Some odometry is written on change only: if all digits are equal, the robot was at rest.
-    hidden[(way == 0.0) & (turn == 0.0)] = 0.0
+    hidden[(distance == 0.0) & (turn == 0.0)] = 0.0
     return hidden
 
 

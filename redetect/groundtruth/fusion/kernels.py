@@ -79,32 +79,32 @@ def predict(
     scale applies. `variances` (3,): accumulated noise along the path, across it (m^2) and of the
     turn (rad^2). `point` (6,): the state at which the movement is linearised.
     """
-    way = math.sqrt(control[0] * control[0] + control[1] * control[1])
+    distance = math.sqrt(control[0] * control[0] + control[1] * control[1])
     turn, distinct = control[2], control[3]
-    length = (1.0 + point[5]) * way
-    half = 0.5 * (turn + point[3] * distinct + point[4] * way)
+    length = (1.0 + point[5]) * distance
+    half = 0.5 * (turn + point[3] * distinct + point[4] * distance)
     chord, along, variance_along, variance_across, mean_cosine = arc_integrals(half)
     # The chord's direction in the world.
     cos, sin = math.cos(point[2] + half), math.sin(point[2] + half)
     east, north = cos, sin
-    if way > 0.0:
-        east = (cos * control[0] - sin * control[1]) / way
-        north = (sin * control[0] + cos * control[1]) / way
+    if distance > 0.0:
+        east = (cos * control[0] - sin * control[1]) / distance
+        north = (sin * control[0] + cos * control[1]) / distance
     # By the turn of the whole arc.
     by_turn_x = length * (along * east - 0.5 * chord * north)
     by_turn_y = length * (along * north + 0.5 * chord * east)
     f[0, 2] = -length * chord * north
     f[1, 2] = length * chord * east
-    f[0, 3], f[0, 4], f[0, 5] = distinct * by_turn_x, way * by_turn_x, way * chord * east
-    f[1, 3], f[1, 4], f[1, 5] = distinct * by_turn_y, way * by_turn_y, way * chord * north
-    f[2, 3], f[2, 4] = distinct, way
+    f[0, 3], f[0, 4], f[0, 5] = distinct * by_turn_x, distance * by_turn_x, distance * chord * east
+    f[1, 3], f[1, 4], f[1, 5] = distinct * by_turn_y, distance * by_turn_y, distance * chord * north
+    f[2, 3], f[2, 4] = distinct, distance
     x[0] += length * chord * east
     x[1] += length * chord * north
     for n in range(2, STATE):
         off = x[n] - point[n]
         x[0] += f[0, n] * off
         x[1] += f[1, n] * off
-    x[2] += turn + x[3] * distinct + x[4] * way
+    x[2] += turn + x[3] * distinct + x[4] * distance
     # f is the identity but for rows 0 to 2: p becomes f p f' row by row, then column by column.
     for j in range(STATE):
         p[0, j] += f[0, 2] * p[2, j] + f[0, 3] * p[3, j] + f[0, 4] * p[4, j] + f[0, 5] * p[5, j]

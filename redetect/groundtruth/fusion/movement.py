@@ -89,13 +89,13 @@ def _follow_from_end(
     count = len(odometry.controls)
     states, covariances = (v[begin : begin + count] for v in smoothed[:2])
     back, spreads = predicted_backward(odometry, states[-1], covariances[-1])
-    way = np.cumsum(np.hypot(odometry.controls[:, 0], odometry.controls[:, 1]))
-    way -= way[0]
-    half = int(np.searchsorted(way, 0.5 * way[-1])) + 1
+    driven = np.cumsum(np.hypot(odometry.controls[:, 0], odometry.controls[:, 1]))
+    driven -= driven[0]
+    half = int(np.searchsorted(driven, 0.5 * driven[-1])) + 1
     apart = pose_differences(back[1:-1, : kernels.POSE], states[1:-1, : kernels.POSE])
     states[half:-1], covariances[half:-1] = back[half:-1], spreads[half:-1]
     if kidnapped:
-        share = np.minimum(way, way[-1] - way)[1:-1] / max(way[-1], 1e-9)
+        share = np.minimum(driven, driven[-1] - driven)[1:-1] / max(driven[-1], 1e-9)
         other = share[:, None, None] * apart[:, :, None] * apart[:, None]
         covariances[1:-1, : kernels.POSE, : kernels.POSE] += other
 
@@ -257,21 +257,25 @@ class MovementProblem:
         """(N, 3) noise of movements to nodes: along the path, across it (m^2), of the turn (rad^2).
 
         `noise` (4,): see `redetect.groundtruth.fusion.inputs.noise_of`. All of it is proportional
-        to way, turn and time, so that it adds up over parts of a movement, except in pauses: there
-        odometry's systematic bend acts on an unknown way, and the lateral error of a wrong heading
-        is assumed to be that of a way out and back.
+        to distance, turn and time, so that it adds up over parts of a movement, except in pauses:
+        there odometry's systematic bend acts on an unknown path, and the lateral error of a wrong
+        heading is assumed to be that of a path out and back.
         """
-        along, across, by_turn, by_way = np.square(noise)
-        way, turn = np.hypot(self.controls[:, 0], self.controls[:, 1]), np.abs(self.controls[:, 2])
+        along, across, by_turn, by_distance = np.square(noise)
+        forward, left, turn = np.abs(self.controls[:, :3].T)
+        distance = np.hypot(forward, left)
         passed = np.concatenate([[0.0], np.diff(self.times_s)])
-        hidden_way, hidden_turn, anywhere, any_turn = self.unseen.T
-        bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_way)
-        hidden = by_turn * hidden_turn + by_way * hidden_way + bend
-        aside = hidden * hidden_way**2 / 12.0 + anywhere + inputs.CREEP_M2_PER_S * passed
-        rest = by_turn * turn + by_way * way + hidden + inputs.CREEP_RAD2_PER_S * passed
+        hidden_distance, hidden_turn, anywhere, any_turn = self.unseen.T
+        bend = np.square(self.settings.turn_bias_per_metre_sigma * hidden_distance)
+        hidden = by_turn * hidden_turn + by_distance * hidden_distance + bend
+        aside = hidden * hidden_distance**2 / 12.0 + anywhere + inputs.CREEP_M2_PER_S * passed
+        rest = by_turn * turn + by_distance * distance + hidden + inputs.CREEP_RAD2_PER_S * passed
         rest += any_turn
-        way = way + hidden_way
-        return np.column_stack([along * way + aside, across * way + aside, rest]) + self.slips
+        distance = distance + hidden_distance
+        return (
+            np.column_stack([along * distance + aside, across * distance + aside, rest])
+            + self.slips
+        )
 
     def forward(
         self,

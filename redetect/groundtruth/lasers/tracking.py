@@ -404,8 +404,8 @@ def _interval_s(times_s: FloatArray) -> float:
 def _velocities(times_s: FloatArray, poses: FloatArray) -> FloatArray:
     """(n, 3) mean velocities in the robot's frame around each time, turned to the world."""
     heading = np.unwrap(poses[:, 2])
-    way = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-0.5j * (heading[1:] + heading[:-1]))
-    driven = np.concatenate([[0.0], np.cumsum(way)])
+    steps = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-0.5j * (heading[1:] + heading[:-1]))
+    driven = np.concatenate([[0.0], np.cumsum(steps)])
     window_s = max(_VELOCITY_WINDOW_S, _VELOCITY_SETS * _interval_s(times_s))
     first = np.searchsorted(times_s, times_s - window_s)
     last = np.searchsorted(times_s, times_s + window_s, side="right") - 1

@@ -141,10 +141,10 @@ def _counted(rows: Sequence[Row], labels: Labels) -> str:
 
 def _doubt(run: Recording) -> str:
     """What may be wrong with a run most of whose rows of discs match none."""
-    way, reach = files.lengths_of(run)
+    length, reach = files.lengths_of(run)
     return (
         "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
-        f"are {way:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
+        f"are {length:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
         "radians, and the axes of the robot, X left and Y backward"
     )
 

@@ -28,10 +28,10 @@ def recordings_of(flags: RunFlags) -> list[Recording]:
                 f"{flags.odometry_noise.sentence()} (--odometry-noise)",
                 file=sys.stderr,
             )
-        way, reach = lengths_of(recording)
-        if len(reach) and way > 2.0 * np.max(reach):
+        length, reach = lengths_of(recording)
+        if len(reach) and length > 2.0 * np.max(reach):
             print(
-                f"the steps are {way:.3g} m long (median), and no disc is farther than "
+                f"the steps are {length:.3g} m long (median), and no disc is farther than "
                 f"{np.max(reach):.3g} m: is the odometry in metres?",
                 file=sys.stderr,
             )
@@ -40,8 +40,8 @@ def recordings_of(flags: RunFlags) -> list[Recording]:
 
 def lengths_of(recording: Recording) -> tuple[float, FloatArray]:
     """Median length of a run's steps, and the distances of its rows of discs (n,) (m)."""
-    way = np.hypot(recording.steps[:, 0], recording.steps[:, 1])
-    return float(np.median(way)), np.hypot(*recording.circles.xy.T)
+    length = np.hypot(recording.steps[:, 0], recording.steps[:, 1])
+    return float(np.median(length)), np.hypot(*recording.circles.xy.T)
 
 
 def recording_of(flags: RunFlags) -> Recording:

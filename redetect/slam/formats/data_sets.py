@@ -448,9 +448,9 @@ def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:
         slope = np.tan(steering[held])
-        way = speed[held] / (1.0 - slope * _ENCODER_M / _AXLES_M) * duration
-        turn = way / _AXLES_M * slope
-        return np.stack([way - turn * _LEFT_M, turn * _AHEAD_M, turn], axis=1)
+        distance = speed[held] / (1.0 - slope * _ENCODER_M / _AXLES_M) * duration
+        turn = distance / _AXLES_M * slope
+        return np.stack([distance - turn * _LEFT_M, turn * _AHEAD_M, turn], axis=1)
 
     return _Log(time, along)
 

@@ -163,13 +163,15 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
 
     Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
+    driven = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))]
+    )
     every = np.array(sorted({i for ids in rows.ids for i in ids}), dtype=np.int64)
     seen = np.flatnonzero([len(ids) == 1 for ids in rows.ids])
     label = np.searchsorted(every, [rows.ids[k][0] for k in seen])
     pose = rows.frame[seen] + 1
     _, first, view = np.unique(label, return_index=True, return_inverse=True)
-    near = way[pose] - way[pose[first[view]]] <= _LOCAL_PATH_M
+    near = driven[pose] - driven[pose[first[view]]] <= _LOCAL_PATH_M
     xy = np.full((len(every), 2), np.nan)
     for some in (near, np.ones(len(seen), dtype=bool)):
         use = some & np.isnan(xy[label, 0])

@@ -107,7 +107,7 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
 
 
 def _without_errors(steps: FloatArray, poses: FloatArray) -> FloatArray:
-    """(N, 2) ways of the steps (N, 3) of odometry (m), with its scale but without random errors:
+    """(N, 2) movements (m) of odometry's steps (N, 3), with its scale but without random errors:
     those of adjusted `poses` (N + 1, 3) times the scale.
     """
     adjusted = between(poses[:-1], poses[1:])[:, :2]
