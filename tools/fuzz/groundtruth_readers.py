@@ -52,7 +52,7 @@ _PTPD = (
     b"1236686400.1 (ptpd debug) offset from master:      0s     -12345ns\n"
     b"(ptpd debug) observed drift:       1200\n"
 )
-_RAWSEEDS = b"0.1,1,2,0.5," + b",".join([b"0.01", b"0", b"0"] * 3) + b"\n"
+_RAWSEEDS = b"0.1,1,2,0.5,0.01,0,0,0,0.01,0,0,0,0.01\n"
 
 
 def _reader(
