@@ -67,7 +67,7 @@ class TimedPose:
 class PoseStream(NamedTuple):
     """Poses of the robot over time: their name in messages, their file, and their reader.
 
-    With `of_arcs`, between poses that are far apart the robot may have driven anything but an arc.
+    With `of_arcs`, poses assume arcs from row to row; over a long gap the movement is unknown.
     """
 
     name: str
@@ -241,10 +241,8 @@ def _poses_along(arcs: Iterator[_Arc]) -> Generator[TimedPose, None, None]:
         if not max(map(abs, movement)) <= FARTHEST:
             raise DetectError(f"{place}: expected distance and turn of at most {FARTHEST:g}")
         distance_m, turn_rad, sigma_m, sigma_rad = movement
-        chord, middle = (
-            distance_m * float(np.sinc(turn_rad / math.tau)),
-            pose.theta + 0.5 * turn_rad,
-        )
+        chord = distance_m * float(np.sinc(turn_rad / math.tau))
+        middle = pose.theta + 0.5 * turn_rad
         dx, dy = chord * math.cos(middle), chord * math.sin(middle)
         after = TimedPose(time_s, pose.x + dx, pose.y + dy, pose.theta + turn_rad)
         # Errors of the heading arise all along the way: the mean of their effects, and its scatter.

@@ -120,8 +120,8 @@ def open_recording(name: PathLike, camera: CameraLike | None = None, **source: A
         If the calibration or the odometry cannot be read.
     """
     for key in {"odometry", "times", "image_topic"} & source.keys():
-        named = path_of(source[key] or "none", f"a name as {key}", DetectError)
-        source[key] = str(named) if source[key] else ""
+        given = source[key]
+        source[key] = str(path_of(given, f"a name as {key}", DetectError)) if given else ""
     options = SourceOptions(**source)
     place = path_of(name, "the name of a run, a folder, a video or a bag", DetectError)
     return Recording(open_run(place, None if camera is None else camera_of(camera), options))

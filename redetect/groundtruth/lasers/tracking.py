@@ -204,7 +204,8 @@ class Tracker:
         if count < LEAST_READINGS:
             gate_m = self.settings.gate_m
             raise GeometryError(f"{count} readings within {gate_m:g} m of the outline")
-        # The ICP is pulled by people beside the robot, so also without it: what fits more readings.
+        # People beside the robot pull the ICP, so the prediction is refined, too, and the pose that
+        # more readings fit is taken.
         found = min(
             (self._refined(seen, at, self.prior_m[i]) for at in (start, predicted)),
             key=lambda one: one.chi2 - GATE_SIGMA**2 * one.used,

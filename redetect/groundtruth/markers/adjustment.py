@@ -32,6 +32,8 @@ UNDETERMINED = "the points do not determine all poses"
 # A first, coarse pass has a robust loss.
 _ROBUST, _NEAR = solver.Loss("huber", 3.0), 1e-6
 _PLAIN, _TOLERANCE = solver.Loss(), 1e-15
+# Residuals this many times as large as the median view's are unusual.
+_UNUSUAL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,19 +210,15 @@ class AdjustedBundle:
         }
 
 
-#: Residuals this many times as large as those of most views are unusual.
-_UNUSUAL = 3.0
-
-
 def adjust_bundle(
     bundle: Bundle, *, outlier_sigma: float = 5.0, outlier_px: float = 1.0
 ) -> AdjustedBundle:
     """Adjust all free poses: robustly first, then by least squares without the wrong views.
 
-    The bundle's poses are the start. A view is wrong if its normalised error and its residuals (px)
-    are larger than `outlier_sigma` and `outlier_px`, and these than is usual here. Raises
-    `GeometryError` if the start has a point behind its camera, or the points do not determine the
-    poses.
+    The bundle's poses are the start. A view is wrong if its normalised error is larger than
+    `outlier_sigma` and its residuals (px) are larger than `outlier_px` and three times the median
+    view's. Raises `GeometryError` if the start has a point behind its camera, or the points do not
+    determine the poses.
     """
     everything = np.ones(len(bundle.seen), dtype=np.bool_)
     bundle = _minimised(bundle, everything, _ROBUST, _NEAR)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
-from redetect.array_types import FloatArray
+from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.markers import adjustment
 from redetect.groundtruth.markers.boards import FIRST, SECOND, WORLD, BoardsFile, BoardView
@@ -41,10 +41,10 @@ class NetworkEstimate:
     offset: FloatArray | None  # (4, 4): `first_from_second` of the double board, adjusted
     adjusted: adjustment.AdjustedBundle
     views: tuple[BoardView, ...]  # The bundle's views
-    # Squared differences of the views' own poses of boards from the network's, in those that the
-    # residuals imply; 1 if chance explains them
+    # Ratio of the squared differences between the boards' poses by single views and by the network
+    # to those that the residuals imply; 1 if chance explains it
     disagreement: float
-    connections: int  # Degrees of freedom of these: 0 if nothing shows whether a board was moved
+    connections: int  # Its degrees of freedom: 0 if nothing shows whether a board was moved
 
 
 def estimate_network(
@@ -72,7 +72,8 @@ def estimate_network(
         offset = _estimated_offset(seen) if offset is None else offset
         parts |= {FIRST: np.eye(4), SECOND: offset}
     poses, bodies = _chained(names, seen, parts)
-    bundle, views = _bundle(setup, parts, seen, poses, bodies, settings)
+    bundle, views = _bundle(setup, parts, seen, poses, bodies, settings.corner_sigma_px)
+    bundle = bundle.only(_fitting_corners(setup, seen, settings.outlier_px))
     try:
         adjusted = adjustment.adjust_bundle(
             bundle, outlier_sigma=settings.outlier_sigma, outlier_px=settings.outlier_px
@@ -206,12 +207,9 @@ def _bundle(
     seen: _PosedShots,
     poses: FloatArray,
     bodies: Mapping[int, FloatArray],
-    settings: NetworkSettings,
+    corner_sigma_px: float,
 ) -> tuple[adjustment.Bundle, tuple[BoardView, ...]]:
-    """Bundle of all views; its first body is the world, the others are the double boards.
-
-    Without single corners that do not fit their board's own pose, such as hidden ones.
-    """
+    """Bundle of all views; its first body is the world, the others are the double boards."""
     names, order = sorted(setup.cameras), list(parts)
     body_index = {number: body for body, number in enumerate(bodies, 1)}
     views = [view for shot in seen for view, _ in shot]
@@ -228,7 +226,7 @@ def _bundle(
         part,
         np.concatenate([setup.boards[view.board].points for view in views]),
         np.concatenate([view.corners for view in views]),
-        np.tile(settings.corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
+        np.tile(corner_sigma_px**2 * np.eye(2), (sum(counts), 1, 1)),
     )
     free = np.ones(len(names) + len(order) + 1 + len(bodies), dtype=np.bool_)
     free[len(names) : len(names) + len(order) + 1] = False
@@ -250,11 +248,14 @@ def _bundle(
         np.repeat(np.arange(len(views)), counts),
         priors,
     )
-    right = []
-    for view, pose in (one for shot in seen for one in shot):
-        expected = setup.cameras[view.camera].project(
-            se3.apply(pose, setup.boards[view.board].points)
-        )
-        off = np.linalg.norm(view.corners - expected, axis=1)
-        right.append(off <= max(settings.outlier_px, _WRONG_CORNER * float(np.median(off))))
-    return bundle.only(np.concatenate(right)), tuple(views)
+    return bundle, tuple(views)
+
+
+def _fitting_corners(setup: BoardsFile, seen: _PosedShots, outlier_px: float) -> BoolArray:
+    """(N,) whether corners fit their board's pose by its own picture; hidden ones do not."""
+    fitting = []
+    for view, pose in chain.from_iterable(seen):
+        points = se3.apply(pose, setup.boards[view.board].points)
+        off = np.linalg.norm(view.corners - setup.cameras[view.camera].project(points), axis=1)
+        fitting.append(off <= max(outlier_px, _WRONG_CORNER * float(np.median(off))))
+    return np.concatenate(fitting)

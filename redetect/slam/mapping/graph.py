@@ -163,9 +163,8 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
 
     Takes `poses` (N + 1, 3), `camera_xy` (2,).
     """
-    driven = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))]
-    )
+    lengths = np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    driven = np.concatenate([[0.0], np.cumsum(lengths)])
     every = np.array(sorted({i for ids in rows.ids for i in ids}), dtype=np.int64)
     seen = np.flatnonzero([len(ids) == 1 for ids in rows.ids])
     label = np.searchsorted(every, [rows.ids[k][0] for k in seen])
