@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
-from detect.discs.explanation import explain_discs
 from detect.drawing.frame import png_of
 from detect.errors import DetectError
+from detect.explanation import explain_discs
 from detect.lean import search_of
 from detect.projection import circle_on_floor
 from detect.runs.frame import detect_batch

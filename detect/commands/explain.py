@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.table import Table
 
 from camera import camera_in, read_camera
-from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, png_of
 from detect.errors import DetectError
+from detect.explanation import DiscExplanation, explain_discs
 from detect.options import Explain
 from detect.runs.outputs import lean_sentence
 from detect.sources.interface import RunFrame, read_image, still

@@ -120,8 +120,8 @@ def _all(command: All, run: Run) -> Job:
 
 def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     """The settings with the radius estimated from some of the images."""
-    from detect.discs.radius import find_radius
     from detect.lean import leaning_as
+    from detect.radius import find_radius
 
     images = list(some_images(run))
     found = find_radius(images, leaning_as(images, run.camera), settings)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from camera import Camera
 from detect.comparison.compare import error_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
-from detect.discs.explanation import DiscExplanation, Stage
+from detect.explanation import DiscExplanation, Stage
 from detect.lines import LineDetections
 from detect.markers.detect import ACCEPTED as ACCEPTED_MARKER
 from detect.markers.detect import SAME_MARKER, MarkerDetections

@@ -17,11 +17,11 @@ import numpy as np
 from camera import Camera
 from detect.circles import CircleDetections, scene_of, vote_shape
 from detect.discs.fit import working_space
-from detect.discs.identity import ids_of_rows
 from detect.discs.judgement import NO_CANDIDATES
 from detect.discs.outline_tilt import tilt_of_outlines
 from detect.discs.placing import place_discs
 from detect.errors import FrameError
+from detect.identity import ids_of_rows
 from detect.lean import detect_leaning, detect_tilted, search_of, with_exact_tilt
 from detect.levelling import common_covariance, levelled
 from detect.lines import LineDetections, carry_ids, detect_lines

@@ -95,7 +95,7 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
         on_discs = list(_hints_on_discs(run, settings, summary))
     yield from on_discs
     if not on_discs and found["discs"] >= processed >= _FEWEST_FRAMES:
-        from detect.discs.radius import ratio_of_radii
+        from detect.radius import ratio_of_radii
 
         images = list(some_images(run, _COMPARED_IMAGES))
         ratio = ratio_of_radii(images, _leaning(images, camera, summary), settings)
@@ -110,8 +110,8 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
 
 def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
     """Why a run has few discs per frame; nothing if no other settings find more."""
-    from detect.discs.explanation import why_none
-    from detect.discs.radius import find_radius
+    from detect.explanation import why_none
+    from detect.radius import find_radius
 
     images, number = list(some_images(run)), summary.found["discs"]
     processed = summary.frames - summary.failed

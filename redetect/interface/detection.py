@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera import Camera, read_camera
-from detect.discs.explanation import DiscExplanation, explain_discs
 from detect.drawing.frame import draw_explanation, draw_rows, png_of
 from detect.errors import DetectError, FrameError
+from detect.explanation import DiscExplanation, explain_discs
 from detect.grey_values import plain_image
 from detect.line_settings import LineSettings
 from detect.projection import DiscProjection, image_positions
@@ -346,7 +346,7 @@ def settings_of(
     if isinstance(radius_m, str):
         raise DetectError(
             f"radius_m is {excerpt(radius_m)}: expected metres, which `detect all --radius-m auto` "
-            "and detect.discs.radius.find_radius estimate from images"
+            "and detect.radius.find_radius estimate from images"
         )
     if not isinstance(settings, CircleSettings | None):
         raise DetectError(f"settings is {excerpt(settings)}: expected rd.CircleSettings(...)")
@@ -414,7 +414,7 @@ class Explanation(DiscExplanation):
     Attributes
     ----------
     image, camera, settings, at, candidates, place, suggestions
-        Those of `detect.discs.explanation.DiscExplanation`.
+        Those of `detect.explanation.DiscExplanation`.
     """
 
     def picture(self) -> NDArray[np.uint8]:

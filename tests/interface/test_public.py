@@ -490,7 +490,7 @@ def test_places_where_nothing_can_be_found(
     demo_image: Path, demo_camera: rd.Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Looking for another radius takes long; that it is found is tried above.
-    monkeypatch.setattr("detect.discs.explanation._radius_at", lambda *_: None)
+    monkeypatch.setattr("detect.explanation._radius_at", lambda *_: None)
     for wrong in ((300.0,), (1, 2, 3), 5, "ab"):
         with pytest.raises(rd.Error, match=r"at is .*: expected a pixel"):
             rd.explain(demo_image, demo_camera, wrong)  # type: ignore[arg-type]

@@ -14,9 +14,9 @@ import pytest
 
 from camera import Camera, read_camera, write_camera
 from detect.cli import main, parsed
-from detect.discs.radius import find_radius
 from detect.options import All, Circles
 from detect.projection import leaning_camera
+from detect.radius import find_radius
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from tests.detect.commands import Captured
@@ -37,7 +37,7 @@ def image(camera: Camera, radius_m: float, seed: int) -> np.ndarray:
 
 @pytest.fixture(autouse=True)
 def tables_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("detect.discs.radius.build_vote_table", TABLE_OF)
+    monkeypatch.setattr("detect.radius.build_vote_table", TABLE_OF)
 
 
 @pytest.mark.parametrize("radius_m", [0.06, 0.1, 0.15])

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from detect.discs.identity import ids_of_rows
+from detect.identity import ids_of_rows
 from redetect.landmarks import CircleLandmark
 
 #: Two standard deviations of which 99.9 % of two-dimensional errors are nearer.

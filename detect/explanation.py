@@ -28,10 +28,10 @@ from detect.circles import (
     within_margins,
 )
 from detect.discs.judgement import LEAST_RIM, RIM_RADIUS, JudgedCandidates, Outcome
-from detect.discs.radius import find_radius
 from detect.lean import detect_tilted, search_of
 from detect.lines import detect_lines
 from detect.projection import Tilt
+from detect.radius import find_radius
 from detect.settings import CircleSettings
 from lut import VoteTable, build_vote_table, cached_vertical_table, cached_vote_table
 from redetect.array_types import FloatArray, GreyImage
@@ -110,7 +110,7 @@ class DiscExplanation(Table):
     settings : CircleSettings
     at : (float, float) or None
         The given pixel.
-    candidates : tuple of detect.discs.explanation.Candidate
+    candidates : tuple of detect.explanation.Candidate
         Accepted ones first, then in order of decreasing votes.
     place : str
         Description of the given pixel; empty without one.
