@@ -274,7 +274,7 @@ def detect(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RecordedFrame:
     """One frame of a recording.
 
@@ -287,6 +287,9 @@ class RecordedFrame:
 
     frame: RunFrame
     camera: Camera
+
+    def __repr__(self) -> str:
+        return f"<frame {self.name}: {self.frame.image or 'image in memory'}>"
 
     @property
     def name(self) -> str:
@@ -366,6 +369,8 @@ def frame_of_image(image: ImageLike) -> RunFrame:
     """An array or a file as a frame without odometry."""
     # Arrays of NumPy and PyTorch, and PIL's images but for those whose values refer to a palette.
     arrays = hasattr(image, "__array__") or hasattr(image, "__array_interface__")
+    if np.ma.is_masked(image):
+        raise FrameError("the image has masked pixels: expected one whose values all count")
     if arrays and getattr(image, "mode", "L") != "P":
         return RunFrame(still("image"), None, content=plain_image(np.asarray(image)))
     path = path_of(image, "an array of grey values, or the name of an image file", FrameError)

@@ -123,6 +123,7 @@ def test_radius_and_settings(demo_image: Path, demo_camera: rd.Camera) -> None:
         np.zeros((288, 768, 3), np.uint8),
         np.zeros((288, 768), np.uint16),
         np.zeros((10, 10), np.uint8),
+        np.ma.masked_less(np.zeros((288, 768), np.uint8), 1),
         "no/such/image.png",
     ],
 )
@@ -154,7 +155,7 @@ def test_json(found: rd.Detection) -> None:
     assert content["tilt"]["lines"] > 5
 
 
-def test_notebooks_show_pictures_and_tables(found: rd.Detection) -> None:
+def test_notebooks_show_pictures_and_tables(found: rd.Detection, demo: Path) -> None:
     picture = cv2.imdecode(np.frombuffer(found._repr_png_(), np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert picture.shape[0] > found.image.shape[0]
@@ -164,6 +165,7 @@ def test_notebooks_show_pictures_and_tables(found: rd.Detection) -> None:
     assert "data:image/png;base64," in page
     assert len(repr(found)) < 200
     assert len(repr(found.discs)) < 200
+    assert len(repr(rd.open(demo)[0])) < 200
 
 
 @pytest.mark.parametrize("name", ["pandas", "polars"])
