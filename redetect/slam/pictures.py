@@ -45,8 +45,10 @@ _CROPS_ABREAST, _CROP_PX = 8, 48.0
 _MOST_NUMBERED = 40
 # Largest number of landmarks whose ellipses are drawn.
 _MOST_ELLIPSES = 700
+# In larger maps, landmarks with fewer rows than this are pale, but not paler than this share.
+_MANY_ROWS, _PALEST = 10, 0.15
 # Margin around path and discs within which verticals are drawn.
-_MARGIN_M, _MARGIN_SHARE = 10.0, 0.25
+_MARGIN_M, _MARGIN_SHARE = 6.0, 0.25
 _Extent = tuple[FloatArray, FloatArray]  # low and high corner (m)
 
 
@@ -238,11 +240,12 @@ def _draw_landmarks(
     shown = np.all((some.xy >= low) & (some.xy <= high), axis=1)
     outside = int(np.sum(~shown))
     label = f"{name} ({len(some)}{f', {outside} of them outside' if outside else ''})"
-    # With hundreds of landmarks, only small dots show walls.
+    # With hundreds of landmarks, only small dots show walls; what was hardly seen would hide them.
     size = 4.0 if len(some) <= 100 else 2.0
-    axes.plot(
-        some.xy[shown, 0], some.xy[shown, 1], ls="", marker=marker, ms=size, color=colour,
-        mew=0.8 if marker == "x" else 0.0, label=label, zorder=5,
+    opaque = np.ones(len(some)) if ellipses else np.clip(some.rows / _MANY_ROWS, _PALEST, 1.0)
+    axes.scatter(
+        *some.xy[shown].T, s=size**2, marker=marker, color=colour, alpha=opaque[shown],
+        lw=0.8 if marker == "x" else 0.0, label=label, zorder=5,
     )  # fmt: skip
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any() and ellipses:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from camera import Camera
 from redetect.least_squares import LossKind
+from redetect.plane import apply
 from redetect.slam.mapping.graph import (
     MOST_SIGMA_M,
     Estimate,
@@ -74,8 +75,10 @@ def test_lines_that_bearings_do_not_place_are_found_at_an_estimate() -> None:
     middle = run.poses[:, :2].mean(axis=0)
     xy[1] = middle + 500.0 * (xy[1] - middle)  # as good as at infinity
     xy[2] = middle - 3.0 * (xy[2] - middle)  # on the other side of the robot
+    seen_from = run.poses[graph.line_pose[graph.member_row[graph.member_line == 3]]]
+    xy[3] = apply(seen_from[:1], [CAMERA_XY + np.array([-0.01, 0.005])])[0]  # at a camera
     placed = well_placed(graph, Estimate(run.poses, run.disc_xy, xy))
-    assert np.flatnonzero(~placed).tolist() == [1, 2]
+    assert np.flatnonzero(~placed).tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("loss", ["none", "huber", "geman-mcclure"])

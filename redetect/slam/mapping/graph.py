@@ -21,6 +21,8 @@ MOST_MISS = 10.0
 MOST_SIGMA_M = 0.5
 # Odometry is good enough for a first triangulation over about this many metres of path.
 _LOCAL_PATH_M = 15.0
+# No robot's camera is closer to an edge than this.
+_NEAREST_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +187,11 @@ def place_lines(poses: FloatArray, rows: LineRows, camera_xy: FloatArray) -> Ini
 
 
 def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
-    """(K,) mask of the lines of an estimate whose position the bearings determine."""
+    """(K,) mask of the lines of an estimate whose position the bearings determine.
+
+    Rows of different lines with one identifier may agree best on a point at a camera: from there
+    every bearing is possible, and its information is without bound.
+    """
     line, row = graph.member_line, graph.member_row
     pose = estimate.poses[graph.line_pose[row]]
     to_line = disc_in_robot(pose, estimate.line_xy[line]) - graph.camera_xy
@@ -197,7 +203,8 @@ def well_placed(graph: Graph, estimate: Estimate) -> BoolArray:
     ahead = to_line[:, 0] * np.sin(bearing) - to_line[:, 1] * np.cos(bearing) > 0.0
     share = np.bincount(line, ahead, len(information)) / graph.line_row_counts
     certain = np.linalg.eigvalsh(information)[:, 0] > MOST_SIGMA_M**-2
-    return np.asarray(certain & (share > 0.5))
+    at_camera = np.bincount(line, np.hypot(*to_line.T) < _NEAREST_M, len(information))
+    return np.asarray(certain & (share > 0.5) & (at_camera == 0))
 
 
 class Triangulation(NamedTuple):
