@@ -243,9 +243,11 @@ def _draw_landmarks(
     # With hundreds of landmarks, only small dots show walls; what was hardly seen would hide them.
     size = 4.0 if len(some) <= 100 else 2.0
     opaque = np.ones(len(some)) if ellipses else np.clip(some.rows / _MANY_ROWS, _PALEST, 1.0)
+    x, y = some.xy[shown].T
     axes.scatter(
-        *some.xy[shown].T, s=size**2, marker=marker, color=colour, alpha=opaque[shown],
-        lw=0.8 if marker == "x" else 0.0, label=label, zorder=5,
+        x, y, size**2, marker=marker, color=colour, lw=0.8 if marker == "x" else 0.0,
+        alpha=opaque[shown],  # type: ignore[arg-type]  # the stub lacks arrays
+        label=label, zorder=5,
     )  # fmt: skip
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))
     if known.any() and ellipses:
