@@ -38,6 +38,8 @@ _POSE, _XY = np.arange(POSE_SIZE), np.arange(2)
 NEW_DISC_GATES = 4.0
 #: Largest distance at which lines are expected to be visible (m), since walls hide others.
 FARTHEST_LINE_M = 15.0
+# Least number of discs by which a slip is noticed; factors on the covariance of its step.
+_SEVERAL, _SLIPS = 3, (10.0, 100.0)
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
@@ -178,13 +180,22 @@ class Filter(ABC):
         """Rows and columns `index` of the state's covariance."""
         return np.asarray(self._covariance[np.ix_(index, index)])
 
-    def predict(self, step: FloatArray, noise: FloatArray) -> None:
-        """Predict the pose after an odometry step (3,) of covariance (3, 3)."""
+    def predict(self, step: FloatArray, noise: FloatArray) -> FloatArray:
+        """Predict the pose after an odometry step (3,) of covariance (3, 3).
+
+        Returns what that adds to the covariance of the pose, (3, 3).
+        """
         at = self._linearised
         pose = models.move(self._state[_POSE], step)
         by_pose, by_step = models.move_jacobians(self._state[_POSE], step)
         by_pose[0, 2], by_pose[1, 2] = at[1] - pose[1], pose[0] - at[0]
-        self._put(0, _POSE, by_pose, by_step @ noise @ by_step.T, pose)
+        added = by_step @ noise @ by_step.T
+        self._put(0, _POSE, by_pose, added, pose)
+        return np.asarray(added)
+
+    def doubt_pose(self, covariance: FloatArray) -> None:
+        """Add (3, 3) to the covariance of the pose."""
+        self._covariance[:POSE_SIZE, :POSE_SIZE] += covariance
 
     @abstractmethod
     def measure(self, rows: FrameRows) -> None:
@@ -391,11 +402,15 @@ def run_filter(
     poses = np.empty((len(recording) + 1, 3))
     covariance = np.empty((len(recording) + 1, 3, 3))
     poses[0], covariance[0] = estimate.state[:3], estimate.pose_covariance
+    before = FrameRows(recording.circles.only(slice(0)), recording.lines.only(slice(0)))
     for k, rows in enumerate(frames_of(recording)):
         try:
-            estimate.predict(recording.steps[k], recording.step_covariance[k])
+            added = estimate.predict(recording.steps[k], recording.step_covariance[k])
             identified = pairing.identified(rows, estimate)
+            if pairing.method != "known" and _are_lost(identified, before, estimate):
+                identified = _after_slip(rows, identified, before, added, estimate, pairing)
             estimate.measure(identified)
+            before = identified
         except SlamError as error:
             raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
         disc_ids.extend(identified.circles.ids.tolist())
@@ -410,6 +425,36 @@ def run_filter(
         disc_ids=np.array(disc_ids, dtype=np.int64),
         line_ids=tuple(line_ids),
     )
+
+
+def _are_lost(rows: FrameRows, before: FrameRows, estimate: Filter) -> bool:
+    """Whether most rows of a frame show no known disc, and most discs of the frame before are lost.
+
+    Of fewer than three rows or discs, that means nothing.
+    """
+    found, expected = rows.circles.ids.tolist(), set(before.circles.ids.tolist()) - {UNKNOWN_ID}
+    known = sum(number in estimate.disc_slots for number in found)
+    several = len(found) >= _SEVERAL and len(expected) >= _SEVERAL
+    return several and 2 * known < len(found) and 2 * len(expected & {*found}) < len(expected)
+
+
+def _after_slip(
+    rows: FrameRows, identified: FrameRows, before: FrameRows, added: FloatArray,
+    estimate: Filter, pairing: Associator,
+) -> FrameRows:  # fmt: skip
+    """Rows of a frame, identified with a larger error of the step if that finds the discs again.
+
+    Wheels may have slipped. `identified` are the same rows with the error as stated, `before` those
+    of the frame before, `added` is what the step added to the covariance of the pose.
+    """
+    jointly = replace(pairing, method="joint")  # the nearest one is often another, with such errors
+    for factor in _SLIPS:
+        estimate.doubt_pose((factor - 1.0) * added)
+        again = jointly.identified(rows, estimate)
+        if not _are_lost(again, before, estimate):
+            return again
+        estimate.doubt_pose((1.0 - factor) * added)
+    return identified
 
 
 def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:

@@ -1,0 +1,53 @@
+"""Steps that are much worse than stated: filters without identifiers find the discs again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from redetect.array_types import FloatArray
+from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.slam.filters.base import Associator
+from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.localizer import localize_run
+from tests.slam.small_run import SmallRun, small_run
+
+_DISCS = 20
+
+
+def run_with_slips(seed: int) -> SmallRun:
+    """A run whose odometry turns by 10 degrees too much, once in either lap, and sees no lines."""
+    run = small_run(seed, discs=_DISCS)
+    run.recording.steps[[20, 45], 2] += np.radians(10.0)
+    return replace(run, recording=replace(run.recording, lines=run.recording.lines.only(slice(0))))
+
+
+def errors_m(poses: FloatArray, run: SmallRun) -> FloatArray:
+    return np.asarray(np.linalg.norm(poses[:, :2] - run.poses[:, :2], axis=1))
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_localisation_survives_slips(method: Literal["nearest", "joint"], seed: int) -> None:
+    run = run_with_slips(seed)
+    discs = Landmarks(
+        np.arange(1, _DISCS + 1), run.disc_xy, np.zeros((_DISCS, 2, 2)), np.ones(_DISCS, np.int64)
+    )
+    none = Landmarks(
+        np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.int64)
+    )
+    found = localize_run(run.recording, LandmarkMap(discs, none), Associator(method))
+    right = found.disc_ids == run.recording.circles.ids
+    assert np.mean(right) > 0.9
+    assert errors_m(found.path.poses, run).max() < 0.25
+
+
+@pytest.mark.parametrize("method", ["nearest", "joint"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_slam_survives_slips(method: Literal["nearest", "joint"], seed: int) -> None:
+    run = run_with_slips(seed)
+    found = run_ekf(run.recording, EkfSlam(), Associator(method))
+    assert errors_m(found.path.poses, run).max() < 0.25
