@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -73,7 +74,7 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
 
     Raises DetectError if there is no such field, or the value has another type.
     """
-    hints = {each.name: get_type_hints(kind)[each.name] for each in fields(kind)}
+    hints = _types(kind)
     if name not in hints:
         raise DetectError(
             f"{name} is not a parameter of {kind.__name__}: expected {', '.join(sorted(hints))}"
@@ -83,6 +84,13 @@ def setting_value(kind: type, name: str, value: Any) -> Any:
     except (TypeError, OverflowError):
         expected = expectation(hints[name])
         raise DetectError(f"{name} is {excerpt(value)}: expected {expected}") from None
+
+
+@cache
+def _types(kind: type) -> dict[str, Any]:
+    """Types of the fields of a dataclass by their names."""
+    hints = get_type_hints(kind)
+    return {each.name: hints[each.name] for each in fields(kind)}
 
 
 def _of_type(hint: Any, value: Any) -> Any:
