@@ -59,6 +59,15 @@ def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     return MarkerPose(poses.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6), costs)
 
 
+def joined(estimates: Sequence[MarkerPose]) -> MarkerPose:
+    """All estimates of one time as alternatives; costs above the least of each."""
+    return MarkerPose(
+        np.concatenate([e.poses for e in estimates]),
+        np.concatenate([e.covariances for e in estimates]),
+        np.concatenate([e.costs - e.costs.min() for e in estimates]),
+    )
+
+
 def pair_consensus(times: Sequence[MarkerPose]) -> PairConsensus:
     """The transform with which most times agree, each with its estimates from `pair_estimates`."""
     poses = np.concatenate([time.poses for time in times])

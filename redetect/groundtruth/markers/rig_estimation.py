@@ -20,6 +20,7 @@ from redetect.groundtruth.markers.pairs import (
     MarkerPose,
     PairConsensus,
     chained_poses,
+    joined,
     pair_consensus,
     pair_estimates,
 )
@@ -196,10 +197,14 @@ def _consensus_of_pairs(
 ) -> dict[tuple[int, int], PairConsensus]:
     estimates: dict[tuple[int, int], list[MarkerPose]] = {}
     for views in solved:
+        # Those of one time are alternatives: they share its errors, and count once.
+        here: dict[tuple[int, int], list[MarkerPose]] = {}
         for (view_a, a), (view_b, b) in product(views, repeat=2):
             pair = (view_a.rig_index, view_b.rig_index)
             if a is not None and b is not None and pair[0] < pair[1]:
-                estimates.setdefault(pair, []).append(pair_estimates(a, b))
+                here.setdefault(pair, []).append(pair_estimates(a, b))
+        for pair, found in here.items():
+            estimates.setdefault(pair, []).append(joined(found))
     return {pair: pair_consensus(times) for pair, times in sorted(estimates.items())}
 
 

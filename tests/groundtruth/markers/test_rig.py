@@ -250,28 +250,38 @@ def test_a_misread_marker_is_left_out_of_the_adjustment() -> None:
     assert np.abs(error).max() < 2e-3
 
 
+def turning_before_a_network(
+    rig: Rig, width_m: float, *, count: int = 12, sigma_px: float = 0.1
+) -> RigEstimate:
+    """A rig from images of four cameras that are calibrated to each other."""
+    generator = np.random.default_rng(11)
+    times = np.arange(float(count))
+    places = generator.normal(0, 0.5, (count, 2)).tolist()
+    poses = np.stack([planar_transform(x, y, 0.5 * i) for i, (x, y) in enumerate(places)])
+    frames = frames_of(times, poses, rig=rig, sigma_px=sigma_px)
+    groups = [tuple(f for f in frames if f.time_s == t) for t in times]
+    settings = RigSettings(corner_floor_px=0.0)
+    return estimate_rig(groups, network_of(hall_cameras(4)), width_m, settings)
+
+
 @pytest.mark.long
 def test_cameras_of_a_network_see_the_rig_together() -> None:
     """With two cameras calibrated to each other, markers of different images are a pair."""
     rig = box_rig(4)
-    times = np.arange(30.0)
-    generator = np.random.default_rng(11)
-    poses = np.stack(
-        [
-            planar_transform(generator.normal(0, 0.5), generator.normal(0, 0.5), 0.5 * i)
-            for i in range(len(times))
-        ]
-    )
-    frames = frames_of(times, poses, rig=rig)
-    groups = [tuple(f for f in frames if f.time_s == t) for t in times]
-    estimate = estimate_rig(
-        groups,
-        network_of(hall_cameras(4)),
-        float(rig.widths_m[0]),
-        RigSettings(corner_floor_px=0.0),
-    )
+    estimate = turning_before_a_network(rig, float(rig.widths_m[0]), count=30)
     assert (0, 2) in estimate.pairs  # front and back: no single camera sees both
     square, dof = normalised_error(estimate, rig, estimate.adjusted.part_covariance)
+    assert square / dof < 2.0
+
+
+def test_estimates_of_one_time_count_once() -> None:
+    """A small marker, seen at its place by no two cameras, has no support by their number."""
+    rig = box_rig(5)
+    rig = replace(rig, widths_m=np.array([0.24] * 4 + [0.18]))
+    estimate = turning_before_a_network(rig, 0.24)
+    assert set(estimate.left_out) == {35}
+    assert max(len(pair.agrees) for pair in estimate.pairs.values()) <= 12
+    square, dof = normalised_error(estimate, box_rig(4), estimate.adjusted.part_covariance)
     assert square / dof < 2.0
 
 
