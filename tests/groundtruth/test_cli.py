@@ -222,6 +222,11 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     assert found.ids == rig.ids
     error = se3.log(se3.inverse(rig.robot_from_marker) @ found.robot_from_marker)
     assert np.abs(error).max() < 6e-3
+    assert "m wide" not in capsys.readouterr().err
+
+    wrong = ["--width-m", "0.25", "-o", str(output), *together[:3]]
+    assert main(["rig", *runs, *wrong]) == 0
+    assert "m wide (sigma" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,9 @@ from redetect.storage import write_bytes
 
 #: Share of a marker's views above which those left out are warned of.
 _MANY_LEFT_OUT = 0.1
+#: Standard deviations, and share, by which the width that fits the images differs from that given
+#: if a warning is printed: no print is much more accurate than a thousandth.
+_WRONG_SIGMAS, _WRONG_SHARE = 5.0, 1e-3
 
 
 def perform_network(command: Network) -> int:
@@ -120,8 +123,14 @@ def perform_rig(command: Rig) -> int:
         if left_out > max(_MANY_LEFT_OUT * views, 2):
             outputs.warn(
                 f"marker {marker}: {left_out} of {views} views disagree with the others: was it "
-                "moved, or misread?"
+                "moved, or misread, or is its width another?"
             )
+    width, sigma = estimate.fitting_width_m
+    if abs(width - command.width_m) > max(_WRONG_SIGMAS * sigma, _WRONG_SHARE * width):
+        outputs.warn(
+            f"the cameras of {command.network} see markers {width:.5f} m wide (sigma "
+            f"{sigma:.5f} m): --width-m {command.width_m:g}, or the scale of the network, is wrong"
+        )
     outputs.print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
     print(
         f"{command.output}: {len(rig.ids)} markers from {estimate.times} times, frame: {frame}, "

@@ -34,6 +34,8 @@ _ROBUST, _NEAR = solver.Loss("huber", 3.0), 1e-6
 _PLAIN, _TOLERANCE = solver.Loss(), 1e-15
 # Residuals this many times as large as the median view's are unusual.
 _UNUSUAL = 3.0
+# Share of the information on the parts' size that is left by rounding if other scales follow it.
+_FREE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,6 +323,25 @@ def _view_figures(bundle: Bundle) -> tuple[FloatArray, FloatArray]:
     errors = np.sqrt(np.bincount(bundle.view, squares) / count)
     rms = np.sqrt(np.bincount(bundle.view, np.sum(difference**2, axis=1)) / count)
     return np.nan_to_num(errors, nan=np.inf), np.nan_to_num(rms, nan=np.inf)
+
+
+def size_of_parts(adjusted: AdjustedBundle) -> tuple[float, float]:
+    """Factor of the size of all parts that would fit the images best, linearised, and its standard
+    deviation, scaled by the residuals; infinite if the images do not determine it.
+    """
+    part = adjusted.bundle.only(adjusted.used)
+    by_part = project_chain_with_jacobians(part.chain, part.seen).by_part
+    by_size = by_part[..., :3] @ part.seen.points[..., None]
+    problem = linearised(part)
+    border = np.zeros((len(problem.residual), 1))
+    border[: by_size.size] = -(solver.whitening(part.seen.covariances) @ by_size).reshape(-1, 1)
+    normal = solver.normal_equations(problem._replace(border=border))
+    eliminated = solver.factor(normal.matrix).solve(normal.border)
+    information = float((normal.corner - normal.border.T @ eliminated)[0, 0])
+    if information < _FREE * float(normal.corner[0, 0]):
+        return 1.0, np.inf
+    _, change = normal.step(0.0)
+    return 1.0 + float(change[0]), float(np.sqrt(max(1.0, adjusted.chi2_per_dof) / information))
 
 
 def _shared_information(problem: solver.Linear, shared: int) -> FloatArray:

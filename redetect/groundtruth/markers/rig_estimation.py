@@ -49,6 +49,9 @@ class RigEstimate:
     views: tuple[View, ...]  # The bundle's views
     times: int  # Number of times (images, without a network) used
     left_out: dict[int, str]  # Markers that were found but are not in the rig, with the reason
+    # Width that would fit the images best, and its standard deviation (m): infinite if the cameras'
+    # poses relative to each other are not known
+    fitting_width_m: tuple[float, float]
 
 
 def estimate_rig(
@@ -148,7 +151,9 @@ def estimate_rig(
     covariance = adjusted.part_covariance * max(1.0, adjusted.chi2_per_dof)
     poses = adjusted.bundle.chain.body_from_part
     rig = replace(rig, robot_from_marker=poses, covariance=covariance)
-    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out)
+    factor, sigma = adjustment.size_of_parts(adjusted)
+    fitting = width_m * factor, width_m * sigma
+    return RigEstimate(rig, ids[root], pairs, adjusted, views, times, left_out, fitting)
 
 
 def _in_known_frame(

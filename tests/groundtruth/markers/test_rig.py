@@ -274,6 +274,16 @@ def test_cameras_of_a_network_see_the_rig_together() -> None:
     assert square / dof < 2.0
 
 
+@pytest.mark.parametrize("stated_m", [0.24, 0.2412, 0.252])
+def test_the_cameras_of_a_network_tell_the_markers_width(stated_m: float) -> None:
+    found, sigma = turning_before_a_network(box_rig(4), stated_m).fitting_width_m
+    assert found == pytest.approx(0.24, abs=4.0 * sigma)
+    assert sigma < 1e-3
+    rig = box_rig(4)
+    alone = estimated(walk_round(rig, 8, seed=1), replace(rig, widths_m=np.full(4, stated_m)))
+    assert np.isinf(alone.fitting_width_m[1])  # a larger rig farther away looks the same
+
+
 def test_estimates_of_one_time_count_once() -> None:
     """A small marker, seen at its place by no two cameras, has no support by their number."""
     rig = box_rig(5)
