@@ -8,7 +8,6 @@ and they are added to the fused path, which has the same error.
 
 from __future__ import annotations
 
-from math import comb
 from pathlib import Path
 
 import numpy as np
@@ -30,8 +29,8 @@ _MEDIAN_OF_NORMAL = 0.6745
 _ORDER = 5
 _LEAST_RATE_HZ = 4.0
 _FEWEST = 50
-# Differences over longer gaps, in usual intervals, do not count.
-_LONGEST_INTERVALS = 1.5
+# Differences over times longer than usual by this factor do not count.
+_LONGEST = 1.5
 # A gross error is farther from the median of this number of poses than this many deviations.
 _NEIGHBOURS, _GROSS = 7, 6.0
 # Least gross error that is removed (m, rad): a turning point of a robot is none.
@@ -60,24 +59,38 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
     The largest of x, y and the heading; 0 without covariances, or with too few or too slow poses.
     """
-    count = len(poses) - _ORDER
-    if poses.covariances is None or count < _FEWEST:
+    poses = last_of_each_time(poses)
+    if poses.covariances is None or len(poses) - _ORDER < _FEWEST:
         return 0.0
-    usual = float(np.median(np.diff(poses.times_s)))
     over = poses.times_s[_ORDER:] - poses.times_s[:-_ORDER]
-    counted = over <= _LONGEST_INTERVALS * _ORDER * usual
-    if usual > 1.0 / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
+    usual = float(np.median(over))
+    counted = over <= _LONGEST * usual
+    if usual > _ORDER / _LEAST_RATE_HZ or np.count_nonzero(counted) < _FEWEST:
         return 0.0
     variances = np.diagonal(poses.covariances, axis1=1, axis2=2)
     gross = _gross_errors(poses.continuous, np.sqrt(variances))
     counted &= np.convolve(gross, np.ones(_ORDER + 1), "valid") == 0.0
     if np.count_nonzero(counted) < _FEWEST:
         return 0.0
-    weights = np.array([comb(_ORDER, k) for k in range(_ORDER + 1)], dtype=np.float64)
-    expected = sum(w**2 * variances[k : k + count] for k, w in enumerate(weights))
-    normalised = np.abs(np.diff(poses.continuous, _ORDER, axis=0))
-    normalised /= np.sqrt(expected)
-    return float(np.max(np.median(normalised[counted], axis=0)) / _MEDIAN_OF_NORMAL)
+    normalised = np.abs(_normalised_differences(poses, variances)[counted])
+    return float(np.max(np.median(normalised, axis=0)) / _MEDIAN_OF_NORMAL)
+
+
+def _normalised_differences(poses: PlanarPoses, variances: FloatArray) -> FloatArray:
+    """(N - 5, 3) divided differences of poses in their standard deviations, from (N, 3) variances.
+
+    Divided by time, differences cancel the motion at uneven times, too, such as those of cameras
+    that are not triggered together.
+    """
+    parts, count = range(_ORDER + 1), len(poses) - _ORDER
+    times, values, squares = (
+        np.stack([column[k : k + count] for k in parts])
+        for column in (poses.times_s, poses.continuous, variances)
+    )
+    apart = [np.prod(times[k] - np.delete(times, k, axis=0), axis=0) for k in parts]
+    weights = 1.0 / np.stack(apart)[..., None]
+    weights /= np.linalg.norm(weights, axis=0)
+    return np.asarray((weights * values).sum(axis=0) / np.sqrt((weights**2 * squares).sum(axis=0)))
 
 
 def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:

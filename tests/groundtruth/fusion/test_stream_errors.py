@@ -39,6 +39,17 @@ def test_jitter_is_told_from_motion(rate_hz: float, factor: float) -> None:
     assert covered.covariances[0] == pytest.approx(COVARIANCE, rel=0.4)
 
 
+@pytest.mark.parametrize("phases_s", [(0.0, 0.03, 0.11), (0.0, 0.06)])
+def test_cameras_that_are_not_triggered_together_do_not_jitter(phases_s: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(8)
+    truth, odometry = drive(rng, 60.0, FuseSettings(distance_sigma=0.006, turn_sigma=0.008))
+    times_s = np.sort(np.add.outer(np.arange(0.0, 59.5, 0.2), phases_s).ravel())
+    poses = measure(rng, truth, times_s, COVARIANCE)
+    assert jitter_ratio(poses) == pytest.approx(1.0, abs=0.2)
+    fusion = fuse(odometry, {"camera": poses})
+    assert 0.7 < float(np.mean(normalised_error(fusion.poses, truth))) / 3.0 < 1.5
+
+
 def test_a_fusion_with_covariances_three_times_too_small_is_honest() -> None:
     rng = np.random.default_rng(6)
     wheels = FuseSettings(distance_sigma=0.006, lateral_sigma=0.001, turn_sigma=0.008)
