@@ -140,6 +140,19 @@ def test_a_sessions_poses_and_their_score(tmp_path: Path, capsys: Captured) -> N
     assert (session / "poses.csv").read_bytes() == before
 
 
+def test_clocks_of_cameras_that_differ_are_told(tmp_path: Path, capsys: Captured) -> None:
+    """They see the robot at different times, so no images contradict each other."""
+    session = write_session(tmp_path / "s", count=20, moved=False)
+    for name, late_s in zip(NAMES, (0.0, 0.05, 0.1, 0.15)):
+        path = session / name / f"{name}.times"
+        rows = [row.split() for row in path.read_text().splitlines()[1:]]
+        path.write_text("".join(f"{prefix} {float(t) + late_s:.6f}\n" for prefix, t in rows))
+    assert main(["poses", str(session)]) == 0
+    captured = capsys.readouterr()
+    assert "disagree" not in captured.err
+    assert "their clocks may be wrong" in captured.err
+
+
 def test_files_and_settings_that_options_name(tmp_path: Path, capsys: Captured) -> None:
     session = write_session(tmp_path / "s", count=6)
     output = tmp_path / "out.csv"

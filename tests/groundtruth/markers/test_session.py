@@ -196,7 +196,7 @@ def test_poses_from_markers_printed_too_large_say_that_they_are_off() -> None:
         assert np.mean(np.einsum("ni,nij,nj->n", error, own, error)) / 2.0 < 1.8
 
 
-def test_a_marker_in_another_place_than_the_rig_says_is_named(
+def test_a_marker_or_camera_in_another_place_than_its_file_says_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = box_rig()
@@ -204,19 +204,22 @@ def test_a_marker_in_another_place_than_the_rig_says_is_named(
     places[2, 0, 3] += 0.05
     wrong = replace(rig, robot_from_marker=places)
     network = network_of(hall_cameras(4))
+    moved = hall_cameras(4)
+    moved[1, 0, 3] += 0.05
     rng = np.random.default_rng(9)
-    poses = np.stack([robot_pose(rng, 0.5) for _ in range(15)])
-    groups = group_by_time(frames_of(np.arange(15.0), poses, rig=rig), 0.005)
-    for used, widths, expected in (
-        (rig, 1.0, ""),
-        (wrong, 1.0, f"disagree: the pose of marker {rig.ids[2]}, or else "),
-        (rig, 1.05, "disagree: poses or widths of markers, in rig.json"),
+    poses = np.stack([robot_pose(rng, 0.5) for _ in range(6)])
+    groups = group_by_time(frames_of(np.arange(6.0), poses, rig=rig), 0.005)
+    for used, cameras, widths, expected in (
+        (rig, network, 1.0, ""),
+        (wrong, network, 1.0, f"disagree: the pose of marker {rig.ids[2]}, or else "),
+        (rig, network_of(moved), 1.0, "disagree: the pose or clock of camera b, or else "),
+        (rig, network, 1.05, "disagree: poses or widths of markers, in rig.json"),
     ):
         used = replace(used, widths_m=widths * used.widths_m)
         # Markers that are 5 % larger and as much farther apart: a rig of another scale.
         places = used.robot_from_marker.copy()
         places[:, :3, 3] *= widths
         used = replace(used, robot_from_marker=places)
-        track = track_by_markers(groups, used, network, PoseSettings())
-        print_left_out(track, Path("rig.json"), Path("network.json"))
+        track = track_by_markers(groups, used, cameras, PoseSettings())
+        print_left_out(track, cameras, Path("rig.json"), Path("network.json"))
         assert expected in capsys.readouterr().err
