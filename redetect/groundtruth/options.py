@@ -213,8 +213,8 @@ class Report:
     Example: groundtruth report SESSION --truth truth.csv -o report.html
     """
 
-    # Folder with the building and those of the results laser.csv, camera.csv, fused.csv, clock.json
-    # and validation that exist.
+    # Folder with the building and those of the results laser.csv, camera.csv or poses.csv,
+    # fused.csv, clock.json and validation that exist.
     session: Positional[Path]
     # True or reference poses (t, x, y, theta); by default truth.csv in the session, if it exists.
     truth: MaybePath = None

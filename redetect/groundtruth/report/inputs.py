@@ -55,7 +55,7 @@ class Inputs:
     odometry: PlanarPoses | None = None  # Aligned with truth, or fused poses, in each visit
     truth: PlanarPoses | None = None
     clock: ClockModel | None = None
-    # Contents of `laser.json`, `fused.json`, `clock.json`, `validation.json`, `aligned.json`
+    # Contents of `laser.json`, `camera.json`, `fused.json`, ..., by their files' names
     documents: dict[str, dict[str, Any]] = field(default_factory=dict)
     pictures: dict[str, bytes] = field(default_factory=dict)  # By the names in `PICTURES` (PNG)
     dimensions: list[Dimension] = field(default_factory=list)  # Tape measurements
@@ -72,8 +72,12 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     inputs = Inputs(session.resolve().name)
     inputs.building = _building(session, inputs)
+    # `groundtruth poses` writes poses.csv if it is not told another name.
+    names = [name for name in ("camera", "poses") if (session / f"{name}.csv").is_file()]
+    camera = names[0] if names else "camera"
     for name in STREAMS:
-        path, optional = session / f"{name}.csv", name == "filtered"
+        path = session / f"{camera if name == 'camera' else name}.csv"
+        optional = name == "filtered"
         if (stream := _read(inputs, path, read_planar_poses, optional=optional)) is not None:
             inputs.streams[name] = stream
     if truth is not None:
@@ -81,8 +85,8 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
     else:
         inputs.truth = _read(inputs, session / "truth.csv", read_planar_poses)
     inputs.clock = _read(inputs, session / "clock.json", read_clock)
-    for name in ("aligned", "laser", "clock", "fused", "validation/validation"):
-        path, optional = session / f"{name}.json", name == "clock"
+    for name in ("aligned", "laser", camera, "clock", "fused", "validation/validation"):
+        path, optional = session / f"{name}.json", name in ("clock", camera)
         if (document := _read(inputs, path, read_json, optional=optional)) is not None:
             inputs.documents[path.name] = document
     inputs.visits = _visits(inputs)

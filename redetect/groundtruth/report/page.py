@@ -212,6 +212,8 @@ def _errors(inputs: Inputs) -> list[Part]:
     fused = inputs.streams.get("fused")
     if fused is not None and len(in_visits(fused, inputs.visits)) < len(fused):
         compared.append(("fused, pauses included", "", fused))
+    if not compared:
+        return [Part("note", "No poses to compare with the truth.")]
     for label, name, poses in compared:
         try:
             mine, theirs, _ = matched_streams(poses, inputs.truth)
@@ -374,6 +376,11 @@ def _rejected(inputs: Inputs) -> list[Part]:
     if suspects:
         words = f"Scanners that disagree with the others: {', '.join(suspects)}."
         content.append(Part("problem", words))
+    cameras = inputs.documents.get("camera.json", inputs.documents.get("poses.json", {}))
+    if times := _entry(cameras, "times", dict):
+        counts = ", ".join(f"{_value(number)} {status}" for status, number in times.items())
+        words = f"Times of images: {counts}; squared residuals per degree of freedom "
+        content.append(Part("text", f"{words}{_number(cameras.get('reduced_cost'), 1.0)}."))
     fused = inputs.documents.get("fused.json")
     if fused is None:
         return [*content, Part("note", "No results of a fusion (fused.json).")]

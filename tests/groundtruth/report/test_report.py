@@ -246,6 +246,21 @@ def test_what_is_missing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "--force" in capsys.readouterr().err
 
 
+def test_a_session_of_markers_alone_is_shown(tmp_path: Path) -> None:
+    """Cameras' poses have the name that `groundtruth poses` gives them by default."""
+    write_planar_poses(tmp_path / "truth.csv", stream(0.0, 9, covariance=False))
+    assert "No poses to compare" in Page(report_page(gather(tmp_path), "1")).text
+    write_planar_poses(tmp_path / "poses.csv", stream(0.05, 1))
+    outcome = {"times": {"clear": 198, "failed": 2}, "reduced_cost": 1.02}
+    (tmp_path / "poses.json").write_text(json.dumps(outcome))
+    inputs = gather(tmp_path)
+    assert "camera.csv" not in inputs.missing
+    page = Page(report_page(inputs, "1"))
+    assert "cameras 200 " in page.text
+    assert "Times of images: 198 clear, 2 failed; squared residuals" in page.text
+    assert "No values to show" not in page.text
+
+
 def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     session: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
