@@ -246,7 +246,8 @@ def test_a_rig_from_a_session(tmp_path: Path, capsys: Captured) -> None:
     ("width", "names"),
     [
         ("0", "width_m is 0"),
-        ("0.2", "markers of the dictionaries ['aruco', 'rawseeds']: expected markers of one"),
+        ("200", "expected metres above 0, at most 10 (200 mm are 0.2)"),
+        ("0.2", "['aruco', 'rawseeds'] in the images: expected markers of one"),
     ],
 )
 def test_rigs_that_cannot_be_made_are_refused(
@@ -258,6 +259,11 @@ def test_rigs_that_cannot_be_made_are_refused(
     output = tmp_path / "rig.json"
     refused(["rig", str(session / "a"), "--width-m", width, "-o", str(output)], names, capsys)
     assert not output.exists()
+    run, options = str(session / "a"), ["--width-m", "0.2", "-o", str(output)]
+    refused(["rig", run, f"{run}/../a", *options], "each of them once", capsys)
+    refused(["rig", *options], "expected one or more run folders", capsys)
+    both = ["--reference", "33", "--robot", str(session / "rig.json")]
+    refused(["rig", run, *options, *both], "--reference is of no use with --robot", capsys)
     (session / "a" / "a.cam").rename(session / "a" / "x.cam")
     write_camera(lens(), session / "a" / "y.cam")
     command = ["rig", str(session / "a"), "--width-m", "0.2", "-o", str(output)]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from camera import camera_file_in, read_camera
-from redetect.bounds import ABOVE_0, demand
+from redetect.bounds import demand
 from redetect.groundtruth.commands import outputs
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers import session
@@ -83,7 +83,11 @@ def perform_network(command: Network) -> int:
 
 def perform_rig(command: Rig) -> int:
     """Carry out ``groundtruth rig``; returns the exit code."""
-    demand(command, GroundTruthError, width_m=ABOVE_0)
+    demand(command, GroundTruthError, width_m=session.WIDTH)
+    if command.robot is not None and command.reference is not None:
+        raise GroundTruthError("--reference is of no use with --robot: expected one of them")
+    if not command.runs or len({run.resolve() for run in command.runs}) < len(command.runs):
+        raise GroundTruthError("expected one or more run folders, each of them once")
     picture = command.output.with_suffix(".png")
     outputs.check_outputs((command.output, picture), command.force)
     network, groups = _input(command)
@@ -129,7 +133,7 @@ def perform_rig(command: Rig) -> int:
     if abs(width - command.width_m) > max(_WRONG_SIGMAS * sigma, _WRONG_SHARE * width):
         outputs.warn(
             f"the cameras of {command.network} see markers {width:.5f} m wide (sigma "
-            f"{sigma:.5f} m): --width-m {command.width_m:g}, or the scale of the network, is wrong"
+            f"{sigma:.5f} m): --width-m {command.width_m:g}, or the network, is wrong"
         )
     outputs.print_sigmas("marker", [str(marker) for marker in rig.ids], rig.covariance)
     print(

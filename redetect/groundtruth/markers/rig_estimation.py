@@ -90,9 +90,8 @@ def estimate_rig(
     markers = [marker for group in groups for frame in group for marker in frame.markers]
     dictionaries = sorted({marker.dictionary for marker in markers})
     if len(dictionaries) != 1:
-        raise GroundTruthError(
-            f"markers of the dictionaries {dictionaries}: expected markers of one dictionary"
-        )
+        found = f"markers of the dictionaries {dictionaries}" if dictionaries else "no markers"
+        raise GroundTruthError(f"{found} in the images: expected markers of one dictionary")
     # Pairs of markers seen together, and a consensus for each pair.
     ids = tuple(sorted({marker.id for marker in markers}))
     candidates = _bare_rig(dictionaries[0], ids, width_m)

@@ -25,7 +25,8 @@ from redetect.landmarks import MarkerLandmark, read_frames
 from redetect.landmarks.frames import read_times
 
 _QUATERNION_TOLERANCE = 1e-3
-_WIDTH = Bounds("metres above 0", lambda x: x > 0.0)
+#: Widths of markers.
+WIDTH = Bounds("metres above 0, at most 10 (200 mm are 0.2)", lambda x: 0.0 < x <= 10.0)
 DETECTED_NAME = "detected.markers"
 
 
@@ -78,7 +79,7 @@ def read_rig(path: PathLike) -> Rig:
     if len(ids) != len(markers) or (ids and ids[0] < 0):
         raise GroundTruthError(f"{path}: markers: expected different IDs of 0 or more")
     entries = {str(marker): by_id[marker] for marker in ids}
-    widths = np.array([entry.number("width_m", _WIDTH) for entry in entries.values()])
+    widths = np.array([entry.number("width_m", WIDTH) for entry in entries.values()])
     poses = np.stack([parse_pose(entry) for entry in entries.values()])
     return Rig(dictionary, ids, widths, poses, _joint_covariance(content, "markers", entries))
 
