@@ -70,7 +70,7 @@ def perform_network(command: Network) -> int:
         outputs.warn(
             "the boards' pictures contradict each other (the standard deviations were multiplied "
             f"by {estimate.disagreement**0.5:.1f}): was a board moved between the pictures of one "
-            "placement, or is a calibration wrong?"
+            "placement, or is a calibration, a board's square_m or first_from_second wrong?"
         )
     elif estimate.connections < 1:
         outputs.warn(
