@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.kernels import project_floor_point
-from detect.discs.model import F32
+from detect.discs.model import F32, FASTMATH
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
@@ -126,7 +126,8 @@ def profiles(
         dx, dy = radius * COS[k], radius * SIN[k]
         u1, v1 = project_floor_point(camera_numbers, x + half * dx, y + half * dy)
         u2, v2 = project_floor_point(camera_numbers, x + FARTHEST * dx, y + FARTHEST * dy)
-        scale[k] = math.hypot(u1 - u0, v1 - v0) / half
+        du, dv = u1 - u0, v1 - v0
+        scale[k] = math.sqrt(du * du + dv * dv) / half
         for m in range(STEPS):
             u = _BEGIN[m] * F32(u0) + _MIDDLE[m] * F32(u1) + _END[m] * F32(u2)
             v = _BEGIN[m] * F32(v0) + _MIDDLE[m] * F32(v1) + _END[m] * F32(v2)
@@ -194,7 +195,7 @@ class Circle(NamedTuple):
     cov_yy: float
 
 
-@kernel()
+@kernel(forceinline=True, fastmath=FASTMATH)
 def fit_circle(
     x: FloatArray, y: FloatArray, weight: FloatArray, circle: Circle, radius_sigma: float
 ) -> Circle:
@@ -246,7 +247,7 @@ def within(step: float, longest: float) -> float:
     return min(max(step, -longest), longest)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _choose(
     x: FloatArray,
     y: FloatArray,
