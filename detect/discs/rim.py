@@ -241,6 +241,13 @@ def fit_circle(
     )
 
 
+@kernel(forceinline=True)
+def _outwards(x: float, y: float, circle: Circle) -> float:
+    """Distance of a point from the circle, negative inside it. (`math.hypot` is much slower.)"""
+    x, y = x - circle.x, y - circle.y
+    return math.sqrt(x * x + y * y) - circle.radius
+
+
 @kernel()
 def within(step: float, longest: float) -> float:
     """The step, or one of the longest length."""
@@ -263,8 +270,7 @@ def _choose(
     """
     count = changed = 0
     for k in range(np.uint64(len(x))):
-        dx, dy = x[k] - circle.x, y[k] - circle.y
-        off = abs(math.sqrt(dx * dx + dy * dy) - circle.radius)
+        off = abs(_outwards(x[k], y[k], circle))
         now = weight[k] if off < wide * tolerance[k] else 0.0
         count += 1 if now > 0.0 else 0
         changed |= 1 if now != chosen[k] else 0
@@ -355,8 +361,7 @@ def follow_rim(
     outside = np.zeros(DIRECTIONS, np.bool_)
     for k in range(DIRECTIONS):
         if chosen[k] > 0.0:
-            off = math.hypot(at_x[k] - best.x, at_y[k] - best.y) - best.radius
-            squares += (off / tolerance[k]) ** 2
+            squares += (_outwards(at_x[k], at_y[k], best) / tolerance[k]) ** 2
             mean += step[k]
         else:
             rim_x = x + radius * (best.x + best.radius * COS[k])
@@ -396,22 +401,20 @@ def _placed(x: FloatArray, y: FloatArray, chosen: FloatArray, circle: Circle) ->
     if count < LEAST_TRUSTED:
         for k in range(DIRECTIONS):
             trusted[k] = chosen[k]
-    off = np.empty(DIRECTIONS)
+    off, of_trusted = np.empty(DIRECTIONS), np.empty(DIRECTIONS)
     for _ in range(_PLACING_STEPS):
         circle = fit_circle(x, y, trusted, circle, PLACING_SIGMA)
         n = 0
         for k in range(DIRECTIONS):
+            off[k] = math.sqrt(trusted[k]) * abs(_outwards(x[k], y[k], circle))
             if trusted[k] > 0.0:
-                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
-                off[n] = abs(residual) * math.sqrt(trusted[k])
+                of_trusted[n] = off[k]
                 n += 1
-        limit = max(_FAR_OFF * 1.4826 * median(off[:n]), 1.0)
+        limit = max(_FAR_OFF * 1.4826 * median(of_trusted[:n]), 1.0)
         for k in range(DIRECTIONS):
-            if trusted[k] > 0.0 and n > LEAST_TRUSTED:
-                residual = math.hypot(x[k] - circle.x, y[k] - circle.y) - circle.radius
-                if abs(residual) * math.sqrt(trusted[k]) > limit:
-                    trusted[k] = 0.0
-                    n -= 1
+            if off[k] > limit and n > LEAST_TRUSTED:
+                trusted[k] = 0.0
+                n -= 1
     return circle
 
 
