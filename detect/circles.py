@@ -281,15 +281,12 @@ def judged(
 
 def adjusted_log_odds(judgement: JudgedCandidates, settings: CircleSettings) -> FloatArray:
     """(N,) log-odds of candidates, compared with each other; minus infinity without a rim."""
-    rims = np.flatnonzero(judgement.outcome == Outcome.JUDGED)
-    step, log_odds = judgement.step[rims], judgement.log_odds[rims]
+    step, log_odds = judgement.step, judgement.log_odds
     sure = log_odds >= SURE
-    penalty = paleness_penalty(step, judgement.floor_grey[rims], sure)
+    penalty = paleness_penalty(step, judgement.floor_grey, sure)
     if settings.polarity == "any":
         penalty += sign_penalty(step, sure)
-    adjusted = np.full(len(judgement.outcome), -np.inf)
-    adjusted[rims] = log_odds - penalty
-    return adjusted
+    return np.where(judgement.outcome == Outcome.JUDGED, log_odds - penalty, -np.inf)
 
 
 def _by_quality(
