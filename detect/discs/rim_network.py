@@ -41,7 +41,7 @@ _Weights = Float32Array
 
 
 class RimNetwork(NamedTuple):
-    """Weights of N networks of I inputs for each direction, C channels and D dense units."""
+    """Weights of N networks: for each direction I inputs, C channels (an even number); D units."""
 
     around: _Weights  # (N, 3, I, C) first convolution: the direction before, the same, the next one
     around_bias: _Weights  # (N, C)
@@ -80,17 +80,16 @@ def network_inputs(
     """The input of a network for N samples: (N, K, M) grey values in K directions at M distances.
 
     Grey values are NaN outside the image. `sign` (N,) is -1 for dark discs, which are seen as light
-    ones. The inputs (M + OTHERS, N (K + 2)) are deviations from the mean relative to their root
+    ones. The inputs (M + OTHERS, (K + 2) N) are deviations from the mean relative to their root
     mean square, 0 outside the image; the logarithm of the pixels per radius; the share outside.
-    Those of each sample are padded by the last direction in front and the first at the end. The
-    scales (N, SCALES) are logarithms of the pixels per radius and of the root mean square, relative
-    to usual ones.
+    Samples follow each other in each direction; the last direction is repeated in front, the first
+    at the end. The scales (N, SCALES) are logarithms of the pixels per radius and of the root mean
+    square, relative to usual ones.
     """
     samples, directions, distances = grey.shape
-    inputs = np.zeros((distances + OTHERS, samples * (directions + 2)), np.float32)
+    inputs = np.zeros((distances + OTHERS, (directions + 2) * samples), np.float32)
     scales = np.empty((samples, SCALES), np.float32)
     for sample in range(samples):
-        first = sample * (directions + 2) + 1
         total = squares = size = 0.0
         n = 0
         for k in range(directions):
@@ -107,17 +106,17 @@ def network_inputs(
         deviation = math.sqrt(squares / max(n, 1) - mean * mean + _NOISE)
         scale = sign[sample] / deviation
         for k in range(directions):
-            outside = 0
+            column, outside = (k + 1) * samples + sample, 0
             for m in range(distances):
                 value = np.float64(grey[sample, k, m])
                 if value == value:
-                    inputs[m, first + k] = scale * (value - mean)
+                    inputs[m, column] = scale * (value - mean)
                 else:
                     outside += 1
             log_size = math.log(np.float32(pixels_per_radius[sample, k])) - 1.5
             size += log_size
-            inputs[distances, first + k] = log_size
-            inputs[distances + 1, first + k] = outside / distances
+            inputs[distances, column] = log_size
+            inputs[distances + 1, column] = outside / distances
         scales[sample, 0] = size / directions
         scales[sample, 1] = math.log(deviation) - 2.5
     _pad(inputs, samples)
@@ -126,31 +125,32 @@ def network_inputs(
 
 @kernel()
 def _pad(values: _Weights, samples: int) -> None:
-    """Put the last direction of each sample before its first, and the first behind the last."""
-    width = values.shape[1] // samples
+    """Put the last direction of the samples before their first, and the first behind the last."""
     for row in values:
-        for first in range(0, len(row), width):
-            last = first + width - 1
-            row[first], row[last] = row[last - 1], row[first + 1]
+        for first in range(samples):
+            last = len(row) - 1 - first
+            row[first], row[last] = row[first - 2 * samples], row[2 * samples - 1 - first]
 
 
 @kernel(fastmath={"contract"})
 def _convolve(values: _Weights, weights: _Weights, bias: _Weights, samples: int) -> _Weights:
-    """Convolution over three neighbours on a circle, and relu, as (C, N (K + 2)) float32."""
+    """Convolution over three neighbours on a circle, and relu, as (C, (K + 2) N) float32."""
     result = np.zeros((len(bias), values.shape[1]), np.float32)
-    # Across the samples, too, so that the loops are long; what is between them is overwritten.
-    inner = values.shape[1] - 2
-    for c in range(len(bias)):
-        row = result[c, 1:]
+    # Over directions and samples at once, so that loops are long and what they load is aligned.
+    step, inner = np.uint64(samples), np.uint64(values.shape[1] - 2 * samples)
+    for c in range(0, len(bias), 2):  # by pairs, which share what is loaded
+        one, other = result[c, samples:], result[c + 1, samples:]
         for k in range(inner):
-            row[k] = bias[c]
+            one[k], other[k] = bias[c], bias[c + 1]
         for i in range(len(values)):
             seen = values[i]
-            before, same, after = weights[0, i, c], weights[1, i, c], weights[2, i, c]
+            a, b = weights[:, i, c], weights[:, i, c + 1]
             for k in range(inner):
-                row[k] += before * seen[k] + same * seen[k + 1] + after * seen[k + 2]
+                before, same, after = seen[k], seen[k + step], seen[k + step + step]
+                one[k] += a[0] * before + a[1] * same + a[2] * after
+                other[k] += b[0] * before + b[1] * same + b[2] * after
         for k in range(inner):
-            row[k] = max(row[k], np.float32(0.0))
+            one[k], other[k] = max(one[k], np.float32(0.0)), max(other[k], np.float32(0.0))
     _pad(result, samples)
     return result
 
@@ -159,11 +159,10 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights, samples: int)
 def _pool(values: _Weights, scales: _Weights) -> _Weights:
     """(N, 3 C + SCALES) mean, maximum and minimum of channels of N samples, and their scales."""
     channels, samples = len(values), len(scales)
-    width = values.shape[1] // samples
     pooled = np.empty((samples, 3 * channels + scales.shape[1]), np.float32)
     for sample in range(samples):
         for c in range(channels):
-            row = values[c, sample * width + 1 : (sample + 1) * width - 1]
+            row = values[c, samples + sample : -samples : samples]
             total, most, least = np.float32(0.0), row[0], row[0]
             for k in range(len(row)):
                 total += row[k]
