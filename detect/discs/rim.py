@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera.kernels import project_floor_point
-from detect.discs.model import F32, FASTMATH
+from detect.discs.model import F32
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
@@ -195,7 +195,7 @@ class Circle(NamedTuple):
     cov_yy: float
 
 
-@kernel(forceinline=True, fastmath=FASTMATH)
+@kernel()
 def fit_circle(
     x: FloatArray, y: FloatArray, weight: FloatArray, circle: Circle, radius_sigma: float
 ) -> Circle:

@@ -41,7 +41,7 @@ _Weights = Float32Array
 
 
 class RimNetwork(NamedTuple):
-    """Weights of N networks: for each direction I inputs, C channels (an even number); D units."""
+    """Weights of N networks of I inputs for each direction, C channels and D dense units."""
 
     around: _Weights  # (N, 3, I, C) first convolution: the direction before, the same, the next one
     around_bias: _Weights  # (N, C)
@@ -138,19 +138,17 @@ def _convolve(values: _Weights, weights: _Weights, bias: _Weights, samples: int)
     result = np.zeros((len(bias), values.shape[1]), np.float32)
     # Over directions and samples at once, so that loops are long and what they load is aligned.
     step, inner = np.uint64(samples), np.uint64(values.shape[1] - 2 * samples)
-    for c in range(0, len(bias), 2):  # by pairs, which share what is loaded
-        one, other = result[c, samples:], result[c + 1, samples:]
+    for c in range(len(bias)):
+        row = result[c, samples:]
         for k in range(inner):
-            one[k], other[k] = bias[c], bias[c + 1]
+            row[k] = bias[c]
         for i in range(len(values)):
             seen = values[i]
-            a, b = weights[:, i, c], weights[:, i, c + 1]
+            before, same, after = weights[0, i, c], weights[1, i, c], weights[2, i, c]
             for k in range(inner):
-                before, same, after = seen[k], seen[k + step], seen[k + step + step]
-                one[k] += a[0] * before + a[1] * same + a[2] * after
-                other[k] += b[0] * before + b[1] * same + b[2] * after
+                row[k] += before * seen[k] + same * seen[k + step] + after * seen[k + step + step]
         for k in range(inner):
-            one[k], other[k] = max(one[k], np.float32(0.0)), max(other[k], np.float32(0.0))
+            row[k] = max(row[k], np.float32(0.0))
     _pad(result, samples)
     return result
 

@@ -58,7 +58,7 @@ _GAIN, _NOISE, _NOISY = 0.3, 4.0, 0.3
 class Shape(NamedTuple):
     """How large networks are, how many are averaged, and how often each sees every sample."""
 
-    channels: int  # an even number
+    channels: int
     units: int
     members: int
     epochs: int

@@ -87,7 +87,7 @@ def _report(mapped: MappedRun, check: OdometryCheck, seconds: float) -> list[str
     said = [
         (left_out.rows_without_id, "rows without an identifier, not used"),
         (left_out.discs_seen_once, "discs seen once"),
-        (left_out.lines_without_parallax, "lines with too little parallax, not used"),
+        (left_out.lines_without_parallax, "lines without a certain position, not used"),
         (left_out.line_rows, "rows of these lines, not used"),
     ]
     lines += [f"{what}: {count}" for count, what in said if count]

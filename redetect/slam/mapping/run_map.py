@@ -123,7 +123,7 @@ class LeftOut:
 
     rows_without_id: int
     discs_seen_once: int  # they are in the map, but nothing checks them
-    lines_without_parallax: int  # in rows of their own, or whose position is lost later
+    lines_without_parallax: int  # in rows of their own, or whose position is not certain later
     line_rows: int  # rows of these lines
     line_ids: tuple[int, ...]  # their identifiers
 
