@@ -354,13 +354,10 @@ class MapProblem(NamedTuple):
         seen, index = np.unique(on.wall, return_inverse=True)
         count, rows = poses.size, np.arange(len(on.error_m))
         columns = [*(3 * on.body + c for c in range(3)), count + 2 * index, count + 2 * index + 1]
-        values = [*on.by_pose.T, on.share - 1.0, -on.share]
-        jacobian = csr_array(
-            (np.concatenate(values), (np.tile(rows, 5), np.concatenate(columns))),
-            shape=(len(rows), count + 2 * len(seen)),
-        )
-        weighted = jacobian.multiply(on.weight[:, None]).T.tocsr()
-        h, g = (weighted @ jacobian).toarray(), weighted @ on.error_m
+        jacobian = np.zeros((len(rows), count + 2 * len(seen)))
+        jacobian[rows, columns] = *on.by_pose.T, on.share - 1.0, -on.share
+        weighted = on.weight[:, None] * jacobian
+        h, g = jacobian.T @ weighted, weighted.T @ on.error_m
         root = np.linalg.cholesky(self._alike(seen))
         h[count:], g[count:] = root.T @ h[count:], root.T @ g[count:]
         h[:, count:] = h[:, count:] @ root
