@@ -98,14 +98,14 @@ def test_a_soak_of_some_seconds(
     assert detect(["all", str(source / "images" / "e.0000.jpg"), "-o", str(tmp_path)]) == 0
     scratch = tmp_path / "scratch"
     scratch.mkdir()
-    arguments = ["--frames", "2000", "--jobs", "1", "--source", str(source)]
+    arguments = ["--frames", "1000", "--jobs", "1", "--source", str(source)]
     code = main([*arguments, "--scratch", str(scratch)])
     said = capsys.readouterr()
     assert code in (0, 1), said.err
     rows = dict(
         re.split(r"  +", line, maxsplit=1) for line in said.out.splitlines() if "  " in line
     )
-    assert rows["frames"] == "2000", said.err
+    assert rows["frames"] == "1000", said.err
     descriptors = [int(number) for number in rows["descriptors"].split()]
     assert "memory grew" not in said.err
     assert 50.0 < float(rows["resident_mib"].split()[0]) < 600.0
