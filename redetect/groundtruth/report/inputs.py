@@ -72,7 +72,7 @@ def gather(session: Path, truth: Path | None = None) -> Inputs:
         raise GroundTruthError(f"{session}: no such folder: expected a session")
     inputs = Inputs(session.resolve().name)
     inputs.building = _building(session, inputs)
-    # `groundtruth poses` writes poses.csv if it is not told another name.
+    # The default output of `groundtruth poses` is poses.csv.
     names = [name for name in ("camera", "poses") if (session / f"{name}.csv").is_file()]
     camera = names[0] if names else "camera"
     for name in STREAMS:
