@@ -172,6 +172,9 @@ def detect_markers(
     hulls = picture.straighten(np.concatenate([np.empty((0, 2)), *(r.hull for r in regions)]))
     ends = np.cumsum([len(region.hull) for region in regions])
     for region, hull in zip(regions, np.split(hulls, ends)):
+        if not np.isfinite(hull).all():
+            rejected[geometry.UNSEEN] += 1
+            continue
         rough = geometry.rough_corners(hull)
         if rough is None or not geometry.is_convex(rough):
             rejected[geometry.NOT_FOUR_CORNERS] += 1

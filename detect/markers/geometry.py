@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 
 from camera import Camera
-from detect.errors import FrameError
 from detect.grey_values import estimate_noise, plain_image
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
@@ -25,6 +24,7 @@ from redetect.compiled import kernel
 _NOISE_ROWS = 64
 
 #: Reasons for rejection, as reported.
+UNSEEN = "where the lens sees nothing"
 NOT_FOUR_CORNERS = "not four corners"
 NO_QUADRANGLE = "no quadrangle"
 #: Quadrangles whose corners are all this near (pixels, and in widths) are duplicates.
@@ -40,7 +40,7 @@ class Picture:
     grey: GreyImage  # (H, W)
     noise: float
     camera: Camera | None
-    straight: Float32Array  # (H, W, 2) straight position of each pixel
+    straight: Float32Array  # (H, W, 2) straight position of each pixel; NaN past the lens's fold
 
     def straighten(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) straight positions of (N, 2) pixels."""
@@ -64,8 +64,7 @@ class Picture:
 def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
     """An image (H, W) with its noise and the distortion of its lens.
 
-    Raises FrameError if the image is not an 8-bit grey image of the camera's size, or the
-    calibration has no direction for some of its pixels.
+    Raises FrameError if the image is not an 8-bit grey image of the camera's size.
     """
     grey = plain_image(image, None if camera is None else (camera.height, camera.width))
     height, width = grey.shape
@@ -76,10 +75,7 @@ def picture_of(image: GreyImage, camera: Camera | None) -> Picture:
 @functools.lru_cache(maxsize=4)
 def _straight_positions(camera: Camera | None, width: int, height: int) -> Float32Array:
     pixels = np.moveaxis(np.mgrid[:height, :width][::-1], 0, -1).astype(np.float64)
-    straight = pixels if camera is None else _straightened(camera, pixels)
-    if not np.all(np.isfinite(straight)):
-        raise FrameError("the calibration has no direction for some pixels of the image")
-    return np.asarray(straight, np.float32)
+    return np.asarray(pixels if camera is None else _straightened(camera, pixels), np.float32)
 
 
 def _straightened(camera: Camera, pixels: FloatArray) -> FloatArray:
