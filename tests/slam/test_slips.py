@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
 from redetect.slam.filters.base import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_run
@@ -36,10 +36,7 @@ def test_localisation_survives_slips(method: Literal["nearest", "joint"], seed: 
     discs = Landmarks(
         np.arange(1, _DISCS + 1), run.disc_xy, np.zeros((_DISCS, 2, 2)), np.ones(_DISCS, np.int64)
     )
-    none = Landmarks(
-        np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.int64)
-    )
-    found = localize_run(run.recording, LandmarkMap(discs, none), Associator(method))
+    found = localize_run(run.recording, LandmarkMap(discs, no_landmarks()), Associator(method))
     right = found.disc_ids == run.recording.circles.ids
     assert np.mean(right) > 0.9
     assert errors_m(found.path.poses, run).max() < 0.25
