@@ -72,7 +72,7 @@ class DetectProgram(Program):
         radius = ArgumentParser(add_help=False, allow_abbrev=False)
         radius.add_argument("--radius-m", dest="given", nargs="?", action="append", default=[])
         found, rest = radius.parse_known_args(arguments)
-        if "auto" in found.given and arguments[0] in ("circles", "all"):
+        if found.given[-1:] == ["auto"] and arguments[0] in ("circles", "all"):
             arguments = [*rest, "--find-radius"]
         deciding = ArgumentParser(add_help=False, allow_abbrev=False)
         for flag in ("--preset", "--settings"):

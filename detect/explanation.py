@@ -196,6 +196,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
     if not stages:
         return f"There is no candidate in {searched}: no edges lie on a circle."
     outcomes = (
+        (stages["outside"], "have their centre outside the image"),
         (stages["polarity"], f"are not {settings.polarity} (--polarity any)"),
         (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
         (stages["prescreening"] + stages["rim"], "have no rim of this radius (--radius-m)"),

@@ -30,7 +30,7 @@ def plain_image(image: GreyImage, shape: tuple[int, int] | None = None) -> GreyI
     It is copied if it is not; for a read-only one, Numba would compile every kernel once more.
     Raises `FrameError` if it is not (H, W) uint8, or not of a calibration's `shape`.
     """
-    if image.ndim != 2 or image.dtype != np.uint8:
+    if image.ndim != 2 or image.dtype != np.uint8 or image.size == 0:
         raise FrameError(
             f"the image is {image.dtype} of shape {image.shape}: expected grey values, uint8 of "
             "shape (H, W); cv2.cvtColor converts colour, image >> 8 converts 16 bits (files of "

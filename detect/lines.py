@@ -176,13 +176,16 @@ def width_for(sharpness: float, settings: LineSettings) -> float:
 @lru_cache(maxsize=32)
 def widened(settings: LineSettings, width: float) -> LineSettings:
     """The settings for edges `width` times as wide; only larger `blurred_widths` remain."""
-    width = min(width, WIDEST_FILTER_PX / max(getattr(settings, name) for name in _FILTERS))
+    most = WIDEST_FILTER_PX / max(getattr(settings, name) for name in _FILTERS)
+    wider = tuple(other / width for other in settings.blurred_widths if other > width)
+    if width > most:
+        width, wider = most, ()
     across = {name: width * getattr(settings, name) for name in _ACROSS}
+    across |= {name: min(across[name], WIDEST_FILTER_PX) for name in _FILTERS}  # rounding
     steps = tuple(
         (min(width * scale, _WIDEST_STEP_PX), width * most)
         for scale, most in settings.refine_steps_px
     )
-    wider = tuple(other / width for other in settings.blurred_widths if other > width)
     return replace(settings, refine_steps_px=steps, blurred_widths=wider, **across)
 
 

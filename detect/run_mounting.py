@@ -40,7 +40,7 @@ class Mounting:
 
     tilt_rad: FloatArray  # (2,) pitch and roll that level measured directions
     sigma_rad: FloatArray  # (2,) their standard deviations, including errors of the lens
-    raised_m: float  # higher than calibrated; NaN if there are too few discs
+    raised_m: float  # higher than calibrated; NaN if the discs do not determine it
     raised_sigma_m: float
     frames: int  # with a tilt from verticals
     frames_with_discs: int  # those that contribute to the height
@@ -53,7 +53,10 @@ class Mounting:
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
         )
         if math.isnan(self.raised_m):
-            return [lean, "its height is unchanged: too few discs of that radius to estimate it"]
+            why = "too few discs of that radius to estimate it"
+            if self.frames_with_discs >= LEAST_FRAMES:
+                why = "no height explains the outlines of the discs: is their radius right?"
+            return [lean, f"its height is unchanged: {why}"]
         height = (
             f"its height is {100.0 * self.raised_m:+.1f} +- {100.0 * self.raised_sigma_m:.1f} "
             f"cm off the calibrated one, by the discs of {self.frames_with_discs} frames"
@@ -86,13 +89,14 @@ def mounting_of_run(
         slope = float(np.median(higher - lower)) / (HEIGHT_STEPS[2] - HEIGHT_STEPS[0])
         bend = float(np.median(higher + lower - 2.0 * same)) / HEIGHT_STEPS[2] ** 2
         off = float(np.median(same))
-        share = -off / slope
-        for _ in range(5):
+        share = 0.0 if slope else math.inf
+        for _ in range(6 if slope else 0):
             share = -(off + 0.5 * bend * share**2) / slope
-        spread = 1.4826 * float(np.median(np.abs(same - off)))
-        statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
-        raised_m = share * height_m if abs(share) < _MOST_RAISED else math.nan
-        sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
+        if abs(share) < _MOST_RAISED:
+            spread = 1.4826 * float(np.median(np.abs(same - off)))
+            statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
+            raised_m = share * height_m
+            sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
     frames = int(np.count_nonzero(verticals.known))
     return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)
 

@@ -297,7 +297,8 @@ def _estimated(series: Sequence[_Series]) -> list[_Axis]:
                 math.exp(-math.exp(-frames) / _FRAMES),
                 math.exp(unknowns[0]),
                 math.exp(outlines),
-                offset + _UNIT_RAD * to_offset,
+                # NaN is equal only to itself, the same object: any other is not in the cache.
+                offset + _UNIT_RAD * to_offset if has_outlines else math.nan,
             )
             for (lean, offset), (to_lean, spread, frames, outlines, to_offset) in zip(
                 middle, unknowns[1:].reshape(len(series), -1), strict=True

@@ -46,9 +46,9 @@ def on_compilation(call: Callable[[], object]) -> Callable[[], None]:
         depth = 0  # of kernels that are compiled because others call them
 
         def on_start(self, _: object) -> None:
-            call()
-            self.depth += 1
+            self.depth += 1  # the compilation ends even if the call raises
             gc.disable()
+            call()
 
         def on_end(self, _: object) -> None:
             self.depth -= 1

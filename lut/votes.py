@@ -36,9 +36,9 @@ class VoteShape:
     border_px: int = 6  #: Least distance from the image's border.
     #: Largest step of the floor from one image row to the next; infinite: no limit.
     far_limit_m_per_px: float = 0.12
-    #: Radius of the discs in pixels, the geometric mean along both axes of the image. Larger ones
-    #: are searched in a reduced image.
-    smallest_px: float = 0.0
+    #: Radius of the discs in pixels, the geometric mean along both axes of the image. Smaller ones
+    #: cannot be found, larger ones are searched in a reduced image.
+    smallest_px: float = 0.5
     largest_px: float = 20.0
 
 

@@ -79,6 +79,19 @@ def test_without_discs_the_height_stays() -> None:
     assert "height is unchanged" in found.sentences()[1]
 
 
+@pytest.mark.parametrize("by_height", [0.0, -1.0])
+def test_an_implausible_height_is_not_stated(by_height: float) -> None:
+    """Nor how certain it is, since the calibration's covariance would become that."""
+    verticals, _ = drive((0.01, 0.0), 0.0)
+    pitches = np.full((200, 1), 1.0) + by_height * np.array(HEIGHT_STEPS)
+    found = mounting_of_run(HEIGHT_M, verticals, pitches)
+
+    assert found is not None
+    assert math.isnan(found.raised_m)
+    assert math.isnan(found.raised_sigma_m)
+    assert "is their radius right?" in found.sentences()[1]
+
+
 def test_without_verticals_there_is_no_mounting() -> None:
     verticals, pitches = drive((0.01, 0.0), 0.0)
     verticals.tilt[:] = math.nan
@@ -195,7 +208,7 @@ def test_a_height_far_off_is_estimated_or_left(
     assert (
         main(["level", str(run), "--camera", str(tmp_path / "wrong.cam"), "-o", str(output)]) == 0
     )
-    left = "its height is unchanged: too few discs of that radius" in capsys.readouterr().out
+    left = "its height is unchanged: no height explains" in capsys.readouterr().out
     assert left == (height_m == 1.1)
     expected = height_m if left else 1.50354
     assert read_camera(output).centre[2] == pytest.approx(expected, abs=0.02)

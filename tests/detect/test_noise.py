@@ -122,7 +122,10 @@ def test_kernels_get_one_kind_of_image(
     assert plain_image(image) is image
 
 
-@pytest.mark.parametrize("image", [np.zeros(9), np.zeros(SHAPE), np.zeros((*SHAPE, 3), np.uint8)])
+NO_IMAGES = [np.zeros(9), np.zeros(SHAPE), np.zeros((*SHAPE, 3), np.uint8), np.zeros((0, 5), "u1")]
+
+
+@pytest.mark.parametrize("image", NO_IMAGES)
 def test_other_arrays_are_no_images(image: NDArray[np.uint8]) -> None:
     with pytest.raises(
         FrameError, match=r"the image is \w+ of shape .*: expected grey values, uint8"

@@ -58,6 +58,16 @@ def test_a_camera_that_looks_straight_down_finds_discs() -> None:
     assert apart.min(axis=0).max() < 2e-3
 
 
+def test_the_floor_at_the_horizon_takes_no_memory(published_camera: Camera) -> None:
+    """Without a far limit, a row of pixels that nearly looks along the floor sees it 3e7 m away."""
+    level = np.array([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, -1.0, 0.0, 1.2]])
+    pose = tuple(map(tuple, level))
+    level_camera = Camera(768, 288, 400.0, 200.0, 384.0, 143.99999, (0.0,) * 5, pose)
+    table = build_vote_table(level_camera, VoteShape(far_limit_m_per_px=np.inf))
+    assert 5.0 < table.ahead.max() < 100.0
+    assert len(table.row_of_step) < 100_000
+
+
 def test_sizes_are_those_of_the_outlines(published_camera: Camera) -> None:
     pixel = [500.0, 180.0]
     outline = circle_on_floor(published_camera.floor_from_pixel(pixel), 0.05, 64)

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+
+import pytest
+from numba.core import event
+
+from detect.terminal import on_compilation
 
 PAIRED = """
 from typing import NamedTuple
@@ -33,6 +40,22 @@ from kernels import of
 on_compilation(cache(lambda: print("compiles")))
 sys.exit(exit_code_of(lambda: print(of(1.0, 2.0), of(1, 2)) or 0))
 """
+
+
+def test_garbage_is_collected_again_although_a_call_before_compilation_fails() -> None:
+    collected = []
+
+    def refuse_once() -> None:
+        if not collected:
+            raise RuntimeError
+
+    stop = on_compilation(refuse_once)
+    for expected in (pytest.raises(RuntimeError), nullcontext()):
+        with expected, event.trigger_event("numba:compile"):
+            pass
+        collected.append(gc.isenabled())
+    stop()
+    assert collected == [True, True]
 
 
 def run(folder: Path) -> subprocess.CompletedProcess[str]:

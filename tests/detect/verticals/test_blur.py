@@ -88,6 +88,8 @@ def test_filters_become_no_wider_than_allowed() -> None:
     wide = replace(DEFAULT, sigma_across_px=20.0, fine_scale_px=20.0, coarse_scale_px=40.0)
     assert widened(wide, 6.0).coarse_scale_px == 100.0
     assert widened(wide, 6.0).fine_scale_px == 50.0
+    assert widened(wide, 3.0).blurred_widths == ()
+    assert widened(replace(DEFAULT, coarse_scale_px=16.96), 6.0).coarse_scale_px == 100.0
 
 
 @pytest.mark.parametrize(("turned_px", "blur_px"), [(9, 0.6), (15, 0.6), (1, 3.0), (1, 6.0)])
