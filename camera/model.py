@@ -298,7 +298,11 @@ class Camera:
 
         Metres per pixel; NaN where the pixel does not see the floor.
         """
-        return self._floor_jacobian(self.floor_from_pixel(pixels), self.camera_from_robot)
+        return self.floor_jacobian_at(self.floor_from_pixel(pixels))
+
+    def floor_jacobian_at(self, floor_xy: ArrayLike) -> FloatArray:
+        """`floor_jacobian` at the pixels that see (..., 2) places X, Y on the floor (m)."""
+        return self._floor_jacobian(floor_xy, self.camera_from_robot)
 
     def floor_jacobian_published(self, pixels: ArrayLike) -> FloatArray:
         """d(floor X, Y) / d(u, v) as the data set's own detector has it.
@@ -308,8 +312,9 @@ class Camera:
         """
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.rotation.T)
 
-    def _floor_jacobian(self, floor_xy: FloatArray, camera_from_robot: FloatArray) -> FloatArray:
-        point = np.concatenate([floor_xy, np.zeros_like(floor_xy[..., :1])], axis=-1)
+    def _floor_jacobian(self, floor_xy: ArrayLike, camera_from_robot: FloatArray) -> FloatArray:
+        xy = np.asarray(floor_xy, dtype=np.float64)
+        point = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
         in_camera = (point - self.centre) @ camera_from_robot.T
         pixels_per_metre = self.project_jacobian(in_camera) @ camera_from_robot[:, :2]
         return inverse_2x2(pixels_per_metre)

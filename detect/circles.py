@@ -19,14 +19,14 @@ import cv2
 import numpy as np
 
 from camera import Camera
-from camera.kernels import camera_numbers, project_floor_points, published_camera_numbers
+from camera.kernels import camera_numbers, project_floor_points
 from detect.discs.candidates import best_apart, local_maxima, suppress_published
 from detect.discs.evidence import SURE, paleness_penalty, sign_penalty
 from detect.discs.fit import Scene, working_space
 from detect.discs.hough import HoughCandidates, hough_candidates
 from detect.discs.judgement import JudgedCandidates, Outcome, judge
 from detect.discs.placing import place_discs
-from detect.discs.positions import published_positions, refined_covariances
+from detect.discs.positions import published_covariance, refined_covariance
 from detect.discs.quality import Limits, centres_of
 from detect.discs.rim_network import Networks, trained_networks
 from detect.errors import DetectError
@@ -307,9 +307,9 @@ def _by_quality(
         pixels, quality = pixels[keep], quality[keep]
     keep = suppress_published(pixels, quality, table.floor_xy, settings.separation_m)
     pixels, quality = pixels[keep], quality[keep]
-    numbers, positions = published_camera_numbers(camera), floor_positions(camera)
-    floor_xy, covariance = published_positions(numbers, positions, pixels)
-    return CircleDetections(pixels, floor_xy, covariance, quality, np.full(len(pixels), np.nan))
+    floor_xy = floor_positions(camera)[pixels[:, 1], pixels[:, 0]]
+    covariance, no_evidence = published_covariance(camera, pixels), np.full(len(pixels), np.nan)
+    return CircleDetections(pixels, floor_xy, covariance, quality, no_evidence)
 
 
 def disc_table(camera: Camera, settings: CircleSettings) -> VoteTable | DiscTable:
@@ -333,15 +333,3 @@ def disc_shape(settings: CircleSettings) -> DiscShape:
         least_pairs=settings.least_pairs, apart_px=settings.apart_px,
         stride_m=settings.stride * (outer - inner),
     )  # fmt: skip
-
-
-def refined_covariance(
-    camera: Camera, floor_xy: FloatArray, fitted: FloatArray, sigma_px: float, tilt_sigma_rad: float
-) -> FloatArray:
-    """(N, 2, 2) covariances of refined positions (N, 2), square metres.
-
-    The covariances of the fits, plus those due to standard deviations of pixels and of the tilt.
-    """
-    floor_xy, fitted = (np.ascontiguousarray(each, np.float64) for each in (floor_xy, fitted))
-    centre, variances = np.array(camera.centre, np.float64), (sigma_px**2, tilt_sigma_rad**2)
-    return np.asarray(refined_covariances(_numbers(camera), centre, floor_xy, fitted, *variances))

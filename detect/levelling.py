@@ -28,7 +28,8 @@ import numpy as np
 from camera import Camera
 from camera.model import inverse_2x2
 from camera.uncertainty import covariance_of, floor_by_parameters, tilt_by_parameters
-from detect.circles import CircleDetections, refined_covariance
+from detect.circles import CircleDetections
+from detect.discs.positions import refined_covariance
 from detect.projection import level_positions
 from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks import FrameTilt, circle_arrays, read_frames

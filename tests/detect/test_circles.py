@@ -14,20 +14,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from camera import Camera
-from camera.kernels import published_camera_numbers
 from detect.circles import (
     CircleDetections,
     detect_circles,
     disc_shape,
     disc_table,
 )
-from detect.discs.positions import published_positions
 from detect.errors import DetectError, FrameError
 from detect.lines import detect_lines
 from detect.projection import circle_on_floor
 from detect.settings import REPORT, CircleSettings, Polarity
 from lut import DiscTable, VoteTable, build_vertical_table, cached_disc_table
-from lut.outlines import floor_positions
 from tests.detect.line_scene import mirrored
 from tests.detect.painted_floor import DARK, LIGHT, SHAPES, PaintedFloor
 from tools.detector_maps import quality_of_centres
@@ -274,19 +271,6 @@ def test_published_rows_are_pixels(
     highest = quality == scipy.ndimage.maximum_filter(quality, size=3, mode="constant")
     expected = np.flatnonzero((highest & (quality >= 0.6)).ravel())
     np.testing.assert_array_equal(order, expected)
-
-
-def test_published_rows_have_the_published_covariance(
-    discs_image: NDArray[np.uint8], published_camera: Camera
-) -> None:
-    for asked in (REPORT, replace(DEFAULT, refine=False)):
-        found = detect(discs_image, published_camera, asked)
-        numbers, positions = (
-            published_camera_numbers(published_camera),
-            floor_positions(published_camera),
-        )
-        expected = published_positions(numbers, positions, found.pixels)[1]
-        np.testing.assert_array_equal(found.covariance, expected)
 
 
 # -- laws -----------------------------------------------------------------------------------

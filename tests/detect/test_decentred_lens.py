@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from camera import Camera
-from camera.kernels import published_camera_numbers
 from detect.circles import detect_circles, disc_table
-from detect.discs.positions import published_positions
 from detect.lines import detect_lines
 from detect.markers.geometry import picture_of
 from detect.settings import CircleSettings
 from lut import build_vertical_table
-from lut.outlines import floor_positions
 from tests.detect.line_scene import EDGES, edge_columns, pinhole, render, tilt_of, tilted
 from tests.detect.painted_floor import PaintedFloor
 
@@ -90,28 +87,6 @@ def test_verticals_are_found_as_exactly_as_through_a_radial_lens(lens: dict[str,
     assert errors[0][1] < 0.08
     assert errors[1][1] < 0.08
     assert errors[2][0] > 6e-4
-
-
-@pytest.mark.parametrize("polynomial", [(0.0, 0.0, 0.0), (-0.05, 0.02, -0.004)])
-@pytest.mark.parametrize("tangential", [(0.0, 0.0), TANGENTIAL])
-def test_published_positions_are_the_cameras(
-    published_camera: Camera,
-    tangential: tuple[float, float],
-    polynomial: tuple[float, float, float],
-) -> None:
-    decentred = replace(published_camera, tangential=tangential, polynomial=polynomial)
-    rows, columns = np.mgrid[0 : decentred.height : 7, 0 : decentred.width : 5]
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=-1)
-    numbers, positions = published_camera_numbers(decentred), floor_positions(decentred)
-    floor_xy, covariance = published_positions(numbers, positions, pixels)
-    seen = decentred.floor_from_pixel(pixels)
-    jacobian = decentred.floor_jacobian_published(pixels)
-    expected = 0.04**2 * np.eye(2) + 2.0 * jacobian @ jacobian.swapaxes(-1, -2)
-    np.testing.assert_allclose(floor_xy, seen, rtol=1e-9)
-    near = np.hypot(*seen.T) < 10.0
-    assert near.sum() > 3000
-    np.testing.assert_allclose(floor_xy[near], seen[near], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(covariance[near], expected[near], rtol=1e-7, atol=1e-10)
 
 
 def test_straight_pixels_of_markers(decentred: Camera) -> None:

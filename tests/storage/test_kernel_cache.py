@@ -43,7 +43,7 @@ sys.exit(exit_code_of(lambda: print(of(1.0, 2.0), of(1, 2)) or 0))
 
 
 def test_garbage_is_collected_again_although_a_call_before_compilation_fails() -> None:
-    collected = []
+    collected: list[bool] = []
 
     def refuse_once() -> None:
         if not collected:

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
-from detect.circles import refined_covariance
 from detect.discs.patch import EDGE, Candidate, view_of
 from detect.discs.placing import RADIUS_SIGMA, WHOLE
+from detect.discs.positions import refined_covariance
 from detect.projection import image_positions
 from lut import VoteTable
 from tests.detect.discs.single_fits import fit_discs
