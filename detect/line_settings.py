@@ -57,8 +57,6 @@ class LineSettings:
     gap_rows: Annotated[int, whole(0)] = 6  #: Largest gap that a track bridges, rows.
     #: Whether tracks predict straight lines; else they follow any curve.
     guided: bool = True
-    #: Lower bound of the gain by which a point's offset corrects the prediction.
-    guided_pull: ShareAbove0 = 0.07
     guided_reach_px: Positive = 0.6  #: Largest offset of a point from the prediction.
     #: Steps in which lines are refined on the grey values: width of the Gaussian and largest
     #: displacement of a line by the step; none for the eigen-decomposition of the tracked points
@@ -80,7 +78,6 @@ class LineSettings:
     #: Least sharpness of edges fainter than the image's median, relative to the lower quartile of
     #: the sharpness: fainter and softer edges are shadows and glare.
     least_sharpness: NotNegative = 0.87
-    soft_evidence: NotNegative = 40.0  #: Such edges are kept if they have at least this evidence.
     #: Largest distance of a line's end from the horizon (or from the anchor that replaces it if the
     #: horizon is not visible: `lut.verticals`).
     largest_horizon_gap_px: LimitOr0 = 11.0
@@ -94,9 +91,8 @@ class LineSettings:
     #: Variance of a line's lean due to noise, relative to that of noise which is independent from
     #: row to row: the surroundings of an edge and its blur are correlated over many rows.
     lean_noise: NotNegative = 3.0
-    #: Largest lean of a line from the vertical; the next two are added in quadrature.
+    #: Largest lean of a line from the vertical; the next one is added in quadrature.
     largest_lean_deg: LimitOr0 = 0.7
-    largest_lean_sigmas: LimitOr0 = 8.0  #: The same in standard deviations due to noise.
     largest_lean_px: LimitOr0 = 1.5  #: The same in pixels over the line's length.
     largest_tilt_deg: Positive = 8.0  #: Largest absolute pitch and roll.
     #: Prior standard deviation of the tilt; decides only between tilts with equal support.
@@ -108,8 +104,6 @@ class LineSettings:
     #: Share of lines that are not vertical: the tilt's covariance is then the mean square error of
     #: `detect.verticals.tilt`; 0 for that of least squares.
     stray_share: Annotated[float, from_to(0.0, 0.5)] = 0.15
-    #: Votes of a line in the consensus increase with its evidence, up to this number.
-    weight_limit: Positive = 3.0
     #: Of two lines of equal polarity closer than this at the horizon, only the stronger is kept.
     same_edge_px: NotNegative = 2.0
     join_px: NotNegative = 2.7  #: Lines closer than this at the horizon are joined to one row.
@@ -123,7 +117,6 @@ class LineSettings:
     joined: Joining = "evidence"
     #: Fainter lines closer than this to another one are lighting effects of its edge: dropped.
     shoulder_px: NotNegative = 5.0
-    shoulder_share: NotNegative = 0.5  #: Fainter: at most this share of the other's contrast.
     #: Standard deviation of an edge about the building's line that causes it.
     sigma_px: Positive = 0.9
     #: Images with a median sharpness of edges below this are processed again with a wider filter.
@@ -148,6 +141,8 @@ class LineSettings:
 
 
 DEFAULT = LineSettings()
+#: Lower bound of the gain by which a point's offset corrects the prediction of a straight line.
+_PULL = 0.07
 
 # Numbers of `LineSettings` for kernels, and some that follow from them.
 LineNumbers = namedtuple(
@@ -155,12 +150,12 @@ LineNumbers = namedtuple(
     # Tracking.
     "threshold border_rows gap_rows guided_pull guided_reach_px "
     # Judgement of tracks, and the tilt.
-    "least_points least_evidence least_sharpness soft_evidence largest_horizon_gap_px "
+    "least_points least_evidence least_sharpness largest_horizon_gap_px "
     "largest_scatter_px largest_shift_px largest_noise_px bend_px lean_noise building_deg "
-    "largest_lean_deg largest_lean_sigmas largest_lean_px weight_limit same_edge_px "
+    "largest_lean_deg largest_lean_px same_edge_px "
     "largest_tilt_deg tilt_prior_deg proposers least_lines stray_share "
     # Joining, and the bearings.
-    "join_px join_rad join_share joined_equally shoulder_px shoulder_share sigma_px level",
+    "join_px join_rad join_share joined_equally shoulder_px sigma_px level",
 )
 
 
@@ -177,6 +172,7 @@ def numbers_of(settings: LineSettings, row_aspect: float = 1.0) -> LineNumbers:
         "least_points": settings.least_points(row_aspect),
         "joined_equally": settings.joined == "equal",
         "level": settings.alpha == "level",
+        "guided_pull": _PULL,
     }
     if not settings.guided:
         # Any curve, and not only lines.

@@ -156,7 +156,6 @@ REPORT = CircleSettings(
 PRESETS = {"default": CircleSettings(), "published": PUBLISHED, "report": REPORT}
 
 _LEAST_WIDTH = Bounds("4 or more", lambda x: 4.0 <= x < math.inf)
-_AREA_FACTOR = Bounds("above 1", lambda x: 1.0 < x < math.inf)
 
 
 @dataclass(frozen=True)
@@ -174,22 +173,13 @@ class MarkerSettings:
     #: A pixel is dark if 1 - I1/I2 of the image I1 and its closing I2 exceeds this; each threshold
     #: gives its own candidates.
     thresholds: Annotated[tuple[float, ...], PROBABILITY] = (0.5, 0.25, 0.12, 0.06, 0.03)
-    disc_widths: Positive = 0.5  #: Radius of the closing's disc in marker widths.
-    #: Dark pixels are darker than the closing by at least this many standard deviations of the
-    #: image's noise.
-    dark_noise: NotNegative = 2.0
     #: Narrowest marker to search for (square root of its area), pixels, if no width is given.
     least_width_px: Annotated[float, _LEAST_WIDTH] = 9.0
-    #: A candidate's area is within this factor of the expected width squared.
-    area_factor: Annotated[float, _AREA_FACTOR] = 6.0
     #: Largest number of white patches enclosed in a candidate.
     most_holes: Annotated[int, whole(0)] = 40
-    #: Least area of a candidate, with holes filled, over that of its convex hull.
-    least_solidity: Share = 0.75
     #: Largest area of a candidate's holes over its whole area, relative to the dictionary's mean
     #: white share (3 of 1/8 in the report).
     most_white: NotNegative = 3.0
-    least_square: Share = 0.75  #: Least area of the rough quadrangle over that of the convex hull.
     #: Least contrast of each edge, in standard deviations of the image's noise.
     least_contrast: NotNegative = 1.4
     edge_balance: Share = 0.2  #: Least contrast of an edge relative to the strongest edge.
@@ -200,8 +190,6 @@ class MarkerSettings:
     least_margin: NotNegative = 1.0
     #: Least share of the grey values' variance, noise aside, explained by the fitted marker.
     least_explained: Share = 0.9
-    #: Largest difference between the whiteness of any cell and that of the pattern.
-    largest_cell_error: Share = 0.45
     #: Systematic error of a corner, pixels: added to its covariance.
     systematic_px: NotNegative = 0.005
 

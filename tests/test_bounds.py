@@ -27,7 +27,7 @@ ENDLESS = {
     "CircleSettings": {"far_limit"},
     "LineSettings": {
         "largest_horizon_gap_px", "largest_scatter_px", "largest_shift_px", "largest_noise_px",
-        "largest_lean_deg", "largest_lean_sigmas", "largest_lean_px",
+        "largest_lean_deg", "largest_lean_px",
     },
 }  # fmt: skip
 

@@ -23,6 +23,7 @@ from detect.markers.dictionaries import MarkerDictionary
 from detect.settings import MarkerSettings
 from redetect.array_types import FloatArray, GreyImage
 
+_DISC_WIDTHS = 0.5  #: Radius of the closing's disc in marker widths.
 #: A disc of radius r as an octagon: half the side of its square, in r; crosses complete it.
 _SQUARE_SHARE = math.sqrt(2.0) - 1.0
 #: Radius of the disc in the reduced images, in their pixels: each level finds markers of up to
@@ -30,6 +31,8 @@ _SQUARE_SHARE = math.sqrt(2.0) - 1.0
 _LEVEL_RADIUS_PX = 12
 #: Smaller levels are not searched.
 _LEAST_LEVEL_PX = 16
+#: Dark pixels are darker than the closing by at least this many deviations of the image's noise.
+_DARK_SIGMAS = 2.0
 #: Thresholds below this are applied to a smoothed image.
 _SMOOTH_BELOW = 0.2
 #: With more noise than this (grey levels) it is smoothed more.
@@ -45,6 +48,10 @@ HOLES = "number of holes"
 SOLIDITY = "solidity"
 WHITE_SHARE = "share of holes"
 
+#: A candidate's area is within this factor of the expected width squared.
+_AREA_FACTOR = 6.0
+#: Least area of a candidate, with holes filled, over that of its convex hull.
+_LEAST_SOLIDITY = 0.75
 #: A marker seen at a slant of 70 degrees has a third of its area.
 _LEAST_FORESHORTENING = 0.3
 #: Least ratio of a marker's dark area to its whole area.
@@ -105,7 +112,7 @@ def candidate_regions(
 
 def _layers(image: GreyImage, settings: MarkerSettings) -> list[Layer]:
     """The image at the scales to be searched, from fine to coarse, with its closings."""
-    expected = settings.disc_widths * settings.width_px
+    expected = _DISC_WIDTHS * settings.width_px
     scale = 1
     if expected:
         while expected / scale > _LEVEL_RADIUS_PX:
@@ -133,7 +140,7 @@ def _masks(
     layer: Layer, noise: float, settings: MarkerSettings, finest: bool
 ) -> Iterator[GreyImage]:
     """Masks of dark pixels for each threshold; for low ones, the full image is smoothed first."""
-    gate = settings.dark_noise * noise / layer.scale
+    gate = _DARK_SIGMAS * noise / layer.scale
     plain = smooth = layer.grey, layer.closed
     if layer.scale == 1 and min(settings.thresholds) < _SMOOTH_BELOW:
         window = (5, 5) if noise > _MUCH_NOISE else (3, 3)
@@ -198,7 +205,7 @@ def _marker_regions(
             yield HOLES
             continue
         hull = np.asarray(cv2.convexHull(outline)[:, 0], np.int32)
-        if area < settings.least_solidity * pixel_area(hull):
+        if area < _LEAST_SOLIDITY * pixel_area(hull):
             yield SOLIDITY
             continue
         bright = sum(cv2.contourArea(hole) - 0.5 * len(hole) + 1.0 for hole in holes)
@@ -212,7 +219,7 @@ def _area_limits(settings: MarkerSettings, scale: int) -> tuple[float, float]:
     """Least and greatest area, pixels of the layer."""
     if settings.width_px:
         expected = (settings.width_px / scale) ** 2
-        return expected / settings.area_factor, expected * settings.area_factor
+        return expected / _AREA_FACTOR, expected * _AREA_FACTOR
     least = settings.least_width_px**2
     # Markers that are small in a reduced image are found in finer ones.
     return (least if scale == 1 else max(least, 100.0) * _LEAST_FORESHORTENING), math.inf

@@ -33,6 +33,10 @@ from redetect.landmarks import MarkerCorner, MarkerLandmark
 ACCEPTED = "accepted"
 SAME_MARKER = "duplicate of a marker"
 
+#: Least area of the rough quadrangle over that of the convex hull.
+_LEAST_SQUARE = 0.75
+#: Largest difference between the whiteness of any cell and that of the pattern.
+_LARGEST_CELL_ERROR = 0.45
 #: Number of similar rough quadrangles that are tried.
 _TRIES = 3
 #: Largest distance of edges from the rough ones: pixels of the layer, of the image, and in widths.
@@ -179,7 +183,7 @@ def detect_markers(
         if rough is None or not geometry.is_convex(rough):
             rejected[geometry.NOT_FOUR_CORNERS] += 1
             continue
-        if geometry.signed_area(rough) < settings.least_square * cv2.contourArea(hull.astype("f4")):
+        if geometry.signed_area(rough) < _LEAST_SQUARE * cv2.contourArea(hull.astype("f4")):
             rejected[geometry.NO_QUADRANGLE] += 1
             continue
         outline = picture.bend(rough)
@@ -331,7 +335,7 @@ def verified_quality(
     strict = (fit.blur_cells - _STRICT_FROM) / (_STRICT_AT - _STRICT_FROM)
     misfit = _between(strict, _CLEAR_MISFIT, _between(weakness, *_BLURRED_MISFIT))
     agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
-    allowed = settings.largest_cell_error
+    allowed = _LARGEST_CELL_ERROR
     if templates.plain[template]:
         misfit = min(misfit, _PLAIN_MISFIT)
         agreement = max(agreement, _PLAIN_AGREEMENT)

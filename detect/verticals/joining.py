@@ -29,6 +29,9 @@ from detect.verticals.tracking import LineTracks
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
+#: A fainter line has at most this share of the other's contrast.
+_FAINTER = 0.5
+
 
 class Lines(NamedTuple):
     """The lines of an image, the leftmost first."""
@@ -159,7 +162,7 @@ def _leave_out(
                 outcome[t] = Outcome.SAME_EDGE
                 break
             faint = evidence[t] < numbers.join_share * evidence[s]
-            fainter = contrast[t] < numbers.shoulder_share * contrast[s]
+            fainter = contrast[t] < _FAINTER * contrast[s]
             if (off < reach[t] and faint) or (near_px < numbers.shoulder_px and fainter):
                 outcome[t] = Outcome.BESIDE_A_STRONGER_EDGE
 

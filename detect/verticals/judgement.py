@@ -51,6 +51,12 @@ class Outcome(IntEnum):
 #: The outcomes in words.
 OUTCOMES = tuple(outcome.name.lower().replace("_", " ") for outcome in Outcome)
 
+#: Soft and faint edges are kept if they have at least this evidence.
+_SOFT_EVIDENCE = 40.0
+#: Votes of a line in the consensus increase with its evidence, up to this number.
+_MOST_VOTES = 3.0
+_LEAN_SIGMAS = 8.0  #: Largest lean of a line in standard deviations due to noise.
+
 #: Tracks with these outcomes might be lines if tracked again,
 _DOUBTFUL = (
     Outcome.NO_MAXIMUM,
@@ -130,7 +136,7 @@ def _judge(
     own_evidence, polarity = np.empty(count), np.empty(count)
     for k in range(count):
         t = accepted[k]
-        votes[k] = min(0.1 * evidence[t], numbers.weight_limit)
+        votes[k] = min(0.1 * evidence[t], _MOST_VOTES)
         place[k] = fits.reference_rad[t] + math.atan(fits.line[t, 0])
         near[k] = numbers.same_edge_px * fits.pixel_rad[t]
         own_evidence[k], polarity[k] = evidence[t], tracks.polarity[t]
@@ -198,7 +204,7 @@ def _reject_soft(
     faint = _quantile(fits.contrast, accepted, 0.5)
     for t in accepted:
         soft = fits.sharpness[t] < least_sharpness and fits.contrast[t] < faint
-        if soft and evidence[t] < numbers.soft_evidence:
+        if soft and evidence[t] < _SOFT_EVIDENCE:
             outcome[t] = Outcome.SOFT
 
 
@@ -240,7 +246,7 @@ def _weigh(
         )
         tolerance[k] = math.sqrt(
             math.radians(numbers.largest_lean_deg) ** 2
-            + numbers.largest_lean_sigmas**2 * noise
+            + _LEAN_SIGMAS**2 * noise
             + (numbers.largest_lean_px * per_length) ** 2
         )
     return Verticals(normal, variance, tolerance, votes)

@@ -35,7 +35,6 @@ from detect.settings import PUBLISHED, REPORT, CircleSettings, MarkerSettings
         (MarkerSettings, {"thresholds": ()}, "thresholds"),
         (MarkerSettings, {"thresholds": (0.5, 1.5)}, "thresholds is 1.5"),
         (MarkerSettings, {"least_explained": 2.0}, "least_explained"),
-        (MarkerSettings, {"area_factor": 0.5}, "area_factor"),
     ],
 )
 def test_nonsense_is_refused_by_name(
