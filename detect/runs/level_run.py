@@ -202,7 +202,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _tilt_of_row(row: str) -> _Tilted:
-    keyword, prefix, *words = row.split()
+    keyword, prefix, *words = row.split(" ")  # a prefix may contain other blanks
     if keyword == "NOTILT":
         return prefix, int(words[0]), None
     pitch, roll, cpp, cpr, crr = map(float, words[:5])

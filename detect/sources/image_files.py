@@ -13,6 +13,7 @@ from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from camera import Camera, camera_in
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
@@ -62,7 +63,11 @@ class ImageNames:
         self.folder = folder
         # Links may lead to the folder of the images, or that of the run.
         own = Path(os.path.abspath(folder))  # noqa: PTH100 - links are not followed yet
-        self._homes = (own, own.parent) if own.name == "images" else (own,)
+        self._homes: tuple[Path, ...] = (own,)
+        self.home = folder  # the run's folder
+        if own.name == "images":
+            self._homes = (own, own.parent)
+            self.home = folder.parent if folder.name == "images" else own.parent
         matches = re.compile(fnmatch.translate(pattern)).match
         with os.scandir(folder) as entries:
             names = sorted(
@@ -140,7 +145,7 @@ class RunFrames(Frames):
         for step in read_steps(self._odometry):
             try:
                 image = self._images.image_of(step.prefix)
-                time_s = None if image is None else self._times.get(image.stem)
+                time_s = None if image is None else _time_of(step.prefix, image, self._times)
                 yield RunFrame(step, image, time_s=time_s)
             except FrameError as error:
                 yield RunFrame(step, None, failure=str(error))
@@ -157,12 +162,8 @@ class ImageFiles(Source):
 
     def __init__(self, name: Path, times: str = "") -> None:
         self.name, self._is_pattern = str(name), not name.is_dir()
-        if self._is_pattern:
-            self._names, self._home = _matching_images(name), name.parent
-            if name.parent.resolve().name == "images":
-                self._home = name.parent.parent
-        else:
-            self._names, self._home = images_of_folder(name), name
+        self._names = _matching_images(name) if self._is_pattern else images_of_folder(name)
+        self._home = self._names.home
         self.output_base = self._home / "detected"
         self.beside = self._home, self._home.resolve().name
         self.expected = len(self._names.names)
@@ -181,7 +182,8 @@ class ImageFiles(Source):
                 )
         for name in self._names.names:
             path = self._names.folder / name
-            step, time_s = still(frame_prefix(path.stem)), self._times.get(path.stem)
+            step = still(frame_prefix(path.stem))
+            time_s = _time_of(step.prefix, path, self._times)
             try:
                 if not self._is_pattern:  # a pattern names links explicitly, a folder does not
                     path = self._names.checked(path)
@@ -189,9 +191,18 @@ class ImageFiles(Source):
             except FrameError as error:
                 yield RunFrame(step, None, time_s=time_s, failure=str(error))
 
+    def calibration(self, *, posed: bool) -> Camera | None:
+        """The calibration in the run's folder or, failing that, among the images."""
+        return super().calibration(posed=posed) or camera_in(self._names.folder)
+
     def along(self, odometry: Path) -> RunFrames:
         """The images that a file of STEP rows names, in its order."""
         return RunFrames(self._names, odometry, self._times)
+
+
+def _time_of(prefix: str, image: Path, times: Mapping[str, float]) -> float | None:
+    """The time of an image, by the prefix of its frame or by its name without extension."""
+    return times.get(prefix, times.get(image.stem))
 
 
 def _matching_images(pattern: Path) -> ImageNames:

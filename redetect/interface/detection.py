@@ -24,7 +24,7 @@ from detect.row_files import ImageRows
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import RunFrame, read_image, still
+from detect.sources.interface import RunFrame, frame_prefix, read_image, still
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
 from redetect.landmarks import Frame, FrameTilt, Step
@@ -376,7 +376,7 @@ def frame_of_image(image: ImageLike) -> RunFrame:
     path = path_of(image, "an array of grey values, or the name of an image file", FrameError)
     if not path.is_file():
         raise FrameError(f"{path}: no such image")
-    return RunFrame(still("_".join(path.stem.split()) or "image"), path)  # a prefix is one word
+    return RunFrame(still(frame_prefix(path.stem)), path)
 
 
 def _detection(

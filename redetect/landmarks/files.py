@@ -81,7 +81,7 @@ def read_head(path: FilePath) -> FileHead:
     """Read the head of a file of rows; a LandmarkFileError if the file cannot be read."""
     with opened(path, "landmark file") as stream:
         start = stream.read(_LONGEST_HEAD_BYTES)
-    lines = map(str.strip, start.decode("utf-8", "replace").splitlines())
+    lines = map(str.strip, start.decode("utf-8-sig", "replace").split("\n"))
     head = takewhile(lambda line: not line or line.startswith("#"), lines)
     comments = [line.removeprefix("#").strip() for line in head]
     settings = tuple(

@@ -117,7 +117,9 @@ def read_times(path: str | os.PathLike[str]) -> dict[str, float]:
     times: dict[str, float] = {}
     with opened(path, "file of times") as stream:
         for row, _, line in rows_of_words(stream, os.fspath(path)):
-            words = decode(b" ".join(row)).replace(",", " ").split()
+            if len(row) != 2:  # of two words, the first may contain commas
+                row = b" ".join(row).replace(b",", b" ").split()
+            words = [decode(word).strip(",") for word in row]
             if not words:
                 continue
             try:

@@ -139,10 +139,11 @@ def test_files_of_colours_can_be_named(
 ) -> None:
     grey = cv2.imread(str(demo_image), cv2.IMREAD_GRAYSCALE)
     assert grey is not None
-    cv2.imwrite(str(tmp_path / "in colour.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
-    other = rd.detect(tmp_path / "in colour.png", demo / "e.cam", polarity="light")
+    path = tmp_path / "#in colour.png"
+    cv2.imwrite(str(path), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
+    other = rd.detect(path, demo / "e.cam", polarity="light")
     np.testing.assert_array_equal(other.discs.xy, found.discs.xy)
-    assert other.name == "in_colour"
+    assert other.name == "_in_colour"
 
 
 def test_json(found: rd.Detection) -> None:
@@ -238,7 +239,7 @@ ANY: Any = rd
         (lambda one: ANY.detect(one.image, one.camera, line_settings={}), "expected rd.LineSettin"),
         (lambda one: ANY.detect(one.image, one.camera, axes="rep103"), "robotics are REP 103's"),
         (lambda _: ANY.open(["e"]), "expected the name of a run"),
-        (lambda _: ANY.open("images/e/images"), "named by `camera`; `camera calibrate`"),
+        (lambda _: ANY.open("docs/images"), "named by `camera`; `camera calibrate`"),
         (lambda _: ANY.open("images/e", odometry=5), "5: expected a name as odometry"),
         (lambda _: ANY.open("images/e", wheel_base_m=-1), "wheel_base_m is -1: expected 0 or more"),
         (lambda one: ANY.compare("images/e", [one.frame]), "expected a Detection, or the name"),

@@ -20,6 +20,7 @@ from redetect.landmarks import (
     read_rows,
     read_steps,
 )
+from redetect.landmarks.files import LEVEL, read_head
 from tests.landmarks.rows import parse_record
 
 STEP = "STEP e.0067 0.00391 -0.15602 -0.00218 0.1 0.2 0.3 0.4 0.5 0.6"
@@ -112,6 +113,13 @@ def test_names_that_are_no_utf8_survive(tmp_path: Path) -> None:
 
 def test_a_byte_order_mark_is_no_part_of_the_first_row(tmp_path: Path) -> None:
     assert len(list(read_steps(write(tmp_path, b"\xef\xbb\xbf" + STEP.encode())))) == 1
+
+
+@pytest.mark.parametrize("odd", ["\ufeff# by hand", "# one\u2028two", "# one\u0085two"])
+def test_the_head_is_read_to_its_end(tmp_path: Path, odd: str) -> None:
+    (tmp_path / "x.circles").write_text(f"{odd}\n# settings refine=True\n# {LEVEL}\n{STEP}\n")
+    head = read_head(tmp_path / "x.circles")
+    assert (head.settings, head.level) == ((("refine", "True"),), True)
 
 
 def test_an_empty_file_has_no_frames(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def test_few_frames_are_levelled_each_by_itself(published_camera: Camera) -> Non
     assert (first.circles[0].px, first.circles[0].py) == (0.5, -2.5)
     assert all(frame.levelled_by is not None for frame in others)
     assert written["run tilt"].startswith(b"NOTILT 0 2\n")
-    seen = {"tilt": "NOTILT 0 2\n", "circles": STEP.format(0) + DISC}
+    # Blanks other than ASCII's are part of a name.
+    seen = {"tilt": "NOTILT im\u00a0age 2\n", "circles": STEP.format("im\u00a0age") + DISC}
     (alone,) = level_run(published_camera, NO_ERRORS, lambda: [seen], RunSummary())
     assert alone["circles"] == seen["circles"]

@@ -82,6 +82,18 @@ def test_times_can_be_named(timed_run: Path, tmp_path: Path) -> None:
     assert run.frames.left_out == 1
 
 
+def test_times_by_prefixes_and_by_names(small_run: Path) -> None:
+    """Those of a result have the frames' prefixes, which differ from the images' names."""
+    steps = small_run / "s.txt"
+    steps.write_text(steps.read_text().replace("STEP s.0000", "STEP s.0000.png"))
+    (small_run / "s.times").write_text("s.0000.png 1.5\ns.0001 2.5\n")
+    assert [frame.time_s for frame in open_source(small_run).frames] == [1.5, 2.5, None]
+    images = small_run / "images"
+    (images / "s.0000.png").rename(images / "a b.png")
+    (small_run / "s.times").write_text("a_b 1.5\n")
+    assert [f.time_s for f in open_source(images / "*.png").frames] == [1.5, None, None]
+
+
 def test_a_run_folder_as_it_is_has_no_times_file(timed_run: Path) -> None:
     """What the data set's folders give is what it always was."""
     assert main(["circles", str(timed_run)]) == 0

@@ -142,6 +142,20 @@ def test_patterns_and_single_images(small_run: Path, published_camera: Camera) -
     assert alone.image == small_run / "images" / "s.0002.png"
 
 
+def test_a_calibration_above_or_among_the_images(
+    small_run: Path, published_camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = small_run / "images"
+    assert open_run(folder).camera == published_camera
+    assert open_run(folder).output_base == small_run / "detected"
+    monkeypatch.chdir(folder)
+    for name in (".", "*.png", "../images"):
+        assert open_run(Path(name)).output_base.resolve() == small_run / "detected"
+    (small_run / "s.cam").rename(folder / "s.cam")
+    for name in (".", "*.png"):
+        assert open_run(Path(name)).camera == published_camera
+
+
 def test_names_that_look_like_patterns(small_run: Path) -> None:
     folder = (small_run / "images").rename(small_run / "drive[1]")
     (folder / "s.0000.png").rename(folder / "s[1].png")
