@@ -226,22 +226,24 @@ def repeated(rows: Sequence[ImageRows]) -> tuple[int, float, float, float] | Non
     Discs are paired within five standard deviations, unless these are too large to identify them.
     The step's error, common to the pairs of two frames, is estimated. Returns the number of pairs,
     the rms of their differences beyond that error, and as the rows state (m); and the mean squared
-    normalised difference with the covariances of rows and steps. None without pairs or steps.
+    normalised difference with the covariances of rows and steps. Steps whose covariance is zero,
+    which means unknown, or invalid are left out. None without pairs.
     """
     row_residuals, stated, squared = [np.zeros(0)], [np.zeros(0)], 0.0
     frames = [each.circles for each in rows]
-    still = not summed_steps(frame.step for frame in frames if frame is not None).any()
-    for one, other in () if still else pairwise(frames):
+    for one, other in pairwise(frames):
         if one is None or other is None:
             continue
         first, second, s = circle_arrays(one.circles), circle_arrays(other.circles), other.step
+        of_step = [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]]
+        if not is_positive_definite(of_step):
+            continue
         turn = rotation(s.dphi)
         lever = second.xy @ turn.T
         offset = np.add(lever, (s.dx, s.dy)) - first.xy[:, None]
         of_rows = first.covariance[:, None] + turn @ second.covariance @ turn.T
         by_step = np.tile(np.eye(2, 3), (len(lever), 1, 1))
         by_step[:, :, 2] = lever @ [[0.0, 1.0], [-1.0, 0.0]]
-        of_step = [[s.cxx, s.cxy, s.cxphi], [s.cxy, s.cyy, s.cyphi], [s.cxphi, s.cyphi, s.cphiphi]]
         both = of_rows + by_step @ of_step @ by_step.swapaxes(1, 2)
         cost = np.full(both.shape[:2], np.inf)
         usable = is_positive_definite(of_rows) & (np.trace(both, axis1=2, axis2=3) < _VAGUE_M2)

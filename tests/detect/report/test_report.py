@@ -314,10 +314,12 @@ def test_repeatability_is_that_of_the_rows() -> None:
     assert per_dof == pytest.approx(1.0, abs=0.06)
     assert rms_m == pytest.approx(stated_m, rel=0.05)
     assert repeated([replace(row, circles=None) for row in rows]) is None
-    lost = [
-        replace(f, step=replace(f.step, cxx=1e6, cyy=1e6)) for row in rows if (f := row.circles)
-    ]
-    assert repeated([ImageRows(circles=frame) for frame in lost]) is None
+    # Unknown ones are zero.
+    for variance in (0.0, -1e-2, -2e-4, 1e6):
+        other = replace(step, cxx=variance, cyy=variance, cphiphi=max(variance, 0.0))
+        spoilt = replace(rows[2], circles=Frame(other, landmarks))
+        assert repeated([spoilt, spoilt]) is None
+        assert repeated([*rows[:2], spoilt]) == repeated(rows[:2])
 
 
 def test_a_source_is_read_twice_however_many_frames_are_shown(judged_run: Path) -> None:
