@@ -12,13 +12,15 @@ from detect.comparison.result import DiscComparison
 from detect.errors import CompareError
 from detect.options import Compare
 from redetect.command_line import EXIT_ERROR
-from redetect.storage import write_bytes
+from redetect.storage import demand_place, write_bytes
 
 
 def perform(command: Compare) -> int:
     """Compare rows with reference rows; returns the exit code."""
     if command.lines and (command.camera or command.matching.gate_m):
         raise CompareError("--camera, --gate-m: expected discs, not --lines: for them, bearings")
+    if command.json is not None:
+        demand_place(command.json, overwrite=command.force)
     result = compare_run(
         command.run,
         "lines" if command.lines else "circles",

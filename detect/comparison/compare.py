@@ -181,6 +181,7 @@ def compare_frames(
         If an image has two frames.
     """
     options = options or CompareOptions()
+    unlisted = list(unlisted or ())
     in_image = projection is not None and options.gate_m is None
     if not in_image and options.gate_m is None:
         options = replace(options, gate_m=FLOOR_GATE_M)

@@ -14,7 +14,7 @@ from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
 from detect.options import All, Circles
 from detect.settings import PRESETS, CircleSettings, MarkerSettings
-from detect.settings_files import read_settings, settings_text
+from detect.settings_files import SettingsFile, read_settings, settings_text
 from tests.detect.commands import Captured
 
 
@@ -26,6 +26,8 @@ def test_come_back(tmp_path: Path, circles: CircleSettings, lines: LineSettings)
     path.write_text(settings_text(circles=circles, lines=lines, markers=markers))
     read = read_settings(path)
     assert (read.circles, read.lines, read.markers) == (circles, lines, markers)
+    path.write_text('{"settings": {}}')
+    assert read_settings(path) == SettingsFile()
 
 
 def test_flags_start_from_a_file(tmp_path: Path) -> None:

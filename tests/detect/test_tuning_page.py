@@ -9,8 +9,9 @@ import re
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import pytest
 from camera import Camera, read_camera
 from detect.cli import main
 from detect.errors import DetectError
+from detect.explanation import Stage
 from detect.settings import CircleSettings
 from detect.settings_files import read_settings
 from detect.sources.opening import open_run
@@ -39,6 +41,13 @@ def server(project_root: Path, tmp_path: Path) -> Iterator[TuningServer]:
         yield served
         served.shutdown()
         thread.join()
+
+
+def test_the_page_knows_the_stages() -> None:
+    page = files("detect").joinpath("tuning_page.html").read_text("utf-8")
+    named = re.findall(r'\.stage [!=]== "([^"]+)"', page)
+    assert named
+    assert set(named) <= set(get_args(Stage))
 
 
 def ask(

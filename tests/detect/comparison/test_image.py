@@ -32,7 +32,7 @@ from redetect.landmarks import (
     write_frames,
 )
 from redetect.storage import write_whole
-from tests.detect.commands import Captured
+from tests.detect.commands import Captured, assert_refused
 from tests.detect.comparison.formatting import format_text
 
 FloatArray = NDArray[np.float64]
@@ -200,6 +200,10 @@ def test_level_truth_is_seen_through_the_tilt_of_what_was_detected(
     assert unsaid.reference_level
     assert unsaid.recall == 1.0
     assert unsaid.error_95_m == pytest.approx(0.0, abs=1e-9)
+    fewer = [replace(truth[0], landmarks=truth[0].landmarks[1:]), *truth[1:]]
+    projection = DiscProjection(published_camera)
+    found = compare_frames(fewer, level, projection=projection, unlisted=iter(truth))
+    assert (found.reference_level, found.set_aside, found.extra) == (True, 1, 0)
     raw, level = leaning_run(published_camera)
     assert not compare(published_camera, raw, level).reference_level
 
@@ -254,6 +258,8 @@ def test_without_a_calibration_the_floor_is_compared(tmp_path: Path, capsys: Cap
     row = CircleLandmark(0.0, -1.0, 0.9, 1e-4, 0.0, 1e-4, (1,))
     for name in ("map.circles", "detected.circles"):
         write_frames(tmp_path / name, [Frame(Step("s.0000", *[0.0] * 9), (row,))])
+    taken = ["--json", str(tmp_path / "map.circles")]
+    assert_refused(["compare", str(tmp_path), *taken], tmp_path, "exists already", capsys)
     assert main(["compare", str(tmp_path)]) == 0
     told = capsys.readouterr().out
     assert "no calibration: positions are compared on the floor" in told
