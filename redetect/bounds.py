@@ -45,7 +45,7 @@ class Bounds:
     include: Callable[[float], bool] = field(repr=False)
     whole: bool = False
 
-    def hold(self, value: Any) -> bool:
+    def contain(self, value: Any) -> bool:
         """Whether a value is allowed."""
         if isinstance(value, bool) or (self.whole and not isinstance(value, Integral)):
             return False
@@ -114,7 +114,7 @@ def demand(settings: object, error: type[Exception], /, **bounds: Bounds) -> Non
     for name, allowed in bounds.items():
         value = getattr(settings, name)
         for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not allowed.hold(number):
+            if number is not None and not allowed.contain(number):
                 shown = f"{number:g}" if isinstance(number, float) else excerpt(number)
                 raise error(f"{name} is {shown}: expected {allowed.expected}")
 

@@ -17,7 +17,7 @@ ROOMS = ("camera", "detect", "lut", "redetect")
 #: commands hand on to settings.
 NO_SETTINGS = frozenset(
     {
-        "DiscShape", "FileHead", "FrameRows", "Known",
+        "DiscShape", "FileHead", "FrameRows", "Priors",
         "RowCount", "RowFiles", "RunSummary", "ImageRows", "VoteShape", "_Rows",
     }
 )  # fmt: skip

@@ -14,7 +14,7 @@ from detect.settings_files import word_value
 from redetect.bounds import number_in, whole_number_in
 from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, read_tilts
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.messages import OneLineError
 from redetect.slam.formats.g2o import read_g2o

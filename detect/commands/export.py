@@ -23,7 +23,7 @@ from detect.options import Export
 from detect.ros_messages import TOPICS, ros_messages
 from redetect.landmarks import FrameTilt, Landmark, Step, read_rows
 from redetect.landmarks.columns import TABLE_OF, TABLES, TableName, Value, values_of
-from redetect.landmarks.frames import numbered_tilts, read_times
+from redetect.landmarks.frame_files import numbered_tilts, read_times
 from redetect.messages import counted, imported_for
 from redetect.storage import demand_place, write_whole
 

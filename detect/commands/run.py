@@ -16,8 +16,8 @@ from detect.runs.plan import (
     FramePlan,
     FramesByImage,
     Job,
-    Known,
     MapByImage,
+    Priors,
     RunSummary,
     tilts_by_image,
 )
@@ -49,19 +49,19 @@ def perform(command: DetectorFlags) -> int:
     if pictures is not None:
         demand_recording(command.run)
         demand_pictures(job.run.frames, pictures, overwrite=command.force)
-    with progress_bar(", ".join(job.places), job.run.frames.expected) as advance:
+    with progress_bar(", ".join(job.outputs), job.run.frames.expected) as advance:
         summary = detect_run(job, workers, advance)
     if pictures is not None:
         from detect.commands.draw import draw_run  # loads the detectors
 
-        files = {kind: path for kind, path in job.places.items() if kind in KINDS}
+        files = {kind: path for kind, path in job.outputs.items() if kind in KINDS}
         plan = job.plan if rejected else None
         draw_run(job.run, RunRows(files), pictures, plan, overwrite=command.force)
     _print_results(job, summary)
     for hint in hints(job, summary):
         print(hint, file=sys.stderr)
-    if summary.images_without_step:
-        print(f"{summary.images_without_step} {job.run.frames.why_left_out}")
+    if summary.images_left_out:
+        print(f"{summary.images_left_out} {job.run.frames.why_left_out}")
     return report_failures(summary.failed, summary.failures)
 
 
@@ -78,21 +78,21 @@ def _job_of(command: DetectorFlags) -> Job:
 
 
 def _circles(command: Circles, run: Run) -> Job:
-    places = {"circles": _output(command, run, "circles")}
+    outputs = {"circles": _output(command, run, "circles")}
     if command.json is not None:
-        places["json"] = command.json
+        outputs["json"] = command.json
     settings = _with_radius(command.detector, run) if command.find_radius else command.detector
     bare = command.tilt == Path("none")
     plan = FramePlan(run.camera, circles=settings, levelling="none" if bare else "frame")
     tilts = None if bare or command.tilt is None else tilts_by_image(command.tilt)
-    return Job(run, plan, places, replace(_known_discs(command.ids), tilts=tilts))
+    return Job(run, plan, outputs, replace(_known_discs(command.ids), tilts=tilts))
 
 
 def _lines(command: Lines, run: Run) -> Job:
     output = _output(command, run, "lines")
     plan = FramePlan(run.camera, lines=command.detector)
-    places = {"lines": output, "tilt": command.tilt_output or output.with_suffix(".tilt")}
-    return Job(run, plan, places, Known(lines=_frames(command.ids_from)))
+    outputs = {"lines": output, "tilt": command.tilt_output or output.with_suffix(".tilt")}
+    return Job(run, plan, outputs, Priors(lines=_frames(command.ids_from)))
 
 
 def _markers(command: Markers) -> Job:
@@ -104,7 +104,7 @@ def _markers(command: Markers) -> Job:
 def _all(command: All, run: Run) -> Job:
     if command.output is not None:
         command.output.mkdir(parents=True, exist_ok=True)
-    places = {
+    outputs = {
         kind: run.output(kind) if command.output is None else command.output / f"detected.{kind}"
         for kind in ("lines", "tilt", "circles")
     }
@@ -112,9 +112,9 @@ def _all(command: All, run: Run) -> Job:
     return Job(
         run,
         FramePlan(run.camera, lines=command.lines, circles=circles, levelling=command.tilt),
-        places,
+        outputs,
         replace(_known_discs(command.ids), lines=_frames(command.line_ids_from)),
-        base=places["lines"].with_suffix(""),
+        base=outputs["lines"].with_suffix(""),
     )
 
 
@@ -150,7 +150,7 @@ def _frames(path: Path | None) -> FramesByImage | None:
     return None if path is None else FramesByImage(path)
 
 
-def _known_discs(options: DiscIdOptions) -> Known:
+def _known_discs(options: DiscIdOptions) -> Priors:
     """Discs with IDs from files."""
     if (options.ids_from_map is None) != (options.path is None):
         raise DetectError("--ids-from-map and --path: expected both or neither")
@@ -158,7 +158,7 @@ def _known_discs(options: DiscIdOptions) -> Known:
     if options.ids_from_map is not None and options.path is not None:
         mapped = MapByImage(options.ids_from_map, options.path)
     level = options.ids_from is not None and read_head(options.ids_from).level
-    return Known(discs=_frames(options.ids_from), discs_level=level, mapped=mapped)
+    return Priors(discs=_frames(options.ids_from), discs_level=level, mapped=mapped)
 
 
 def _workers(command: DetectorFlags, job: Job) -> Workers:
@@ -167,31 +167,31 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
     if command.cluster is not None:
         if command.jobs is not None:
             raise WorkerError("--jobs and --cluster: expected one of them")
-        return cluster_workers(command.cluster, large=frames.ships_images)
+        return cluster_workers(command.cluster, large=frames.images_in_memory)
     jobs = command.jobs if command.jobs is not None else default_jobs(frames.expected or 0)
-    return local_workers(jobs, large=frames.ships_images, shared=True)
+    return local_workers(jobs, large=frames.images_in_memory, shared=True)
 
 
 def _print_results(job: Job, summary: RunSummary) -> None:
-    found, places, tilt = summary.found, job.places, summary.tilt
+    found, outputs, tilt = summary.found, job.outputs, summary.tilt
     frames = counted(summary.frames, "frame")
-    if "lines" in places:
-        print(f"{places['lines']}: {counted(found['lines'], 'line')} in {frames}")
-    if "tilt" in places and tilt is not None:
-        place = frames_tilt_place(places["tilt"])
+    if "lines" in outputs:
+        print(f"{outputs['lines']}: {counted(found['lines'], 'line')} in {frames}")
+    if "tilt" in outputs and tilt is not None:
+        place = frames_tilt_place(outputs["tilt"])
         print(f"{place}: the separate tilts of {counted(found['tilts'], 'frame')}")
-        print(f"{places['tilt']}: {tilt.sentence()}")
-    elif "tilt" in places:
+        print(f"{outputs['tilt']}: {tilt.sentence()}")
+    elif "tilt" in outputs:
         others = _other_frames(job.plan, summary)
-        print(f"{places['tilt']}: the tilt of {counted(found['tilts'], 'frame')}{others}")
+        print(f"{outputs['tilt']}: the tilt of {counted(found['tilts'], 'frame')}{others}")
     for kind, what in (("circles", "disc"), ("markers", "marker")):
-        if kind in places:
-            print(f"{places[kind]}: {counted(found[f'{what}s'], what)} in {frames}")
+        if kind in outputs:
+            print(f"{outputs[kind]}: {counted(found[f'{what}s'], what)} in {frames}")
     if job.run.bit_depth is not None:
         print(depth_sentence(job.run.bit_depth))
     if summary.lean is not None:
         print(lean_sentence(summary.lean))
-    if summary.unlevelled_deg is not None and "tilt" not in places and not job.known.tilts:
+    if summary.unlevelled_deg is not None and "tilt" not in outputs and not job.known.tilts:
         print(
             "positions are not levelled: pitch and roll are assumed unknown within "
             f"{summary.unlevelled_deg:g} degrees, as some frames show (detect all levels them)"
@@ -205,7 +205,7 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     elif circles and circles.refine and camera and any(camera.covariance or ()):
         from detect.levelling import sentence_of  # loads the compiler
 
-        print(sentence_of(places["circles"], camera))
+        print(sentence_of(outputs["circles"], camera))
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

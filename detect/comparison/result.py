@@ -30,8 +30,8 @@ class FrameMatch(NamedTuple):
     name: str  # of the image
     projection: DiscProjection | None  # into it; None: compared on the floor
     detected: Sequence[Any]  # all detected rows
-    wanted: list[Any]  # matched reference rows, and the detected row of each:
-    matched: list[Any]  # no row is in two pairs
+    matched_reference: list[Any]  # reference rows
+    matched: list[Any]  # the detected row of each; no row is in two pairs
     joined: list[Any]  # further reference rows that a matched line represents
     missed: list[Any]
     extra: list[Any]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
-from detect.comparison.compare import error_px, match_frame, numbers
+from detect.comparison.matching import error_px, match_frame, numbers
 from detect.comparison.result import FrameMatch
 from detect.explanation import DiscExplanation, Stage
 from detect.lines import LineDetections
@@ -108,7 +108,7 @@ class _Canvas:
         self.scale = 2 if image.shape[1] < _SMALL_PX else 1
         picture = canvas_of(image, camera)
         self.picture = np.repeat(np.repeat(picture, self.scale, axis=0), self.scale, axis=1)
-        self.times = enlargement(self.picture)  # of text and marks
+        self.text_scale = enlargement(self.picture)  # of text and marks
         self._labels: list[Box] = []
 
     def scaled(self, points: FloatArray) -> FloatArray:
@@ -123,8 +123,9 @@ class _Canvas:
         A place is a point at half the label's height, and the share of its width to the left of it.
         If none is free, the label is left out: further away, it would seem to be another one's.
         """
-        extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * self.times, self.times)[0]
-        wide, high = np.array(extent) + 2.0 * self.times
+        scale = self.text_scale
+        extent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * scale, scale)[0]
+        wide, high = np.array(extent) + 2.0 * scale
         corners = [place - np.array([share * wide, 0.5 * high]) for place, share in places]
         corners += [corners[-1] + [0.0, down * high] for down in range(1, _LABELS_DOWN + 1)]
         for least in corners:
@@ -132,7 +133,7 @@ class _Canvas:
             within = least[0] >= 0.0 and most[0] <= self.picture.shape[1]
             if within and not any(np.all((least < b) & (a < most)) for a, b in self._labels):
                 self._labels.append((least, most))
-                draw_text(self.picture, text, (least[0], most[1] - self.times), colour, size)
+                draw_text(self.picture, text, (least[0], most[1] - scale), colour, size)
                 return
 
 
@@ -191,7 +192,7 @@ def _draw_discs(canvas: _Canvas, match: FrameMatch, compared: bool) -> None:
             outline = projection.detected_px(circle_on_floor((row.px, row.py), radius_m))
             rims.append(canvas.scaled(outline))
             draw_curve(canvas.picture, rims[-1], colour, closed=True)
-    gap = np.array([3.0 * canvas.times, 0.0])
+    gap = np.array([3.0 * canvas.text_scale, 0.0])
     for (row, text, _), rim in zip(drawn, rims[2::3]):
         if np.all(np.abs(rim) < _FARTHEST_PX):
             (left, top), (right, bottom) = rim.min(axis=0), rim.max(axis=0)
@@ -205,14 +206,14 @@ def _draw_lines(canvas: _Canvas, camera: Camera, match: FrameMatch, compared: bo
         draw_curve(canvas.picture, curve, MISSED_COLOUR)
     drawn = [(row, "", LINE_COLOUR) for row in match.set_aside]
     drawn += [(row, "", EXTRA_COLOUR if compared else LINE_COLOUR) for row in match.extra]
-    for wanted, row in zip(match.wanted, match.matched):
+    for wanted, row in zip(match.matched_reference, match.matched):
         error = float(wrap_angle(row.alpha - wanted.alpha))
         text = f"{error / row.sigma:+.1f}" if row.sigma > 0.0 else ""
         drawn.append((row, text, LINE_COLOUR))
     rows = [row for row, _, _ in drawn]
     curves = canvas.scaled(line_curves(camera, ends_of(rows)))
     bars = canvas.scaled(sigma_bars(camera, ends_of(rows), numbers(rows, "sigma")))
-    tick = canvas.times * np.array([[0.0, -2.0], [0.0, 2.0]])
+    tick = canvas.text_scale * np.array([[0.0, -2.0], [0.0, 2.0]])
     for (_, text, colour), curve, bar in zip(drawn, curves, bars):
         draw_curve(canvas.picture, curve, colour)
         for points in (bar, bar[0] + tick, bar[1] + tick):
@@ -232,7 +233,7 @@ def _draw_markers(canvas: _Canvas, found: Sequence[MarkerLandmark]) -> None:
         spreads = [((c.cuu, c.cuv), (c.cuv, c.cvv)) for c in row.corners]
         for ellipse in ellipses(corners, spreads, canvas.scale * _SIGMAS, _POINTS):
             draw_curve(canvas.picture, ellipse, LINE_COLOUR, closed=True)
-        first = corners[0] + 3.0 * canvas.times * circle
+        first = corners[0] + 3.0 * canvas.text_scale * circle
         draw_curve(canvas.picture, first, MISSED_COLOUR, closed=True)
         draw_text(canvas.picture, f"{row.id}", corners.mean(axis=0), _TEXT_COLOUR, 0.45, (-8, 5))
 
@@ -290,11 +291,11 @@ def draw_text(
     """
     place = np.asarray(at, dtype=np.float64)
     if np.all(np.abs(place) < _FARTHEST_PX):
-        times = enlargement(canvas)
-        u, v = (np.rint(place) + times * np.array(shift)).astype(int).tolist()
+        text_scale = enlargement(canvas)
+        u, v = (np.rint(place) + text_scale * np.array(shift)).astype(int).tolist()
         cv2.putText(
-            canvas, text.encode("ascii", "replace").decode(), (u, max(v, 10 * times)),
-            cv2.FONT_HERSHEY_SIMPLEX, times * size, colour, times, cv2.LINE_AA,
+            canvas, text.encode("ascii", "replace").decode(), (u, max(v, 10 * text_scale)),
+            cv2.FONT_HERSHEY_SIMPLEX, text_scale * size, colour, text_scale, cv2.LINE_AA,
         )  # fmt: skip
 
 
@@ -302,11 +303,11 @@ def with_legend(
     canvas: ByteArray, words: Sequence[tuple[str, Colour]], column_px: int, size: float
 ) -> ByteArray:
     """The picture with text below it, in columns of a given width."""
-    times = enlargement(canvas)
+    text_scale = enlargement(canvas)
     width = int(canvas.shape[1])
-    per_row = max(1, width // (column_px * times))
+    per_row = max(1, width // (column_px * text_scale))
     rows = -(-len(words) // per_row)
-    legend = np.zeros(((14 * rows + 4) * times, width, 3), np.uint8)
+    legend = np.zeros(((14 * rows + 4) * text_scale, width, 3), np.uint8)
     for k, (text, colour) in enumerate(words):
         shift = 4 + column_px * (k % per_row), 13 + 14 * (k // per_row)
         draw_text(legend, text, (0, 0), colour, size, shift)

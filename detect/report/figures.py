@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from detect.comparison.compare import LEAST_SIGMA_RAD, numbers
+from detect.comparison.compare import LEAST_SIGMA_RAD
+from detect.comparison.matching import numbers
 from detect.comparison.result import DiscComparison, DiscPairs, LineComparison, LinePairs
 from detect.projection import summed_steps
 from detect.row_files import ImageRows
@@ -95,8 +96,8 @@ def floor_figure(pairs: DiscPairs) -> Part:
             for label, offset, colour, mark in series:
                 error = 1e3 * (offset * direction).sum(axis=1)
                 _dots(axes, distance, error, colour)
-                middle, half, _ = binned(distance, error)
-                axes.plot(middle, half, mark, color=colour, lw=1.4, ms=4, label=label)
+                centre, median, _ = binned(distance, error)
+                axes.plot(centre, median, mark, color=colour, lw=1.4, ms=4, label=label)
                 ends += [*np.quantile(error, [0.01, 0.99])] if len(error) else []
             axes.axhline(0.0, color=REFERENCE, lw=0.8)
             if ends:
@@ -130,9 +131,9 @@ def _spread(words: str, x: str, y: str, at: FloatArray, values: FloatArray) -> P
     with figure_file((_WIDE, 2.8), "svg") as (figure, content):
         axes = figure.subplots()
         _dots(axes, at, values, REFERENCE)
-        middle, half, most = binned(at, values)
-        axes.plot(middle, half, "o-", color=DATA, lw=1.4, ms=4, label="median")
-        axes.plot(middle, most, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
+        centre, median, p95 = binned(at, values)
+        axes.plot(centre, median, "o-", color=DATA, lw=1.4, ms=4, label="median")
+        axes.plot(centre, p95, "s--", color=SECOND, lw=1.2, ms=3.5, label="95 %")
         if (values > 0.0).any():
             axes.set_yscale("log")
         _finish(axes, x, y)
@@ -297,5 +298,5 @@ def binned(at: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, 
         for part in parts
         if len(part)
     ]
-    middle, median, most = np.array(figures, dtype=np.float64).reshape(-1, 3).T
-    return middle, median, most
+    centre, median, p95 = np.array(figures, dtype=np.float64).reshape(-1, 3).T
+    return centre, median, p95

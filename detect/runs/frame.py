@@ -28,9 +28,9 @@ from detect.lines import LineDetections, carry_ids, detect_lines
 from detect.run_tilt import smooth_axis
 from detect.runs.plan import (
     FramePlan,
+    FramePriors,
     FrameRows,
     FrameTask,
-    KnownOfFrame,
     json_record,
     rows_of_failure,
     time_row,
@@ -101,14 +101,14 @@ def detect_batch(tasks: Sequence[FrameTask], plan: FramePlan) -> list[FrameDetec
     """
     batch = [FrameDetections() for _ in tasks]
     verticals = vertical_table_of(plan.camera) if plan.camera and plan.lines else None
-    paths = [_path(task, found, plan, verticals) for task, found in zip(tasks, batch)]
+    pipelines = [_stages(task, found, plan, verticals) for task, found in zip(tasks, batch)]
     with interrupts_deferred():  # an interrupt while Numba unpacks tuples would crash the process
-        for _ in zip_longest(*paths):  # advances each path to its next `yield` in turn
+        for _ in zip_longest(*pipelines):  # advances each pipeline to its next `yield` in turn
             pass
     return batch
 
 
-def _path(
+def _stages(
     task: FrameTask, found: FrameDetections, plan: FramePlan, verticals: VerticalTable | None
 ) -> Iterator[None]:
     """All stages of one image in order; at each `yield`, the others of a batch catch up."""
@@ -273,7 +273,7 @@ def _text(frame: Frame) -> str:
 
 
 def _disc_rows(
-    discs: CircleDetections, unlevelled: CircleDetections, known: KnownOfFrame
+    discs: CircleDetections, unlevelled: CircleDetections, known: FramePriors
 ) -> tuple[CircleLandmark, ...]:
     """The rows, each with the IDs of a known row of the same disc, or of a map's disc, or -1."""
     rows = discs.landmarks()

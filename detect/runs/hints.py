@@ -10,7 +10,7 @@ from dataclasses import replace
 from camera import Camera
 from detect.errors import DetectError, FrameError
 from detect.projection import leaning_camera
-from detect.runs.plan import Job, Known, RunSummary
+from detect.runs.plan import Job, Priors, RunSummary
 from detect.settings import UNREFINED, CircleSettings
 from detect.sources.interface import Run, read_image, spread_frames
 from redetect.array_types import ByteArray, GreyImage
@@ -52,7 +52,7 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
     processed = summary.frames - summary.failed
     if not processed:
         return  # the reasons are listed frame by frame
-    if job.known != Known() and not summary.known:
+    if job.known != Priors() and not summary.known:
         yield (
             "no image of this run is in the files of known tilts or IDs, or they have no rows: "
             "were they made from other images?"

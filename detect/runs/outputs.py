@@ -23,7 +23,7 @@ from redetect import __version__
 from redetect.json_text import json_text
 from redetect.landmarks import format_head
 from redetect.landmarks.files import LEVELLED
-from redetect.landmarks.frames import TIMES_HEAD
+from redetect.landmarks.frame_files import TIMES_HEAD
 
 #: The kind of the tilts that the second pass writes (`detect.runs.level_run`).
 RUN_TILT = "run tilt"
@@ -71,7 +71,7 @@ class Output:
 
 def outputs_of(job: Job) -> list[Output]:
     """The files of a run, except its log."""
-    run, plan, places = job.run, job.plan, job.places
+    run, plan, paths = job.run, job.plan, job.outputs
     outputs = []
     by_run = plan.levelling == "run" and plan.lines is not None
 
@@ -79,19 +79,19 @@ def outputs_of(job: Job) -> list[Output]:
         text = format_head("\n".join(head)).decode("utf-8", "surrogateescape")
         outputs.append(Output(path, kind, text, crlf=crlf))
 
-    if "json" in places:
-        outputs.append(_json_file(places["json"], plan))
-    if "tilt" in places:
-        path = frames_tilt_place(places["tilt"]) if by_run else places["tilt"]
+    if "json" in paths:
+        outputs.append(_json_file(paths["json"], plan))
+    if "tilt" in paths:
+        path = frames_tilt_place(paths["tilt"]) if by_run else paths["tilt"]
         add(path, "tilt", *_TILT_TEXT, *([_OUTLINES_TEXT] if by_run else []))
-    if "lines" in places:
-        add(places["lines"], "lines", *_lines_text(run, plan), crlf=job.crlf)
-    if "tilt" in places and "circles" in places and by_run:
-        add(places["tilt"], RUN_TILT, *_RUN_TILT_TEXT)
-    if "circles" in places:
-        add(places["circles"], "circles", *_circles_text(job), crlf=job.crlf)
-    if "markers" in places:
-        add(places["markers"], "markers", *_markers_text(run, plan), crlf=job.crlf)
+    if "lines" in paths:
+        add(paths["lines"], "lines", *_lines_text(run, plan), crlf=job.crlf)
+    if "tilt" in paths and "circles" in paths and by_run:
+        add(paths["tilt"], RUN_TILT, *_RUN_TILT_TEXT)
+    if "circles" in paths:
+        add(paths["circles"], "circles", *_circles_text(job), crlf=job.crlf)
+    if "markers" in paths:
+        add(paths["markers"], "markers", *_markers_text(run, plan), crlf=job.crlf)
     if run.has_times:
         add(job.beside(".times"), "times", TIMES_HEAD)
     return outputs
@@ -214,7 +214,7 @@ def log_text(job: Job, summary: RunSummary, failures: Sequence[Mapping[str, obje
         "failures": failures,
         "frames": summary.frames,
         "failed": summary.failed,
-        "images_left_out": summary.images_without_step,
+        "images_left_out": summary.images_left_out,
         "found": {kind: summary.found[kind] for kind in ("discs", "lines", "tilts", "markers")},
         "rejected": dict(sorted(summary.rejected.items())),
         "exit_code": EXIT_FRAMES_FAILED if summary.failed else 0,

@@ -35,7 +35,7 @@ from redetect.landmarks import (
     read_rows,
     read_tilts,
 )
-from redetect.landmarks.frames import format_time
+from redetect.landmarks.frame_files import format_time
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.plane import rotation
 
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
 _REACH_M = 20.0
 
 
-class KnownOfFrame(NamedTuple):
-    """Prior data on a frame: see `Known`."""
+class FramePriors(NamedTuple):
+    """Prior data on a frame: see `Priors`."""
 
     tilt: FrameTilt | None = None
     lines: tuple[LineLandmark, ...] = ()
@@ -61,7 +61,7 @@ class KnownOfFrame(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Known:
+class Priors:
     """Prior data on the frames of a run, by the names of their images."""
 
     tilts: Mapping[str, FrameTilt] | None = None  # of frames whose verticals are not detected
@@ -71,11 +71,11 @@ class Known:
     #: Discs of a map: rows without an ID from `discs` get the ID of the one at their position.
     mapped: MapByImage | None = None
 
-    def of(self, prefix: str) -> KnownOfFrame:
+    def of(self, prefix: str) -> FramePriors:
         """Prior data on a frame."""
         lines = self.lines.get(prefix) if self.lines else None
         discs = self.discs.get(prefix) if self.discs else None
-        return KnownOfFrame(
+        return FramePriors(
             self.tilts.get(image_name(prefix)) if self.tilts else None,
             lines.lines if lines else (),
             discs.circles if discs else (),
@@ -160,14 +160,14 @@ class FramePlan:
 
 @dataclass(frozen=True)
 class Job:
-    """A run to be processed, and the places of its results."""
+    """A run to be processed, and the files of its results."""
 
     run: ImageRun
     plan: FramePlan
     #: The files to write: "circles", "lines", "tilt", "markers", "json" (the discs once more).
-    places: Mapping[str, Path]
-    known: Known = field(default_factory=Known)
-    #: Path of log, journal and times without their extensions; None: the first of the places.
+    outputs: Mapping[str, Path]
+    known: Priors = field(default_factory=Priors)
+    #: Path of log, journal and times without their extensions; None: the first of the outputs.
     base: Path | None = None
     command: str = ""  # name of the run in the log
     crlf: bool = False  # whether lines of landmark files end with CRLF
@@ -177,7 +177,7 @@ class Job:
 
     def beside(self, ending: str) -> Path:
         """A file beside the results, with their name and this extension."""
-        base = self.base or next(iter(self.places.values()))
+        base = self.base or next(iter(self.outputs.values()))
         return base.with_name(f"{base.name}{ending}")
 
 
@@ -185,7 +185,7 @@ class FrameTask(NamedTuple):
     """A frame to be processed, prior data on it, and its plan if it is not the run's. Small."""
 
     frame: RunFrame
-    known: KnownOfFrame = KnownOfFrame()
+    known: FramePriors = FramePriors()
     plan: FramePlan | None = None
 
     @property
@@ -198,7 +198,7 @@ class FrameRows(NamedTuple):
     """Result of a frame, some kilobytes: all that a worker sends back."""
 
     prefix: str
-    rows: Mapping[str, str]  # by kind of file: those of `Job.places`, and "times"
+    rows: Mapping[str, str]  # by kind of file: those of `Job.outputs`, and "times"
     found: Mapping[str, int] = {}  # numbers of "discs", "lines", "tilts" and "markers"
     rejected: Mapping[str, int] = {}  # numbers of rejected candidates for markers, by cause
     error: str | None = None  # why there are no landmarks
@@ -214,7 +214,7 @@ class RunSummary:
     rejected: Counter[str] = field(default_factory=Counter)
     failed: int = 0
     failures: list[str] = field(default_factory=list)
-    images_without_step: int = 0  # missing in the odometry
+    images_left_out: int = 0  # not part of the run
     known: int = 0  # frames with prior data
     lean: Tilt | None = None  # of the camera in the search for discs
     unlevelled_deg: float | None = None  # sigma of pitch and roll, as some frames show

@@ -203,8 +203,8 @@ class Bag(Source):
 
     def __iter__(self) -> Generator[RunFrame, None, None]:
         with opened_bag(self.path) as reader:
-            said = messages(reader, self.path, self.topic)
-            for number, (recorded_s, message) in enumerate(said):
+            stored_messages = messages(reader, self.path, self.topic)
+            for number, (recorded_s, message) in enumerate(stored_messages):
                 prefix = numbered_prefix(self.stem, number)
                 name = f"{self.name}: {prefix}"
                 content: bytes | NDArray[Any] | None = None

@@ -17,7 +17,7 @@ from camera import Camera, camera_in
 from detect.errors import DetectError, FrameError
 from detect.sources.interface import Frames, RunFrame, Source, frame_prefix, still
 from redetect.landmarks import read_steps
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from redetect.messages import excerpt
 from redetect.storage import IMAGE_SUFFIXES, demand_free
 from redetect.storage.bounded import leads_out, link_out
@@ -42,7 +42,7 @@ def picture_name(prefix: str) -> str:
 def demand_pictures(frames: Frames, folder: Path, *, overwrite: bool) -> None:
     """Make the folder for pictures of frames; reject existing pictures if names are known now."""
     folder.mkdir(parents=True, exist_ok=True)
-    if not frames.ships_images:
+    if not frames.images_in_memory:
         names = (picture_name(frame.step.prefix) for frame in frames)
         demand_free((folder / f"{name}.png" for name in names), overwrite=overwrite)
 
@@ -127,7 +127,7 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
 class RunFrames(Frames):
     """The frames of a file of STEP rows, in its order, with the images that the rows name."""
 
-    ships_images = False
+    images_in_memory = False
     why_left_out = "images are not named by a STEP row: left out"
 
     def __init__(self, images: ImageNames, odometry: Path, times: Mapping[str, float]) -> None:
@@ -158,7 +158,7 @@ class ImageFiles(Source):
     written there: the folder of the images, or the one above ``images/``.
     """
 
-    ships_images = False
+    images_in_memory = False
 
     def __init__(self, name: Path, times: str = "") -> None:
         self.name, self._is_pattern = str(name), not name.is_dir()

@@ -62,7 +62,7 @@ class RunFrame:
 class Frames(ABC):
     """The frames of a run, made on demand; iterating again starts over, unless they are live."""
 
-    ships_images = True  # yields contents of images, not files
+    images_in_memory = True  # yields contents of images, not files
     expected: int | None = None  # approximate number of frames, if known
     is_recorded = True  # iterating again yields the same frames
     left_out = 0  # number of images, so far, that are not part of the run
@@ -83,7 +83,7 @@ class SomeFrames(Frames):
     ) -> None:
         self._frames, self._count, self._every = frames, count, every
         self._bit_depth = bit_depth
-        self.ships_images, self.why_left_out = frames.ships_images, frames.why_left_out
+        self.images_in_memory, self.why_left_out = frames.images_in_memory, frames.why_left_out
         self.is_recorded = frames.is_recorded
         known = [number for number in (frames.expected, count or None) if number is not None]
         self.expected = -(-min(known) // every) if known else None
@@ -272,7 +272,7 @@ def bit_depth_of(frames: Frames, camera: Camera | None) -> int | None:
     """
     depth = None
     # All messages of a bag before the last of these are read.
-    farthest = _DEPTH_SPACING if frames.ships_images else None
+    farthest = _DEPTH_SPACING if frames.images_in_memory else None
     for frame in spread_frames(frames, _DEPTH_IMAGES, farthest):
         with suppress(FrameError):  # reported when the frame is processed
             stored = stored_image(frame, camera)

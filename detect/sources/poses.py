@@ -26,9 +26,10 @@ from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), so that products of two remain finite.
 FARTHEST = 1e12
-LARGEST_GAP_S = 1.0  #: Longest interval between poses that is interpolated (s),
-#: except that slow poses may be farther apart: this many times as far as those before, up to (s).
-_USUAL_GAPS, _SLOWEST_S = 1.5, 2.0
+#: Longest interval between poses that is interpolated (s), unless poses are slow:
+LARGEST_GAP_S = 1.0
+_USUAL_GAPS = 1.5  #: then it is this many times the interval before,
+_SLOWEST_S = 2.0  #: and at most this (s).
 #: Later times since 1970 are not in seconds.
 _LATEST_S = 1e11
 # A movement that is faster (m/s or rad/s), and this many times as far as the one before, is a jump
@@ -287,7 +288,7 @@ class FramesAlongPoses(Frames):
 
     def __init__(self, source: Source, stream: PoseStream) -> None:
         self._source, self._stream = source, stream
-        self.ships_images, self.expected = source.ships_images, source.expected
+        self.images_in_memory, self.expected = source.images_in_memory, source.expected
         self.is_recorded = source.is_recorded
         self.why_left_out = (
             f"images without a time or a pose of {stream.name}, or not in order, or between poses "

@@ -82,7 +82,7 @@ class JsonObject:
     def number(self, key: str, bounds: Bounds = FINITE) -> float:
         """A number within bounds."""
         value = self.values.get(key)
-        if not is_number(value) or not bounds.hold(value):
+        if not is_number(value) or not bounds.contain(value):
             raise self.wrong(key, bounds.expected)
         return float(value)
 

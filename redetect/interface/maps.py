@@ -17,7 +17,7 @@ from redetect import __version__
 from redetect.bounds import demand_fields
 from redetect.json_text import json_text
 from redetect.landmarks import map_file
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
 from redetect.least_squares import LossKind
 from redetect.messages import excerpt, keywords_named, path_of
 from redetect.slam.errors import SlamError
@@ -94,8 +94,8 @@ class Poses(Table):
 class RunMap(Table):
     """Least-squares map of a run; its frame is the robot's at the start, X left, Y backward."""
 
-    discs: Landmarks  #: Identifiers, positions (m) and covariances (m^2).
-    lines: Landmarks
+    discs: MapLandmarks  #: Identifiers, positions (m) and covariances (m^2).
+    lines: MapLandmarks
     path: Path2D  #: Poses with covariances: the start, one after each step; then the next run's.
     paths: tuple[Path2D, ...]  #: The path of each run.
     result: MappedRun  #: Details: residuals, ignored rows, the camera's mounting.

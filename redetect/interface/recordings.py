@@ -85,7 +85,7 @@ class Recording:
     @cached_property
     def _listed(self) -> list[RunFrame] | None:
         """All frames, if their images are files: then they are small."""
-        return None if self._run.frames.ships_images else list(self._run.frames)
+        return None if self._run.frames.images_in_memory else list(self._run.frames)
 
     @property
     def expected(self) -> int | None:

@@ -107,8 +107,8 @@ class Association:
     first: IndexArray
     second: IndexArray
     #: The unmatched rows of each set, in ascending order
-    first_alone: IndexArray
-    second_alone: IndexArray
+    first_unmatched: IndexArray
+    second_unmatched: IndexArray
 
 
 def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
@@ -149,8 +149,8 @@ def associate(costs: ArrayLike, allowed: ArrayLike) -> Association:
     return Association(
         first=first,
         second=second,
-        first_alone=np.setdiff1d(np.arange(cost.shape[0]), first),
-        second_alone=np.setdiff1d(np.arange(cost.shape[1]), second),
+        first_unmatched=np.setdiff1d(np.arange(cost.shape[0]), first),
+        second_unmatched=np.setdiff1d(np.arange(cost.shape[1]), second),
     )
 
 

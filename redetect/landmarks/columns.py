@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import astuple, fields
 from typing import Literal, NamedTuple
 
-from redetect.landmarks.frames import FrameTilt
+from redetect.landmarks.frame_files import FrameTilt
 from redetect.landmarks.records import (
     MARKER_CORNERS,
     CircleLandmark,

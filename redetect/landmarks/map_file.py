@@ -41,7 +41,7 @@ _SAME = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class MapLandmarks:
     """Landmarks of one kind in the map."""
 
     ids: IntArray  #: (M,) identifiers, each once
@@ -57,8 +57,8 @@ class Landmarks:
 class LandmarkMap:
     """Discs and vertical lines in one map."""
 
-    discs: Landmarks
-    lines: Landmarks
+    discs: MapLandmarks
+    lines: MapLandmarks
     #: (2 M, 2 M) of all positions, discs first (m^2); None if only each landmark's own is known
     joint_covariance: FloatArray | None = None
 
@@ -77,7 +77,7 @@ class Path2D:
         return Path2D(self.prefixes[first:end], self.poses[first:end], spread)
 
 
-def no_landmarks() -> Landmarks:
+def no_landmarks() -> MapLandmarks:
     """An empty map."""
     return _landmarks({})
 
@@ -230,9 +230,9 @@ def read_path(path: FilePath) -> Path2D:
     return Path2D(tuple(prefixes), table[:, :3].copy(), covariance)
 
 
-def _landmarks(found: dict[int, tuple[list[float], int]]) -> Landmarks:
+def _landmarks(found: dict[int, tuple[list[float], int]]) -> MapLandmarks:
     table = np.array([values for values, _ in found.values()], dtype=np.float64).reshape(-1, 5)
-    return Landmarks(
+    return MapLandmarks(
         ids=np.array(list(found), dtype=np.int64),
         xy=table[:, :2].copy(),
         covariance=table[:, [2, 3, 3, 4]].reshape(-1, 2, 2),

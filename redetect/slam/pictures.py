@@ -23,7 +23,7 @@ from matplotlib.image import imread
 from redetect import plane
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
 from redetect.reporting.page import figure_file
 from redetect.slam.errors import SlamError
 from redetect.slam.recording import PICTURES
@@ -231,7 +231,7 @@ def _draw_panel(
 
 
 def _draw_landmarks(
-    axes: Axes, some: Landmarks, look: tuple[str, str, str], extent: _Extent, *, ellipses: bool
+    axes: Axes, some: MapLandmarks, look: tuple[str, str, str], extent: _Extent, *, ellipses: bool
 ) -> None:
     name, colour, marker = look
     low, high = extent

@@ -12,7 +12,7 @@ from detect.comparison.compare import compare_frames, compare_line_frames
 from detect.comparison.result import DiscComparison, LineComparison
 from detect.line_settings import LineSettings
 from detect.options import CompareOptions
-from detect.runs.plan import FramePlan, FramesByImage, Job, Known, RunSummary
+from detect.runs.plan import FramePlan, FramesByImage, Job, Priors, RunSummary
 from detect.runs.stream import detect_run
 from detect.settings import PUBLISHED, REPORT, CircleSettings
 from detect.sources.opening import open_run
@@ -28,7 +28,7 @@ def detected(
     """The discs of a run, with the IDs of known rows."""
     opened = open_run(run)
     plan = FramePlan(opened.camera, circles=settings)
-    ids = Known() if known is None else Known(discs=FramesByImage(known))
+    ids = Priors() if known is None else Priors(discs=FramesByImage(known))
     return detect_run(Job(opened, plan, {"circles": output}, ids, crlf=crlf))
 
 

@@ -61,8 +61,8 @@ def test_pairs_are_allowed_one_to_one_and_nothing_is_lost(
     costs, allowed = problem
     found = associate(costs, allowed)
     assert allowed[found.first, found.second].all()
-    assert sorted([*found.first, *found.first_alone]) == list(range(costs.shape[0]))
-    assert sorted([*found.second, *found.second_alone]) == list(range(costs.shape[1]))
+    assert sorted([*found.first, *found.first_unmatched]) == list(range(costs.shape[0]))
+    assert sorted([*found.second, *found.second_unmatched]) == list(range(costs.shape[1]))
     assert (np.diff(found.first) > 0).all()
 
 
@@ -108,7 +108,7 @@ def test_rows_that_compete_for_too_few_partners_stay_alone() -> None:
     allowed = [[True, False, False], [True, False, False], [True, True, True]]
     found = associate([[2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 4.0, 3.0]], allowed)
     assert list(zip(found.first, found.second)) == [(1, 0), (2, 2)]
-    assert (found.first_alone.tolist(), found.second_alone.tolist()) == ([0], [1])
+    assert (found.first_unmatched.tolist(), found.second_unmatched.tolist()) == ([0], [1])
 
 
 def test_forbidden_costs_are_not_looked_at() -> None:
@@ -130,7 +130,7 @@ def test_shapes_must_agree() -> None:
 def test_positions_pair_within_the_gate_and_not_beyond() -> None:
     found = associate_positions([[0, 0], [1, 0], [5, 5]], [[1, 0.25], [0, -0.25]], gate_m=0.25)
     assert list(zip(found.first, found.second)) == [(0, 1), (1, 0)]
-    assert found.first_alone.tolist() == [2]
+    assert found.first_unmatched.tolist() == [2]
     assert len(associate_positions([[0, 0]], [[0, 0.26]], gate_m=0.25).first) == 0
 
 
@@ -150,7 +150,7 @@ def test_crowded_positions_give_way_to_each_other() -> None:
 def test_empty_sets_leave_the_other_alone(first: int, second: int) -> None:
     found = associate_positions(np.zeros((first, 2)), np.zeros((second, 2)), gate_m=1.0)
     assert len(found.first) == len(found.second) == 0
-    assert (len(found.first_alone), len(found.second_alone)) == (first, second)
+    assert (len(found.first_unmatched), len(found.second_unmatched)) == (first, second)
 
 
 def test_mahalanobis_distance_is_that_of_whitened_differences() -> None:

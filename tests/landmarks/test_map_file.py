@@ -10,7 +10,7 @@ import pytest
 from redetect.landmarks import LandmarkFileError
 from redetect.landmarks.map_file import (
     LandmarkMap,
-    Landmarks,
+    MapLandmarks,
     Path2D,
     no_landmarks,
     read_map,
@@ -26,7 +26,7 @@ HEAD = "kind,id,x_m,y_m,cxx_m2,cxy_m2,cyy_m2,rows\n"
 def test_a_map_comes_back(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(0, 0.1, (5, 2, 2))
-    discs = Landmarks(
+    discs = MapLandmarks(
         ids=np.array([5, 1, 9, 2, 2**62]),
         xy=rng.normal(0, 9, (5, 2)),
         covariance=root @ np.swapaxes(root, 1, 2),

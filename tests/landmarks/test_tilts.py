@@ -17,7 +17,7 @@ from redetect.landmarks import (
     read_tilts,
     tilt_as_written,
 )
-from redetect.landmarks.frames import numbered_tilts
+from redetect.landmarks.frame_files import numbered_tilts
 
 ANGLE = st.floats(-0.2, 0.2)
 VARIANCE = st.floats(1e-9, 1e-3)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from redetect.landmarks import LandmarkFileError
-from redetect.landmarks.frames import format_time, read_times
+from redetect.landmarks.frame_files import format_time, read_times
 
 
 def test_times_are_read_by_prefix(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks
 from redetect.slam.filters.base import FrameRows
 from redetect.slam.filters.localizer import Localizer
 from redetect.slam.recording import CircleRows, LineRows
@@ -46,9 +46,9 @@ def bearings_of(lines: list[tuple[tuple[int, ...], float, float]]) -> FrameRows:
 def localizer(pose: ArrayLike, discs: ArrayLike, lines: ArrayLike) -> Localizer:
     """A robot in a map whose discs and lines are numbered from 0."""
 
-    def landmarks(places: ArrayLike) -> Landmarks:
+    def landmarks(places: ArrayLike) -> MapLandmarks:
         xy = np.reshape(places, (-1, 2))
         count = len(xy)
-        return Landmarks(np.arange(count), xy, np.zeros((count, 2, 2)), np.ones(count, np.int64))
+        return MapLandmarks(np.arange(count), xy, np.zeros((count, 2, 2)), np.ones(count, np.int64))
 
     return Localizer(LandmarkMap(landmarks(discs), landmarks(lines)), pose, camera_xy=CAMERA_XY)

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
-from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks
 from redetect.slam.filters.base import FilterRun, run_filter
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import Localizer
@@ -42,11 +42,11 @@ def localized(sigma_m: float, *, exact: bool = False) -> Estimate:
     def estimate(run: SmallRun, seed: int) -> FilterRun:
         rng = np.random.default_rng([seed, 1])
 
-        def measured(xy: FloatArray) -> Landmarks:
+        def measured(xy: FloatArray) -> MapLandmarks:
             noisy = xy + sigma_m * rng.standard_normal(xy.shape)
             covariance = np.tile(sigma_m**2 * np.eye(2), (len(xy), 1, 1))
             ones = np.ones(len(xy), dtype=np.int64)
-            return Landmarks(1 + np.arange(len(xy)), noisy, covariance, ones)
+            return MapLandmarks(1 + np.arange(len(xy)), noisy, covariance, ones)
 
         known = LandmarkMap(discs=measured(run.disc_xy), lines=measured(run.line_xy))
         localizer = Localizer(known, camera_xy=CAMERA_XY, exact=exact)
@@ -63,9 +63,9 @@ def mapped(run: SmallRun, _: int) -> FilterRun:
 def true_map(run: SmallRun) -> LandmarkMap:
     """All landmarks at their true places."""
 
-    def exact(xy: FloatArray) -> Landmarks:
+    def exact(xy: FloatArray) -> MapLandmarks:
         ones = np.ones(len(xy), dtype=np.int64)
-        return Landmarks(1 + np.arange(len(xy)), xy, np.zeros((len(xy), 2, 2)), ones)
+        return MapLandmarks(1 + np.arange(len(xy)), xy, np.zeros((len(xy), 2, 2)), ones)
 
     return LandmarkMap(discs=exact(run.disc_xy), lines=exact(run.line_xy))
 

@@ -11,7 +11,7 @@ import pytest
 
 from redetect.landmarks.map_file import (
     LandmarkMap,
-    Landmarks,
+    MapLandmarks,
     Path2D,
     no_landmarks,
     read_map,
@@ -157,7 +157,9 @@ def test_distance_of_paths_and_maps() -> None:
 
     def discs(ids: list[int], xy: list[list[float]]) -> LandmarkMap:
         covariance = np.tile(0.25 * np.eye(2), (len(ids), 1, 1))
-        some = Landmarks(np.array(ids), np.array(xy), covariance, np.ones(len(ids), dtype=np.int64))
+        some = MapLandmarks(
+            np.array(ids), np.array(xy), covariance, np.ones(len(ids), dtype=np.int64)
+        )
         return LandmarkMap(some, no_landmarks())
 
     found = map_distance(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
 from redetect.plane import between
 from redetect.slam.filters.localizer import localize_run
 from redetect.slam.formats.ranges import Noise, Sightings, estimate_noise, with_noise
@@ -105,7 +105,9 @@ def test_poses_in_a_map_have_the_errors_that_are_stated_despite_misread_landmark
     assert np.mean(lost[misread]) > 0.8
     assert np.mean(lost[~misread]) < 0.001
     spread = np.tile(1e-8 * np.eye(2), (LANDMARKS, 1, 1))
-    discs = Landmarks(np.arange(LANDMARKS) + 6, places, spread, np.ones(LANDMARKS, dtype=np.int64))
+    discs = MapLandmarks(
+        np.arange(LANDMARKS) + 6, places, spread, np.ones(LANDMARKS, dtype=np.int64)
+    )
     path = localize_run(found, LandmarkMap(discs, no_landmarks()), start=poses[0]).path
     off = (path.poses - poses)[1:]
     assert path.covariance is not None

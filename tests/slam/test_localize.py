@@ -10,7 +10,7 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import Associator, frames_of, run_filter
 from redetect.slam.filters.localizer import Localizer
@@ -26,8 +26,8 @@ from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.ekf_rows import CAMERA_XY, circle_rows, spd
 
 
-def landmarks(rng: np.random.Generator, count: int, scale: float) -> Landmarks:
-    return Landmarks(
+def landmarks(rng: np.random.Generator, count: int, scale: float) -> MapLandmarks:
+    return MapLandmarks(
         ids=np.arange(count) + 10,
         xy=rng.uniform(-4, 4, (count, 2)),
         covariance=np.array([spd(rng, 2, scale) for _ in range(count)]),
@@ -231,10 +231,12 @@ def test_identities_are_found_in_the_map(method: str) -> None:
     first = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
     circles = recording.circles.only(np.isin(np.arange(len(pairs)), first))
     one = replace(recording, circles=circles, lines=recording.lines.only(single))
-    certain = Landmarks(
+    certain = MapLandmarks(
         some.discs.ids, some.discs.xy, some.discs.covariance * 1e-3, some.discs.rows
     )
-    exact = Landmarks(some.lines.ids, some.lines.xy, some.lines.covariance * 1e-3, some.lines.rows)
+    exact = MapLandmarks(
+        some.lines.ids, some.lines.xy, some.lines.covariance * 1e-3, some.lines.rows
+    )
     run = run_filter(
         one,
         Localizer(LandmarkMap(certain, exact), camera_xy=CAMERA_XY),

@@ -11,7 +11,7 @@ import pytest
 from redetect.landmarks import LandmarkFileError, squared_mahalanobis, write_frames
 from redetect.landmarks.map_file import (
     LandmarkMap,
-    Landmarks,
+    MapLandmarks,
     covariance_file,
     no_landmarks,
     read_map,
@@ -60,7 +60,7 @@ def test_joint_covariance_is_the_inverse_of_the_normal_equations(
 @pytest.fixture
 def some() -> LandmarkMap:
     covariance = np.tile(0.25 * np.eye(2), (2, 1, 1))
-    discs = Landmarks(np.array([1, 2]), np.zeros((2, 2)), covariance, np.array([1, 1]))
+    discs = MapLandmarks(np.array([1, 2]), np.zeros((2, 2)), covariance, np.array([1, 1]))
     return LandmarkMap(discs, no_landmarks())
 
 

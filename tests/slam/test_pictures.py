@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import BoolArray, FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D, no_landmarks
 from redetect.plane import ellipses
 from redetect.slam.errors import SlamError
 from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, pose_errors
@@ -18,10 +18,10 @@ from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, pose_errors
 DISC_BGR = (0x1E, 0x50, 0xC8)
 
 
-def landmarks(xy: FloatArray, covariance: FloatArray | None = None) -> Landmarks:
+def landmarks(xy: FloatArray, covariance: FloatArray | None = None) -> MapLandmarks:
     count = len(xy)
     spread = np.tile(1e-4 * np.eye(2), (count, 1, 1)) if covariance is None else covariance
-    return Landmarks(np.arange(count), xy, spread, np.full(count, 3))
+    return MapLandmarks(np.arange(count), xy, spread, np.full(count, 3))
 
 
 def some_path(count: int = 60, scale: float = 0.2) -> Path2D:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
 from redetect.slam.filters.base import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_run
@@ -33,7 +33,7 @@ def errors_m(poses: FloatArray, run: SmallRun) -> FloatArray:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_localisation_survives_slips(method: Literal["nearest", "joint"], seed: int) -> None:
     run = run_with_slips(seed)
-    discs = Landmarks(
+    discs = MapLandmarks(
         np.arange(1, _DISCS + 1), run.disc_xy, np.zeros((_DISCS, 2, 2)), np.ones(_DISCS, np.int64)
     )
     found = localize_run(run.recording, LandmarkMap(discs, no_landmarks()), Associator(method))

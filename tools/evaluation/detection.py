@@ -17,7 +17,7 @@ from tyro.conf import Positional
 
 from detect.line_settings import PRESETS as LINE_PRESETS
 from detect.line_settings import LineSettings
-from detect.runs.plan import FramePlan, Job, Known
+from detect.runs.plan import FramePlan, Job, Priors
 from detect.runs.stream import detect_run
 from detect.settings import CircleSettings, Polarity
 from detect.sources.opening import open_run
@@ -37,11 +37,11 @@ _NAMES = ("images", "discs", "recall", "false", "median_mm")
 
 
 def _detect(
-    run: Path, places: dict[str, Path], known: Known | None = None, **settings: Any
+    run: Path, places: dict[str, Path], known: Priors | None = None, **settings: Any
 ) -> None:
     """Detect a run's `circles` or `lines` with settings of theirs; failures go to stderr."""
     opened = open_run(run)
-    job = Job(opened, FramePlan(opened.camera, **settings), places, known or Known())
+    job = Job(opened, FramePlan(opened.camera, **settings), places, known or Priors())
     for failure in detect_run(job).failures:
         print(failure, file=sys.stderr)
 
@@ -129,7 +129,7 @@ class Rendered(Study):
             settings = CircleSettings(polarity=self.polarity)
             _detect(self.run, {"circles": discs}, circles=settings)
             tilts = _detect_lines(self.run, LINE_PRESETS[self.preset], lines)
-            _detect(self.run, {"circles": levelled}, Known(tilts=tilts), circles=settings)
+            _detect(self.run, {"circles": levelled}, Priors(tilts=tilts), circles=settings)
             script = self.run.parent / "evaluate.py"
             for path in (discs, lines, levelled):
                 print(path.name, flush=True)
@@ -154,7 +154,7 @@ class Tilt(Study):
             settings = CircleSettings(polarity="light", far_limit=0.5)
             medians = dict.fromkeys(("median m", "3-3.5 m", "3.5-4 m"), ".4f")
             table = Table({"tilt": "<7", **medians, "normalised": ".2f"})
-            for label, known in (("without", Known()), ("with", Known(tilts=tilts))):
+            for label, known in (("without", Priors()), ("with", Priors(tilts=tilts))):
                 discs = Path(folder) / f"{label}.circles"
                 _detect(self.run, {"circles": discs}, known, circles=settings)
                 result = compared(self.run, discs, "--gate-m", 0.3)

@@ -17,7 +17,7 @@ import numpy as np
 from camera import CameraError, parse_camera
 from detect.errors import DetectError, FrameError
 from detect.row_files import circle_settings_of
-from detect.runs.stream import Journal
+from detect.runs.journal import Journal
 from detect.sources.bag import pixels_of_message
 from detect.sources.interface import bounded_content, decode_gray, eight_bits, gray_of_pixels
 from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses, velocity_poses

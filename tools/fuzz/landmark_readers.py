@@ -9,7 +9,7 @@ import numpy as np
 
 from redetect.landmarks import LandmarkError, frames_of_rows, parse_rows, read_rows
 from redetect.landmarks.files import format_record
-from redetect.landmarks.frames import read_tilts, read_times
+from redetect.landmarks.frame_files import read_tilts, read_times
 from redetect.landmarks.map_file import covariance_file, read_map, read_path, with_joint_covariance
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o import read_g2o

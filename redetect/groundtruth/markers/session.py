@@ -22,7 +22,7 @@ from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike, write_json
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerLandmark, read_frames
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 
 _QUATERNION_TOLERANCE = 1e-3
 #: Widths of markers.

@@ -10,7 +10,7 @@ from redetect import __version__
 from redetect.bounds import demand_fields
 from redetect.landmarks import write_frames
 from redetect.landmarks.axes import MEANING
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path, write_table
 from redetect.plane import chain_steps
 from redetect.slam.commands.files import recording_of

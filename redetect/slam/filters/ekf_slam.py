@@ -25,7 +25,7 @@ from scipy.linalg import block_diag
 from scipy.linalg.blas import dgemm
 
 from redetect.array_types import BoolArray, FloatArray, IntArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks
 from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.filters import base
@@ -124,9 +124,9 @@ class EkfSlam(base.Filter):
         xy = np.concatenate([self._state[of_discs], line_xy])
         own = joint.reshape(len(every), 2, len(every), 2)[every, :, every]
 
-        def landmarks(ids: list[int], some: slice, rows: Counter[int]) -> Landmarks:
+        def landmarks(ids: list[int], some: slice, rows: Counter[int]) -> MapLandmarks:
             counts = np.array([rows[i] for i in ids], dtype=np.int64)
-            return Landmarks(np.array(ids, dtype=np.int64), xy[some], own[some], counts)
+            return MapLandmarks(np.array(ids, dtype=np.int64), xy[some], own[some], counts)
 
         line_ids = [number for number, good in zip(self.line_slots, placed) if good]
         return LandmarkMap(

@@ -30,7 +30,7 @@ from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import LARGEST_NUMBER
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.axes import covariance_from_dataset, to_dataset
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D, no_landmarks
 from redetect.plane import apply, between, chain_steps, compose, invert
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import ranges
@@ -329,7 +329,7 @@ def read_landmarks(path: Path) -> LandmarkMap:
     covariance = np.zeros((len(table), 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = table[:, 4] ** 2, table[:, 3] ** 2
     count = np.zeros(len(table), dtype=np.int64)
-    discs = Landmarks(ids, to_dataset(table[:, 1:3]), covariance, count)
+    discs = MapLandmarks(ids, to_dataset(table[:, 1:3]), covariance, count)
     return LandmarkMap(discs, no_landmarks())
 
 

@@ -186,7 +186,9 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
             numbers = tuple(map(number_in, words[count:]))
         except ValueError:
             vertices, numbers = (), ()
-        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(map(FINITE.hold, numbers))
+        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(
+            map(FINITE.contain, numbers)
+        )
         if not usable or len(numbers) != len(names):
             raise SlamError(
                 f"{path}:{line}: {kind} {' '.join(words)[:60]!a}: expected "

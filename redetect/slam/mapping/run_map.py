@@ -15,7 +15,7 @@ import numpy as np
 
 from camera import Camera
 from redetect.array_types import FloatArray
-from redetect.landmarks.map_file import LandmarkMap, Landmarks, Path2D, no_landmarks
+from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D, no_landmarks
 from redetect.least_squares.solver import Minimum
 from redetect.plane import apply, fitted
 from redetect.slam.errors import SlamError
@@ -159,8 +159,8 @@ class MappedRun:
         """The map."""
         graph, at, spread = self.graph, self.estimate, self.covariance
         return LandmarkMap(
-            discs=Landmarks(graph.disc_ids, at.disc_xy, spread.discs, graph.disc_row_counts),
-            lines=Landmarks(graph.line_ids, at.line_xy, spread.lines, graph.line_row_counts),
+            discs=MapLandmarks(graph.disc_ids, at.disc_xy, spread.discs, graph.disc_row_counts),
+            lines=MapLandmarks(graph.line_ids, at.line_xy, spread.lines, graph.line_row_counts),
         )
 
     @property
@@ -172,7 +172,7 @@ class MappedRun:
     def before(self) -> tuple[LandmarkMap, Path2D]:
         """Discs and poses at first sight, without covariances."""
         graph, zero = self.graph, np.zeros_like(self.covariance.discs)
-        discs = Landmarks(graph.disc_ids, self.start.disc_xy, zero, graph.disc_row_counts)
+        discs = MapLandmarks(graph.disc_ids, self.start.disc_xy, zero, graph.disc_row_counts)
         return LandmarkMap(discs, no_landmarks()), Path2D(self.prefixes, self.start.poses)
 
     def landmarks_jointly(self) -> LandmarkMap:

@@ -131,11 +131,11 @@ def test_residuals_of_bearings_are_wrapped_and_need_a_sigma() -> None:
 
 def test_bins_are_of_equally_many() -> None:
     at = np.arange(80.0)
-    middle, median, most = binned(at, 2.0 * at)
-    assert len(middle) == 10
-    np.testing.assert_allclose(median, 2.0 * middle)
+    centre, median, p95 = binned(at, 2.0 * at)
+    assert len(centre) == 10
+    np.testing.assert_allclose(median, 2.0 * centre)
     np.testing.assert_allclose(
-        most, [np.quantile(2.0 * at[k : k + 8], 0.95) for k in range(0, 80, 8)]
+        p95, [np.quantile(2.0 * at[k : k + 8], 0.95) for k in range(0, 80, 8)]
     )
     assert len(binned(np.zeros(0), np.zeros(0))[0]) == 0
 

@@ -14,8 +14,8 @@ import lut.cache
 from detect.line_settings import LineSettings
 from detect.runs import frame as rows_module
 from detect.runs.frame import FrameDetections, detect_batch, rows_of_frames
-from detect.runs.plan import FramePlan, FrameRows, FrameTask, KnownOfFrame
-from detect.runs.stream import Journal, task_digest
+from detect.runs.journal import Journal, task_digest
+from detect.runs.plan import FramePlan, FramePriors, FrameRows, FrameTask
 from detect.settings import PUBLISHED, CircleSettings
 from detect.sources.interface import RunFrame
 from detect.sources.opening import open_run
@@ -88,7 +88,7 @@ def test_tables_are_loaded_once(
 def test_tasks_travel_whole(tasks_and_plan: tuple[list[FrameTask], FramePlan]) -> None:
     tasks, _ = tasks_and_plan
     tilt = FrameTilt("e.0001", 0.1, 0.2, 1e-6, 0.0, 1e-6, 7)
-    tasks[1] = FrameTask(tasks[1].frame, KnownOfFrame(tilt))
+    tasks[1] = FrameTask(tasks[1].frame, FramePriors(tilt))
     shipped = RunFrame(tasks[2].frame.step, None, b"content", 1.5, "why")
     assert pickle.loads(pickle.dumps(tasks)) == tasks
     arrived = pickle.loads(pickle.dumps(shipped))

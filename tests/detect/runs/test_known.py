@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from detect.runs.plan import FramesByImage, Known
+from detect.runs.plan import FramesByImage, Priors
 from redetect.landmarks import LandmarkFileError, read_frames
 
 LINES = """\
@@ -31,7 +31,7 @@ LANDMARK_L 0 -0.6 0 0.3 1.5 0 0 0.003 4
 def test_lines_are_those_of_the_frame(tmp_path: Path, line_end: str, mark: bytes) -> None:
     path = tmp_path / "k.lines"
     path.write_bytes(mark + LINES.replace("\n", line_end).encode())
-    found = Known(lines=FramesByImage(path))
+    found = Priors(lines=FramesByImage(path))
     for frame in list(read_frames(path))[:3]:
         assert found.of(frame.step.prefix).lines == frame.lines
     (line,) = found.of("k.0001.png").lines

@@ -12,7 +12,7 @@ import pytest
 
 from detect.errors import DetectError
 from detect.line_settings import LineSettings
-from detect.runs.plan import KEPT_FAILURES, FramePlan, FramesByImage, Job, Known, RunSummary
+from detect.runs.plan import KEPT_FAILURES, FramePlan, FramesByImage, Job, Priors, RunSummary
 from detect.runs.stream import detect_run
 from detect.runs.workers import local_workers
 from detect.settings import CircleSettings
@@ -38,12 +38,12 @@ def run_folder(project_root: Path, tmp_path: Path) -> Path:
 
 
 def detect(
-    run: Path, places: dict[str, Path], jobs: int = 1, known: Known | None = None, **plan: Any
+    run: Path, places: dict[str, Path], jobs: int = 1, known: Priors | None = None, **plan: Any
 ) -> RunSummary:
     """Detect in one pass, with a plan of discs or lines or both."""
     opened = open_run(run)
     wanted = FramePlan(opened.camera, **plan)
-    return detect_run(Job(opened, wanted, places, known or Known()), local_workers(jobs))
+    return detect_run(Job(opened, wanted, places, known or Priors()), local_workers(jobs))
 
 
 def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
@@ -52,7 +52,7 @@ def in_folder(folder: Path, *kinds: str) -> dict[str, Path]:
 
 def in_two_passes(run: Path, output: Path) -> None:
     detect(run, in_folder(output, "lines", "tilt"), lines=LineSettings())
-    tilts = Known(tilts=read_tilts(output / "detected.tilt"))
+    tilts = Priors(tilts=read_tilts(output / "detected.tilt"))
     detect(run, in_folder(output, "circles"), known=tilts, circles=LIGHT)
 
 
@@ -90,10 +90,10 @@ def all_there_is(run: Path, output: Path, jobs: int) -> dict[str, bytes]:
     )
     reference.write_text("\n".join(numbered) + "\n")
     places = {"lines": output / "known.lines", "tilt": output / "known.tilt"}
-    known = Known(lines=FramesByImage(reference))
+    known = Priors(lines=FramesByImage(reference))
     detect(run, places, jobs, known, lines=LineSettings())
     places = {"circles": output / "level.circles", "json": output / "level.json"}
-    known = Known(tilts=read_tilts(plain["tilt"]))
+    known = Priors(tilts=read_tilts(plain["tilt"]))
     detect(run, places, jobs, known, circles=LIGHT)
     return files_in(output)
 
@@ -135,8 +135,8 @@ def test_failures_are_counted_but_not_all_kept(small_run: Path, tmp_path: Path) 
 class Arriving(Frames):
     """Frames of a run that come one by one, as those of a camera do, and who waits for them."""
 
-    def __init__(self, frames: list[RunFrame], *, ships_images: bool) -> None:
-        self.ships_images = ships_images
+    def __init__(self, frames: list[RunFrame], *, images_in_memory: bool) -> None:
+        self.images_in_memory = images_in_memory
         self.frames = frames
         self.done = 0
         self.largest_lead = 0
@@ -150,19 +150,19 @@ class Arriving(Frames):
         self.done += 1
 
 
-@pytest.mark.parametrize("ships_images", [True, False])
+@pytest.mark.parametrize("images_in_memory", [True, False])
 def test_only_files_are_asked_for_ahead(
-    run_folder: Path, tmp_path: Path, ships_images: bool
+    run_folder: Path, tmp_path: Path, images_in_memory: bool
 ) -> None:
     opened = open_run(run_folder)
-    frames = Arriving([*opened.frames] * 5, ships_images=ships_images)
+    frames = Arriving([*opened.frames] * 5, images_in_memory=images_in_memory)
     run = replace(opened, frames=frames)
     summary = detect_run(
         Job(run, FramePlan(run.camera, circles=LIGHT), {"circles": tmp_path / "a.circles"}),
         on_progress=frames.advance,
     )
     assert summary.frames == frames.done == 5 * FRAMES
-    if ships_images:
+    if images_in_memory:
         assert frames.largest_lead == 0
     else:
         assert 0 < frames.largest_lead <= 128

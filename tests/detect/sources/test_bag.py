@@ -26,7 +26,7 @@ from detect.sources.interface import eight_bits, gray_of_pixels, read_image
 from detect.sources.opening import open_source
 from detect.sources.poses import TimedPose, step_between
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from redetect.plane import rotation
 from tests.detect.commands import Captured, rows_in
 from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said

@@ -20,7 +20,7 @@ from detect.sources import video as live
 from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from tests.detect.commands import Captured, assert_refused
 from tests.detect.recordings import images_of, write_video
 from tests.pictures import read_grey

@@ -25,7 +25,7 @@ from detect.sources.poses import (
     velocity_poses,
 )
 from redetect.landmarks import read_frames
-from redetect.landmarks.frames import format_time, read_times
+from redetect.landmarks.frame_files import format_time, read_times
 
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 

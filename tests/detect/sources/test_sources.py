@@ -17,7 +17,7 @@ from detect.options import SourceOptions
 from detect.sources.interface import Run, read_image
 from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from tests.detect.commands import Captured, assert_refused, rows_in
 from tests.detect.recordings import images_of, write_bag, write_video
 from tests.pictures import read_grey

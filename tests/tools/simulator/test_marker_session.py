@@ -19,7 +19,7 @@ from redetect.groundtruth.markers.boards import BoardImage, find_boards
 from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import read_planar_poses
-from redetect.landmarks.frames import read_times
+from redetect.landmarks.frame_files import read_times
 from tests.pictures import read_grey
 from tools.simulator.__main__ import main
 from tools.simulator.driving import planar_transform
