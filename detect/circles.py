@@ -138,7 +138,7 @@ def _by_rims(
     """The default detector: finds discs by their rims and locates them by fits."""
     image, camera, table, left = within_margins(image, camera, table, settings)
     searched = searched_images(image, camera, table, settings)
-    discs, log_odds = judged_discs(searched, settings)
+    discs, log_odds = select_discs(searched, settings)
     scene = searched[0].scene
     floor_xy, fitted = place_discs(scene, discs, working_space()[0])
     centre_px = np.rint(project_floor_points(scene.camera_numbers, floor_xy))
@@ -238,22 +238,22 @@ def scene_of(image: GreyImage, camera: Camera, table: VoteTable, settings: Circl
     return Scene(image, table.floor_xy, settings.radius_m, noise, ratio, _numbers(camera))
 
 
-def judged_discs(
+def select_discs(
     searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[JudgedCandidates, FloatArray]:
     """The candidates that are discs, and their log-odds."""
-    _, judgement = judged_candidates(searched, settings)
+    _, judgement = classify_candidates(searched, settings)
     log_odds = adjusted_log_odds(judgement, settings)
     best = best_apart(judgement.floor_xy, log_odds, settings.evidence, settings.separation_m)
     return judgement.where(best), log_odds[best]
 
 
-def judged_candidates(
+def classify_candidates(
     searched: Sequence[Searched], settings: CircleSettings
 ) -> tuple[FloatArray, JudgedCandidates]:
     """(N,) scores of all candidates, and their classification."""
     candidates = [candidates_of(*each, settings) for each in searched]
-    found = [judged(each.scene, settings, own) for each, own in zip(searched, candidates)]
+    found = [classify(each.scene, settings, own) for each, own in zip(searched, candidates)]
     return (
         np.concatenate([each.score for each in candidates]),
         JudgedCandidates._make(map(np.concatenate, zip(*found))),
@@ -267,7 +267,7 @@ def candidates_of(scene: Scene, table: VoteTable, settings: CircleSettings) -> H
     return hough_candidates(scene.image, table, scene.radius, SIGNS[settings.polarity], edge)
 
 
-def judged(
+def classify(
     scene: Scene,
     settings: CircleSettings,
     candidates: HoughCandidates,

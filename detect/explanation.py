@@ -21,8 +21,8 @@ from detect.circles import (
     SIGNS,
     CircleDetections,
     adjusted_log_odds,
+    classify_candidates,
     detect_circles,
-    judged_candidates,
     searched_images,
     vote_shape,
     within_margins,
@@ -227,7 +227,7 @@ class _Examined:
         """Votes for the candidates of both polarities, and their classification."""
         settings = replace(self.settings, polarity="any")
         image, camera, table, _ = within_margins(self.image, self.camera, self.table, settings)
-        return judged_candidates(searched_images(image, camera, table, settings), settings)
+        return classify_candidates(searched_images(image, camera, table, settings), settings)
 
     def count(self, at: tuple[float, float] | None) -> int:
         """Number of discs found, near a pixel if one is given."""

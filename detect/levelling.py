@@ -45,9 +45,9 @@ def levelled(found: CircleDetections, camera: Camera, tilt: FrameTilt) -> Circle
     Discs above the horizon of the levelled camera are dropped.
     """
     tilts = tilt_arrays([tilt])
-    floor_xy, covariance, down = level_discs(camera, found.floor_xy, found.covariance, *tilts)
+    floor_xy, covariance, on_floor = level_discs(camera, found.floor_xy, found.covariance, *tilts)
     by = tilt.pitch, tilt.roll
-    return replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by).where(down)
+    return replace(found, floor_xy=floor_xy, covariance=covariance, levelled_by=by).where(on_floor)
 
 
 def as_calibrated(found: CircleDetections, leaning: Camera, camera: Camera) -> CircleDetections:
@@ -90,8 +90,8 @@ def level_discs(
     of_all[:, :2, :2] = covariance
     of_all[:, 2:, 2:] = tilt_covariance
     level_covariance = jacobian @ of_all @ jacobian.swapaxes(1, 2)
-    down = np.isfinite(level_xy).all(axis=1) & np.isfinite(level_covariance).all(axis=(1, 2))
-    return level_xy, level_covariance, np.asarray(down)
+    on_floor = np.isfinite(level_xy).all(axis=1) & np.isfinite(level_covariance).all(axis=(1, 2))
+    return level_xy, level_covariance, np.asarray(on_floor)
 
 
 def common_covariance(
@@ -130,7 +130,7 @@ def common_tilt_variance(camera: Camera) -> FloatArray | None:
     return np.asarray(np.diag(jacobian @ covariance @ jacobian.T))
 
 
-def sentence_of(circles: Path, camera: Camera) -> str:
+def calibration_share(circles: Path, camera: Camera) -> str:
     """A sentence on the calibration's share of the variances in a file's rows."""
     shares: list[float] = []
     for frame in read_frames(circles):

@@ -1,4 +1,4 @@
-"""Projects floor positions into the image, undoing that they were levelled; and levels them.
+"""Projection of floor positions into the image, and their correction for the tilt.
 
 Plain NumPy, so that comparing files does not load the compiler.
 """
@@ -42,7 +42,7 @@ def image_positions(
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
     if levelled_by is not None:
         # The rotation levels measured directions; its transpose undoes that.
-        points = points @ level_matrix(levelled_by)
+        points = points @ level_rotation(levelled_by)
     return camera.project_robot(points - np.array([0.0, 0.0, raised_m]))
 
 
@@ -55,7 +55,7 @@ def level_positions(
     for all or broadcast against them. NaN where the levelled ray does not meet the floor.
     """
     xy = np.asarray(floor_xy, dtype=np.float64)
-    turn = level_matrix(levelled_by)
+    turn = level_rotation(levelled_by)
     points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
     rays = (turn @ (points - camera.centre)[..., None])[..., 0]
     centre = turn @ (camera.centre + np.array([0.0, 0.0, raised_m]))
@@ -63,8 +63,11 @@ def level_positions(
     return np.asarray(centre[..., :2] - centre[..., 2:] / down * rays[..., :2])
 
 
-def level_matrix(levelled_by: ArrayLike) -> FloatArray:
-    """(..., 3, 3) rotations exp([pitch, roll, 0]x) that level measured directions."""
+def level_rotation(levelled_by: ArrayLike) -> FloatArray:
+    """(..., 3, 3) rotations exp([pitch, roll, 0]x) that level measured directions.
+
+    `detect.verticals.tilt.levelling_rotation` is the kernel.
+    """
     tilt = np.asarray(levelled_by, dtype=np.float64)
     return rotation_of(np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1))
 
@@ -74,7 +77,7 @@ def leaning_camera(camera: Camera, lean: Tilt, raised_m: float = 0.0) -> Camera:
 
     These level directions, about the robot's origin on the floor. The covariance is dropped.
     """
-    turn = level_matrix(lean)
+    turn = level_rotation(lean)
     centre = camera.centre + np.array([0.0, 0.0, raised_m])
     pose = np.column_stack([turn @ camera.rotation, turn @ centre])
     return replace(camera, robot_from_camera=checked_pose("sensor2World", pose), covariance=None)

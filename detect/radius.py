@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from detect.circles import judged_discs, searched_images, vote_shape
+from detect.circles import searched_images, select_discs, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from redetect.array_types import FloatArray, GreyImage
@@ -80,7 +80,7 @@ def _rims(
     """The rims in each image: (N, 4) positions and radii, metres, and log-odds."""
     table = build_vote_table(camera, vote_shape(settings))
     found = [
-        judged_discs(searched_images(each, camera, table, settings), settings) for each in images
+        select_discs(searched_images(each, camera, table, settings), settings) for each in images
     ]
     return [np.column_stack([discs.floor_xy, discs.radius, log_odds]) for discs, log_odds in found]
 

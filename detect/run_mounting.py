@@ -17,7 +17,7 @@ from camera.calibration.model import COUNT
 from camera.model import PARAMETERS
 from camera.rotations import left_jacobian
 from camera.uncertainty import covariance_of, with_covariance
-from detect.projection import leaning_camera, level_matrix
+from detect.projection import leaning_camera, level_rotation
 from detect.run_tilt import COMMON_RAD, FrameTilts, tilt_of_run
 from detect.settings import LEAST_FRAMES
 from redetect.array_types import FloatArray
@@ -28,7 +28,7 @@ HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 _RADIUS_SIGMA = 0.01
 #: Largest change of the height that the outlines show, and share of frames that mostly have discs.
 _MOST_RAISED, _FEW_DISCS = 0.6, 0.4
-_TOGETHER = 5.0  #: Number of neighbouring frames that see the same discs.
+_CORRELATED_FRAMES = 5.0  #: Number of neighbouring frames that see the same discs.
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
 _LEAN_AND_HEIGHT = (COUNT + 3, COUNT + 4, COUNT + 2)
@@ -94,9 +94,9 @@ def mounting_of_run(
             share = -(off + 0.5 * bend * share**2) / slope
         if abs(share) < _MOST_RAISED:
             spread = 1.4826 * float(np.median(np.abs(same - off)))
-            statistical = spread * math.sqrt(0.5 * math.pi * _TOGETHER / count) / abs(slope)
+            of_median = spread * math.sqrt(0.5 * math.pi * _CORRELATED_FRAMES / count)
             raised_m = share * height_m
-            sigma_m = height_m * math.hypot(statistical, COMMON_RAD / slope, _RADIUS_SIGMA)
+            sigma_m = height_m * math.hypot(of_median / slope, COMMON_RAD / slope, _RADIUS_SIGMA)
     frames = int(np.count_nonzero(verticals.known))
     return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)
 
@@ -107,7 +107,7 @@ def remounted(camera: Camera, mounting: Mounting) -> Camera:
     If it states its covariance, that of its pitch, roll and (where there is one) height becomes the
     mounting's; the rest stays.
     """
-    turn = level_matrix(mounting.tilt_rad)
+    turn = level_rotation(mounting.tilt_rad)
     raised_m = 0.0 if math.isnan(mounting.raised_m) else mounting.raised_m
     pitch, roll = mounting.tilt_rad
     moved = leaning_camera(camera, (pitch, roll), raised_m)

@@ -219,7 +219,7 @@ class _Axis(NamedTuple):
 
     lean: float
     spread: float
-    memory: float  # correlation of deviations from frame to frame
+    correlation: float  # of deviations from frame to frame
     verticals_scale: float
     outlines_scale: float
     offset: float = math.nan  # the outlines' constant minus the verticals'
@@ -248,7 +248,7 @@ class _Series(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = (information * np.nan_to_num(values)).sum(axis=0) / total
             likelihood, deviation, of_deviation = smooth_axis(
-                mean - axis.lean, 1.0 / np.sqrt(total), axis.spread, axis.memory
+                mean - axis.lean, 1.0 / np.sqrt(total), axis.spread, axis.correlation
             )
         difference, of_difference = values[1] - values[0], variance.sum(axis=0)
         both = np.isfinite(difference)
@@ -354,7 +354,7 @@ def _weighted_density(share: float, off: float, variance: float) -> float:
 
 @kernel()
 def smooth_axis(
-    deviation: FloatArray, sigma: FloatArray, spread: float, memory: float
+    deviation: FloatArray, sigma: FloatArray, spread: float, correlation: float
 ) -> tuple[float, FloatArray, FloatArray]:
     """Smooth the deviations of one angle from the run's constant lean over all frames.
 
@@ -375,9 +375,9 @@ def smooth_axis(
     x, u, xx, xu, uu = 0.0, 0.0, spread * spread, 0.0, 1.0
     for k in range(count):
         if k > 0:
-            x, u = memory * x, LASTING * u
-            xx = memory * memory * xx + (1.0 - memory * memory) * spread * spread
-            xu = memory * LASTING * xu
+            x, u = correlation * x, LASTING * u
+            xx = spread * spread + correlation * correlation * (xx - spread * spread)
+            xu = correlation * LASTING * xu
             uu = LASTING * LASTING * uu + 1.0 - LASTING * LASTING
         before[k, 0], before[k, 1], before[k, 2], before[k, 3], before[k, 4] = x, u, xx, xu, uu
         if not math.isnan(deviation[k]):
@@ -407,7 +407,7 @@ def smooth_axis(
             fx, fu, fxx, fxu, fuu = after[k]
             determinant = pxx * puu - pxu * pxu
             # Rows of the smoother's gain, for x and for u.
-            cxx, cxu, cux, cuu = memory * fxx, LASTING * fxu, memory * fxu, LASTING * fuu
+            cxx, cxu, cux, cuu = correlation * fxx, LASTING * fxu, correlation * fxu, LASTING * fuu
             gxx = (cxx * puu - cxu * pxu) / determinant
             gxu = (cxu * pxx - cxx * pxu) / determinant
             gux = (cux * puu - cuu * pxu) / determinant

@@ -106,23 +106,23 @@ def build_disc_table(camera: Camera, shape: DiscShape) -> DiscTable:
     """
     demand_above_floor(camera)
     floor_xy = floor_positions(camera)
-    down, paired = size_down(floor_xy), shape.least_pairs > 0
+    step_m, paired = row_step_m(floor_xy), shape.least_pairs > 0
     if paired:
         by_row = camera.floor_jacobian_published(camera.pixel_grid())[..., 1]
-        down = np.hypot(by_row[..., 0], by_row[..., 1])
+        step_m = np.hypot(by_row[..., 0], by_row[..., 1])
     numbers = published_camera_numbers(camera) if paired else camera_numbers(camera)
     angle = 2.0 * np.pi * np.arange(shape.samples) / shape.samples
     angle = np.concatenate([angle[0::2], angle[1::2]])
     unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     radii = shape.inner_radius_m, shape.outer_radius_m
     outlines = _Outlines(*radii, unit, paired, float(shape.apart_px))
-    candidate = pixels_within(down, shape.border_px, shape.far_limit_m_per_px)
-    step = np.fmax(np.ceil(shape.stride_m / down), 1.0)
+    candidate = pixels_within(step_m, shape.border_px, shape.far_limit_m_per_px)
+    step = np.fmax(np.ceil(shape.stride_m / step_m), 1.0)
     enough = shape.least_pairs or MIN_SHARE_INSIDE * shape.samples
     samples, pixels = [np.zeros((0, shape.samples, 2), np.uint32)], [np.zeros((0, 2), np.int32)]
     for row in np.flatnonzero(candidate.any(axis=1)).tolist():
         across = np.flatnonzero(candidate[row])
-        centres = floor_xy[row, across], down[row, across]
+        centres = floor_xy[row, across], step_m[row, across]
         seen = _sample_pixels(numbers, camera.width, camera.height, *centres, outlines)
         inside = np.count_nonzero(seen < camera.height * camera.width, axis=1).min(axis=1)
         usable = np.flatnonzero(inside >= enough)
@@ -149,7 +149,7 @@ class _Outlines(NamedTuple):
 
 @kernel()
 def _sample_pixels(
-    numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, down: FloatArray,
+    numbers: FloatArray, width: int, height: int, centre_xy: FloatArray, step_m: FloatArray,
     outlines: _Outlines,
 ) -> NDArray[np.uint32]:  # fmt: skip
     """`DiscTable.samples` of some centres, (N, 2) on the floor, with (N,) the size of a pixel."""
@@ -170,15 +170,15 @@ def _sample_pixels(
                     pixel[j] = int(v + 0.5) * width + int(u + 0.5) if inside else outside
                 if not (outlines.paired and pixel[0] == pixel[1] and pixel[0] < outside):
                     break
-                radius[0] -= outlines.apart_px * down[i]
-                radius[1] += outlines.apart_px * down[i]
+                radius[0] -= outlines.apart_px * step_m[i]
+                radius[1] += outlines.apart_px * step_m[i]
             if outlines.paired and (pixel[0] == outside or pixel[1] == outside):
                 pixel[:] = outside
             samples[i, k, 0], samples[i, k, 1] = pixel[0], pixel[1]
     return samples
 
 
-def size_down(floor_xy: FloatArray) -> FloatArray:
+def row_step_m(floor_xy: FloatArray) -> FloatArray:
     """(H, W) step of the floor per image row, metres, from (H, W, 2) positions."""
     if len(floor_xy) == 1:
         return np.full(floor_xy.shape[:2], np.nan)
@@ -186,13 +186,13 @@ def size_down(floor_xy: FloatArray) -> FloatArray:
     return np.hypot(by_row[..., 0], by_row[..., 1])
 
 
-def pixels_within(down: FloatArray, border: int, far_limit_m_per_px: float) -> BoolArray:
-    """(H, W) pixels far enough from the border and near enough on the floor (`size_down`)."""
-    height, width = down.shape
+def pixels_within(step_m: FloatArray, border: int, far_limit_m_per_px: float) -> BoolArray:
+    """(H, W) pixels far enough from the border and near enough on the floor (`row_step_m`)."""
+    height, width = step_m.shape
     u, v = np.arange(width), np.arange(height)
     inside_u = (u >= border) & (u <= width - border)
     inside_v = (v >= border) & (v <= height - border)
-    return np.asarray((down <= far_limit_m_per_px) & inside_v[:, None] & inside_u[None, :])
+    return np.asarray((step_m <= far_limit_m_per_px) & inside_v[:, None] & inside_u[None, :])
 
 
 def _strided(columns: IntArray, step: FloatArray) -> list[int]:

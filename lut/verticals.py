@@ -195,8 +195,8 @@ def _crossing(
     By Newton's method from an elevation nearby; NaN if there is no crossing.
     """
     for _ in range(_NEWTON_STEPS):
-        u, v = _seen(numbers, bearing, angle)
-        slope = (_seen(numbers, bearing, angle + _STEP_RAD)[1] - v) / _STEP_RAD
+        u, v = _project_bearing(numbers, bearing, angle)
+        slope = (_project_bearing(numbers, bearing, angle + _STEP_RAD)[1] - v) / _STEP_RAD
         if abs(row - v) < _TOLERANCE_PX:
             return u, angle, slope
         angle += (row - v) / slope
@@ -204,7 +204,7 @@ def _crossing(
 
 
 @kernel()
-def _seen(numbers: FloatArray, bearing: float, elevation: float) -> tuple[float, float]:
+def _project_bearing(numbers: FloatArray, bearing: float, elevation: float) -> tuple[float, float]:
     ahead = math.cos(elevation)
     return project_direction(
         numbers, ahead * math.sin(bearing), -ahead * math.cos(bearing), math.sin(elevation)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from camera import Camera
-from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, size_down
+from lut.outlines import demand_above_floor, fingerprint, floor_positions, pixels_within, row_step_m
 from redetect.array_types import ByteArray, Float32Array, FloatArray, IntArray
 
 _CELL_RADII = 0.25  #: Width of a cell, radii.
@@ -75,7 +75,7 @@ def build_vote_table(camera: Camera, shape: VoteShape) -> VoteTable:
     foot, radius = np.array(camera.centre[:2]), shape.radius_m
     offset = floor_xy - foot
     limits = shape.border_px, shape.far_limit_m_per_px
-    usable = pixels_within(size_down(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
+    usable = pixels_within(row_step_m(floor_xy), *limits) & np.isfinite(offset).all(axis=-1)
     if min(usable.shape) >= 3:
         by_row, by_column = (np.gradient(floor_xy, axis=axis) for axis in (0, 1))
         size = radius_px(radius, np.stack([by_column, by_row], axis=-1))

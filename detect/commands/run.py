@@ -203,9 +203,9 @@ def _print_results(job: Job, summary: RunSummary) -> None:
             f"{circles.calibration_px:g} px (--calibration-px)"
         )
     elif circles and circles.refine and camera and any(camera.covariance or ()):
-        from detect.levelling import sentence_of  # loads the compiler
+        from detect.levelling import calibration_share  # loads the compiler
 
-        print(sentence_of(outputs["circles"], camera))
+        print(calibration_share(outputs["circles"], camera))
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")

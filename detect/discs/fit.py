@@ -74,7 +74,7 @@ _TERMS = 12
 
 #: Steps of the fit; the first ones reject no sector, since the start may be off.
 _STEPS, _EARLY = 12, 1
-_ARRIVED = 5e-3  #: The iteration stops after a shorter step, nominal radii.
+_CONVERGED_STEP = 5e-3  #: The iteration stops after a shorter step, nominal radii.
 _LONGEST, _LONGEST_BLUR = 0.2, 0.7  #: Longest step, nominal radii (and log blur).
 _MOST_OFF = 0.3  #: Largest offset of a fit by parts from its start, radii.
 #: Bounds of the blur, pixels, and of the radius, nominal radii.
@@ -145,7 +145,7 @@ class FitSettings(NamedTuple):
 class Fit(NamedTuple):
     """A fitted disc; lengths in metres."""
 
-    arrived: bool  #: Whether it converged; if not, the covariance is infinite, the rest undefined.
+    converged: bool  #: If not, the covariance is infinite, and the rest undefined.
     x: float
     y: float
     radius: float
@@ -165,7 +165,7 @@ class Fit(NamedTuple):
 NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
 
 
-class Edge(NamedTuple):
+class BlurredDisc(NamedTuple):
     """A disc relative to its candidate, nominal radii, and its blur."""
 
     x: float
@@ -216,8 +216,9 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
     most_blur = _MOST_BLUR
     if shape != EDGE:
         most_blur = min(_MOST_GROWTH * start.blur_px + _MOST_GROWTH_PX, _MOST_BLUR)
-    usual = Edge(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
-    edge = Edge(begin.x, begin.y, begin.radius, _blur_of(shape, start.blur_px, scene.blur_ratio))
+    usual = BlurredDisc(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
+    blur = _blur_of(shape, start.blur_px, scene.blur_ratio)
+    edge = BlurredDisc(begin.x, begin.y, begin.radius, blur)
     parts = ends if by_parts else ends[::SECTORS].copy()
     groups = len(parts) - 1
     zeros = np.zeros((5, groups))
@@ -246,7 +247,7 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         _solve(normal.copy(), _BLUR_1, movement)
         edge = _moved(edge, movement, most_blur)
         moved = max(math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS]))
-        if moved < _ARRIVED and step > _EARLY:
+        if moved < _CONVERGED_STEP and step > _EARLY:
             break
     reduced = normal.copy()
     eliminate(reduced, range(_BLUR_1, _RADIUS))
@@ -300,7 +301,7 @@ def _blur_of(shape: int, blur: float, ratio: float) -> Blur:
 
 @kernel(forceinline=True, fastmath=FASTMATH)
 def _write_rows(
-    patch: Any, n: int, edge: Edge, level: float, by_parts: bool, rows: Float32Array
+    patch: Any, n: int, edge: BlurredDisc, level: float, by_parts: bool, rows: Float32Array
 ) -> None:
     """Write the derivatives by all unknowns, and the grey values (above `level`), of n pixels."""
     shares = patch.shares
@@ -459,8 +460,9 @@ def _scale(grouped: FloatArray, levels: Levels) -> None:
 
 @kernel(inline="always")
 def _add_up(
-    grouped: FloatArray, edge: Edge, usual: Edge, radius_sigma: float, normal: FloatArray
-) -> None:
+    grouped: FloatArray, edge: BlurredDisc, usual: BlurredDisc, radius_sigma: float,
+    normal: FloatArray,
+) -> None:  # fmt: skip
     """The normal equations of the edge's step: the sum of all groups, plus the priors."""
     for a in range(_BLUR_1, _TERMS):
         for b in range(_BLUR_1, min(a, _Y) + 1):
@@ -486,13 +488,13 @@ def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
 
 
 @kernel(inline="always")
-def _moved(edge: Edge, step: FloatArray, most_blur: float) -> Edge:
+def _moved(edge: BlurredDisc, step: FloatArray, most_blur: float) -> BlurredDisc:
     """The edge after a step, within limits."""
     radius = edge.radius + within(step[_RADIUS], _LONGEST)
     x, y = edge.x + within(step[_X], _LONGEST), edge.y + within(step[_Y], _LONGEST)
     first = _scaled(edge.blur.first, step[_BLUR_1], most_blur)
     second = _scaled(edge.blur.second, step[_BLUR_2], most_blur)
-    return Edge(x, y, min(max(radius, _LEAST_RADIUS), _MOST_RADIUS), Blur(first, second))
+    return BlurredDisc(x, y, min(max(radius, _LEAST_RADIUS), _MOST_RADIUS), Blur(first, second))
 
 
 @kernel(inline="always")

@@ -35,7 +35,7 @@ LEAST_AXIS_PX = 1.2  #: Least semi-minor axis of the ellipse, pixels.
 #: Least contrast, grey levels.
 LEAST_CONTRAST = 8.0
 POINT_SIGMA_PX = 0.25  #: Standard deviation of a rim point, pixels.
-TOGETHER = 4.0  #: Number of neighbours with a common error.
+_CORRELATED_POINTS = 4.0  #: Number of neighbours with a common error.
 #: Standard deviation of a single disc's tilt, and of the floor's below all discs of a frame.
 DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 
@@ -192,7 +192,7 @@ def fit_outline(
         on += weight[k] > 0.0 and abs(residual[k]) < 3.0 * sigma
         squares += weight[k] * residual[k] ** 2
         weights += weight[k]
-    variance = max(squares / weights, POINT_SIGMA_PX**2) * TOGETHER
+    variance = max(squares / weights, POINT_SIGMA_PX**2) * _CORRELATED_POINTS
     found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
     return OutlineTilt(found, unknowns[2:].copy(), variance * inverse[2:, 2:])
 

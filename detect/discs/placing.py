@@ -109,7 +109,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
     for k, fit in enumerate(whole):
         if not _explains(fit, discs, k):
             size = size_of_disc(scene.radius, radii, k)
-            place = _place_by_rim(scene, discs, k, last[k] if last[k].arrived else parts[k], size)
+            place = _place_by_rim(scene, discs, k, last[k] if last[k].converged else parts[k], size)
         else:
             place = _place_of(fit)
             if fit.explained < _EXPLAINS_ALL:
@@ -135,7 +135,7 @@ def _start_of(
     size, wanted = Size(scene.radius, RADIUS_SIGMA * scene.radius), True
     if stage < _PARTS:
         if stage > 0:  # too blurred for its patch: once more, in a wider one
-            wanted = fit.arrived and fit.blur > _AT_BOUND * fit.blur_bound
+            wanted = fit.converged and fit.blur > _AT_BOUND * fit.blur_bound
             x, y, radius, blur_px = fit.x, fit.y, fit.radius, fit.blur_bound
     elif stage == _PARTS:
         wanted = not _explains(fit, discs, k)
@@ -149,7 +149,7 @@ def _start_of(
         if wanted:
             size = size_of_disc(scene.radius, radii, k)
             before, radius = fit if explained else by_parts, size.radius
-            if before.arrived:
+            if before.converged:
                 x, y, radius, blur_px = before.x, before.y, before.radius, before.blur
     return wanted, Start(x, y, radius, blur_px), size
 
@@ -187,14 +187,14 @@ def _explains(fit: Fit, discs: JudgedCandidates, k: int) -> bool:
     """Whether the fit of a whole disc explains the image."""
     least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
     same_sign = fit.contrast * discs.step[k] > 0.0
-    return bool(fit.arrived and fit.explained >= least and same_sign)
+    return bool(fit.converged and fit.explained >= least and same_sign)
 
 
 @kernel(inline="always")
 def _place_by_rim(scene: Scene, discs: JudgedCandidates, k: int, fit: Fit, size: Size) -> Place:
     """Place a disc by its sectors, or where they differ by the points of its rim."""
     rim = _rim_of(scene, discs, k, size.radius)
-    if fit.arrived:
+    if fit.converged:
         place = _place_of(fit)
     else:
         place = Place(rim.x, rim.y, rim.cov_xx, rim.cov_xy, rim.cov_yy)

@@ -42,7 +42,7 @@ LEAST_POINTS = 6  #: Least number of points on a circle.
 #: Least number of points for placing a circle; its steps, and the deviations that make an outlier.
 LEAST_TRUSTED = 8
 _PLACING_STEPS, _FAR_OFF = 4, 2.5
-_ALIKE = 1.5  #: Number of neighbouring points with a common error.
+_CORRELATED_POINTS = 1.5  #: Number of neighbouring points with a common error.
 #: Distance of the circle's starts from the candidate, nominal radii; the first is the candidate.
 _START = 0.3
 _STARTS = 9
@@ -55,7 +55,7 @@ _PER_POINT = 0.5  #: Log-odds that each point on a circle adds to it.
 #: Number of steps from each start, and the longest step, nominal radii.
 _ITERATIONS = 8
 _LONGEST_STEP = 0.3
-_ARRIVED = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
+_CONVERGED_STEP = 1e-4  #: Iteration stops at a shorter step with the same inliers, nominal radii.
 #: A circle with this share of the points is the best: the other starts are skipped.
 _CERTAINLY_BEST = 0.9
 
@@ -306,7 +306,7 @@ def best_circle(
             circle = fit_circle(x, y, chosen, before, RADIUS_SIGMA)
             count, changed = _choose(x, y, weight, tolerance, circle, 1.6 if i < 2 else 1.0, chosen)
             moved = max(abs(circle.x - before.x), abs(circle.y - before.y))
-            if i > 2 and not changed and moved < _ARRIVED:
+            if i > 2 and not changed and moved < _CONVERGED_STEP:
                 break
         if count < LEAST_POINTS:
             continue
@@ -377,7 +377,7 @@ def follow_rim(
     scatter = math.sqrt(squares / best_count)
     radius_found = radius * best.radius
     best = _placed(at_x, at_y, chosen, best)
-    area = _ALIKE * radius * radius
+    area = _CORRELATED_POINTS * radius * radius
     return Rim(
         best_count / DIRECTIONS, runs, scatter, mean / best_count,
         x + radius * best.x, y + radius * best.y, radius_found,

@@ -173,7 +173,7 @@ def detect_markers(
     markers: list[_Marker] = []
     candidates: list[Candidate] = []
     tried = np.empty((0, 4, 2))
-    hulls = picture.straighten(np.concatenate([np.empty((0, 2)), *(r.hull for r in regions)]))
+    hulls = picture.undistort(np.concatenate([np.empty((0, 2)), *(r.hull for r in regions)]))
     ends = np.cumsum([len(region.hull) for region in regions])
     for region, hull in zip(regions, np.split(hulls, ends)):
         if not np.isfinite(hull).all():
@@ -186,7 +186,7 @@ def detect_markers(
         if geometry.signed_area(rough) < _LEAST_SQUARE * cv2.contourArea(hull.astype("f4")):
             rejected[geometry.NO_QUADRANGLE] += 1
             continue
-        outline = picture.bend(rough)
+        outline = picture.distort(rough)
         if markers and geometry.covered(rough, np.array([marker.corners for marker in markers])):
             candidates.append(Candidate(outline, SAME_MARKER))
             continue
@@ -204,7 +204,7 @@ def detect_markers(
 
     # Back to the distorted image.
     markers.sort(key=lambda m: (m.id, m.corners[0, 0], m.corners[0, 1]))
-    outlines = [picture.bend(marker.corners) for marker in markers]
+    outlines = [picture.distort(marker.corners) for marker in markers]
     spreads = [_image_covariance(m, at, picture, settings) for m, at in zip(markers, outlines)]
     return MarkerDetections(
         dictionary=settings.dictionary,
@@ -303,7 +303,7 @@ def sampled_cells(picture: Picture, corners: FloatArray, templates: Templates) -
     x, y = np.meshgrid(along, along)
     homography = geometry.square_homography(corners)
     straight = cv2.perspectiveTransform(np.stack([x, y], axis=-1), homography)
-    u, v = picture.bend(np.asarray(straight, np.float64).reshape(-1, 2)).T
+    u, v = picture.distort(np.asarray(straight, np.float64).reshape(-1, 2)).T
     height, width = picture.grey.shape
     if not np.all((u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)):
         return None
@@ -330,11 +330,13 @@ def verified_quality(
 ) -> float | str:
     """The quality of a fitted template, or the reason for rejection by its cells."""
     weakness = templates.weakness
-    if fit.blur_cells > _between(weakness, *_LARGEST_BLUR_CELLS):
+    if fit.blur_cells > _clamped_lerp(weakness, *_LARGEST_BLUR_CELLS):
         return TOO_SMALL
     strict = (fit.blur_cells - _STRICT_FROM) / (_STRICT_AT - _STRICT_FROM)
-    misfit = _between(strict, _CLEAR_MISFIT, _between(weakness, *_BLURRED_MISFIT))
-    agreement = _between(strict, _CLEAR_AGREEMENT, _between(weakness, *_BLURRED_AGREEMENT))
+    misfit = _clamped_lerp(strict, _CLEAR_MISFIT, _clamped_lerp(weakness, *_BLURRED_MISFIT))
+    agreement = _clamped_lerp(
+        strict, _CLEAR_AGREEMENT, _clamped_lerp(weakness, *_BLURRED_AGREEMENT)
+    )
     allowed = _LARGEST_CELL_ERROR
     if templates.plain[template]:
         misfit = min(misfit, _PLAIN_MISFIT)
@@ -358,7 +360,7 @@ def verified_quality(
     return max(0.0, 1.0 - distance)
 
 
-def _between(share: float, first: float, second: float) -> float:
+def _clamped_lerp(share: float, first: float, second: float) -> float:
     """Interpolate from the first number to the second, clamped, as the share goes from 0 to 1."""
     return float(np.interp(share, (0.0, 1.0), (first, second)))
 

@@ -166,7 +166,7 @@ def _sampled(picture: Picture, first: FloatArray, last: FloatArray) -> ByteArray
 
     They are so close to each other that distortion between them is negligible.
     """
-    ends = picture.bend(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
+    ends = picture.distort(np.stack([first, last]).reshape(-1, 2)).T.reshape(2, 2, -1, 1, 4)
     height, width = picture.grey.shape
     inside = (ends >= -0.5) & (ends <= np.array([width, height])[:, None, None, None, None] - 0.5)
     if not inside.all():

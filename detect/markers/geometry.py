@@ -42,11 +42,11 @@ class Picture:
     camera: Camera | None
     straight: Float32Array  # (H, W, 2) straight position of each pixel; NaN past the lens's fold
 
-    def straighten(self, pixels: FloatArray) -> FloatArray:
+    def undistort(self, pixels: FloatArray) -> FloatArray:
         """(N, 2) straight positions of (N, 2) pixels."""
         return pixels if self.camera is None else _straightened(self.camera, pixels)
 
-    def bend(self, straight: FloatArray) -> FloatArray:
+    def distort(self, straight: FloatArray) -> FloatArray:
         """(N, 2) pixels of (N, 2) straight positions; NaN if there is none."""
         c = self.camera
         if c is None:

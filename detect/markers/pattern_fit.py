@@ -257,7 +257,7 @@ def _samples(
     """
     along = np.linspace(0.0, 1.0, 5)[:, None, None]
     outline = (1.0 - along) * corners + along * np.roll(corners, -1, axis=0)
-    pixels = picture.bend(outline.reshape(-1, 2))
+    pixels = picture.distort(outline.reshape(-1, 2))
     low, high = pixels.min(axis=0), pixels.max(axis=0)
     last = np.array(picture.grey.shape[::-1]) - 1
     if not (np.all(low >= 0.0) and np.all(high <= last)):

@@ -310,4 +310,4 @@ def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
     place_discs(scene, NO_CANDIDATES, working_space()[0])
     if plan.levelling == "run":
         tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
-        smooth_axis(np.zeros(1), np.ones(1), spread=1.0, memory=0.0)
+        smooth_axis(np.zeros(1), np.ones(1), spread=1.0, correlation=0.0)

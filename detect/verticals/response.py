@@ -31,7 +31,7 @@ MIDDLE_GREY = np.float32(128.0)
 STRIPE_ROWS = 16  #: Rows of a stripe in which the response is evaluated.
 #: Least number of columns in which it is evaluated; the stripe's width is a multiple of `_VECTOR`.
 _LEAST_COLUMNS, _VECTOR = 8, 8
-_TOGETHER = 7  #: Weights along the path that are applied at a time.
+_UNROLLED = 7  #: Weights along the path that are applied at a time.
 
 
 class LineFilter(NamedTuple):
@@ -101,7 +101,7 @@ def line_filter(settings: LineSettings) -> LineFilter:
 
 def padded(weights: FloatArray) -> Float32Array:
     """Pad weights with zeros (last axis) to a number that is summed together."""
-    behind = [(0, 0)] * (weights.ndim - 1) + [(0, -weights.shape[-1] % _TOGETHER)]
+    behind = [(0, 0)] * (weights.ndim - 1) + [(0, -weights.shape[-1] % _UNROLLED)]
     return np.pad(weights, behind).astype(np.float32)
 
 
@@ -214,10 +214,10 @@ def correlate(values: Float32Array, weights: Float32Array, stride: int, sums: Fl
     for c in range(len(sums)):
         sums[c] = 0.0
     step = np.uint64(stride)
-    for m in range(np.uint64(0), np.uint64(len(weights)), np.uint64(_TOGETHER)):
+    for m in range(np.uint64(0), np.uint64(len(weights)), np.uint64(_UNROLLED)):
         for c in range(np.uint64(len(sums))):
             total = sums[c]
-            for k in range(np.uint64(_TOGETHER)):
+            for k in range(np.uint64(_UNROLLED)):
                 total += weights[m + k] * values[c + (m + k) * step]
             sums[c] = total
 

@@ -16,7 +16,7 @@ from camera import Camera, read_camera
 from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
 from lut import cached_vote_table
-from lut.outlines import floor_positions, pixels_within, size_down
+from lut.outlines import floor_positions, pixels_within, row_step_m
 from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
 from tools.evaluation.figures import Figures, Study
@@ -46,7 +46,7 @@ def measure_accuracy(
     """Render and detect discs."""
     table = cached_vote_table(camera, vote_shape(settings))
     rng = np.random.default_rng(seed)
-    usable = pixels_within(size_down(floor_positions(camera)), 6, settings.far_limit_m_per_px)
+    usable = pixels_within(row_step_m(floor_positions(camera)), 6, settings.far_limit_m_per_px)
     rows, columns = np.nonzero(usable)
     distance, error, normalised = [], [], []
     failed = 0

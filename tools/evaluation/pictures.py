@@ -24,7 +24,7 @@ from detect.settings import CircleSettings, MarkerSettings
 from detect.sources.interface import read_image
 from detect.sources.opening import open_run
 from lut import cached_disc_table, cached_vertical_table
-from lut.outlines import floor_positions, size_down
+from lut.outlines import floor_positions, row_step_m
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import read_robot, read_scanners, read_scans
@@ -129,7 +129,7 @@ def draw_field_of_view(figure: Any, run: Path) -> None:
     seen = np.rint(np.nan_to_num(camera.project_floor(floor_xy), nan=-1.0)).astype(int)
     inside = np.all((seen >= 1) & (seen < [camera.width - 1, camera.height - 1]), axis=1)
     u, v = seen[inside].T
-    size_m = size_down(floor_positions(camera))
+    size_m = row_step_m(floor_positions(camera))
     length_mm = np.full(len(seen), np.nan)
     length_mm[inside] = 1000.0 * size_m[v, u]
     axes = figure.subplots()

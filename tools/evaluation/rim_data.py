@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from camera import Camera, read_camera
 from camera.kernels import camera_numbers
 from camera.uncertainty import with_pose
-from detect.circles import candidates_of, judged, scene_of, vote_shape
+from detect.circles import candidates_of, classify, scene_of, vote_shape
 from detect.discs.judgement import (
     DENSE_RADII,
     FEATURES,
@@ -149,7 +149,7 @@ class _Gathering:
         for k, *row in known(candidates.floor_xy, candidates.sign):
             seen: tuple[Any, ...] = candidates.score[k, None], grey[k, None], scale[k, None]
             self.sparse.append((*seen, *row))
-        rims = judged(scene, _SETTINGS, candidates, _BY_RIM)
+        rims = classify(scene, _SETTINGS, candidates, _BY_RIM)
         rims = rims.where((rims.outcome == Outcome.JUDGED) & np.isfinite(rims.features).all(axis=1))
         for k, *row in known(rims.floor_xy, rims.sign):
             views = self._views(image, camera, rims.floor_xy[k], rims.sign[k])

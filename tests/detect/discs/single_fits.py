@@ -35,7 +35,7 @@ def fit_discs(
         x, y = floor_xy[v, u].astype(float)
         fits.append(fit_disc(scene, Start(x, y, radius_m, blur_px), settings, working_space()[0]))
     return DiscFits(
-        np.array([fit.arrived for fit in fits]),
+        np.array([fit.converged for fit in fits]),
         np.array([(fit.x, fit.y) for fit in fits]),
         np.array([((f.cov_xx, f.cov_xy), (f.cov_xy, f.cov_yy)) for f in fits]),
         fits,

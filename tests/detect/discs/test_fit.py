@@ -177,4 +177,4 @@ def test_nothing_is_fitted_where_there_is_nothing(
     image = np.full(table.floor_xy.shape[:2], grey, np.uint8)
     pixels = np.array([[400, 200], [300, 120]])
     fit = fit_discs(published_camera, image, table.floor_xy, pixels, 0.1, 0.5)
-    assert not any(f.arrived and f.explained > 0.5 for f in fit.fits)
+    assert not any(f.converged and f.explained > 0.5 for f in fit.fits)

@@ -19,7 +19,7 @@ from detect.discs.outline_tilt import (
     mean_of_tilts,
     tilt_of_outlines,
 )
-from detect.projection import image_positions, level_matrix
+from detect.projection import image_positions, level_rotation
 from redetect.landmarks import FrameTilt
 from tests.detect.line_scene import tilted
 from tests.detect.painted_floor import PaintedFloor
@@ -34,7 +34,7 @@ def seen_from(
     """The tilt found in an image that a robot tilted so takes of the discs."""
     # The robot turns about its origin on the floor, and the camera with it.
     turned = tilted(camera, *tilt)
-    rows = np.column_stack([turned.rotation, level_matrix(tilt) @ camera.centre]).tolist()
+    rows = np.column_stack([turned.rotation, level_rotation(tilt) @ camera.centre]).tolist()
     floor = PaintedFloor(replace(camera, robot_from_camera=tuple(map(tuple, rows))))
     for place in DISCS:
         floor.disc(place)

@@ -151,17 +151,17 @@ def test_the_lens_is_the_cameras_distortion(published_camera: Camera) -> None:
     scale = np.array([published_camera.scale_x, published_camera.scale_y])
     offset = np.array([published_camera.offset_x, published_camera.offset_y])
     expected = published_camera.undistort(pixels) * scale + offset
-    straight = lens.straighten(pixels)
+    straight = lens.undistort(pixels)
     np.testing.assert_allclose(straight, expected, atol=1e-9)
-    np.testing.assert_allclose(lens.bend(straight), pixels, atol=1e-5)
+    np.testing.assert_allclose(lens.distort(straight), pixels, atol=1e-5)
     u, v = pixels.astype(int).T
-    at = lens.straighten(np.stack([u, v], axis=-1).astype(float))
+    at = lens.undistort(np.stack([u, v], axis=-1).astype(float))
     np.testing.assert_allclose(lens.straight[v, u], at, atol=1e-3)
     jacobians = lens.pixel_jacobians(pixels)
-    moved = [lens.bend(straight + step) - pixels for step in 1e-4 * np.eye(2)]
+    moved = [lens.distort(straight + step) - pixels for step in 1e-4 * np.eye(2)]
     np.testing.assert_allclose(jacobians, np.stack(moved, axis=-1) / 1e-4, atol=2e-3)
     plain = picture_of(image, None)
-    np.testing.assert_array_equal(plain.straighten(pixels), pixels)
+    np.testing.assert_array_equal(plain.undistort(pixels), pixels)
     np.testing.assert_array_equal(plain.straight[7, 5], [5.0, 7.0])
 
 
