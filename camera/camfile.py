@@ -67,7 +67,8 @@ def camera_file_in(folder: Path, stem: str = "", how: str = "by --camera") -> Pa
     and says how to name one.
     """
     own = folder / f"{stem or folder.resolve().name}.cam"
-    found = [own] if own.is_file() else sorted(folder.glob("*.cam"))
+    # Hidden files are skipped: some systems keep metadata in ones named ._ and the file.
+    found = [own] if own.is_file() else sorted(folder.glob("[!.]*.cam"))
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:4])
         raise CameraError(f"{folder}: several calibrations ({names}): name one {how}")

@@ -204,10 +204,12 @@ def _markers(board: Board, left: float, top: float) -> tuple[list[Rectangle], se
 
 def sheet_of_discs(diameter_m: float, columns: int, rows: int) -> Sheet:
     """Discs side by side, a tenth of their diameter apart, to be cut out."""
-    if not (np.isfinite(diameter_m) and diameter_m > 0.0) or min(columns, rows) < 1:
+    possible = 0.0 < diameter_m <= _LARGEST_SQUARE_M
+    if not possible or min(columns, rows) < 1 or max(columns, rows) > _MOST_COUNTED:
         raise CalibrationError(
-            f"{columns} x {rows} discs of {diameter_m:g} m: expected a --circle-m above 0 and at "
-            "least one disc"
+            f"{excerpt(columns)} x {excerpt(rows)} discs of {diameter_m:g} m: expected a "
+            f"--circle-m above 0, at most {_LARGEST_SQUARE_M:g}, and 1 to {_MOST_COUNTED} discs "
+            "each way"
         )
     apart = 1.1 * diameter_m
     width, height = apart * (columns - 1) + diameter_m, apart * (rows - 1) + diameter_m

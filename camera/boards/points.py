@@ -58,10 +58,13 @@ def find_board(
                 "sharp and large enough to be read?"
             )
         return indices, pixels
-    if board.kind == "checkerboard":
-        grid = _checkerboard(image, board, window)
-    else:
-        grid = _circles(image, board)
+    try:
+        if board.kind == "checkerboard":
+            grid = _checkerboard(image, board, window)
+        else:
+            grid = _circles(image, board)
+    except cv2.error:  # as for pictures of a few rows or columns
+        raise _not_found(board) from None
     return np.arange(board.columns * board.rows), grid.reshape(-1, 2)
 
 

@@ -50,6 +50,8 @@ _RIGHT = {
     "charuco": "--rows right, and the --dictionary?",
 }
 _WHETHER = {"auto": None, "on": True, "off": False}
+#: Endings of the pictures that are written, which no folder's photographs have.
+_WRITTEN = (".residuals.png", ".coverage.png", ".corners.png")
 #: Files that are read as videos.
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mjpeg")
 
@@ -253,8 +255,13 @@ def calibration_files(inputs: Sequence[Path], most: int) -> dict[str, Path]:
     for path in inputs:
         if path.is_dir():
             # Hidden files are skipped: some systems keep metadata in ones named ._ and the image.
-            visible = [each for each in path.iterdir() if not each.name.startswith(".")]
-            images += sorted(p for p in visible if p.suffix.lower() in IMAGE_SUFFIXES)
+            images += sorted(
+                each
+                for each in path.iterdir()
+                if each.suffix.lower() in IMAGE_SUFFIXES
+                and not each.name.startswith(".")
+                and not each.name.endswith(_WRITTEN)
+            )
         elif not path.exists():
             raise CalibrationError(f"{path}: no such picture, folder or video")
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -291,8 +298,12 @@ def _each_once(paths: list[Path]) -> list[Path]:
 
 
 def _frames(path: Path, name: str, most: int) -> Iterator[tuple[str, GreyImage]]:
-    with opened_video(path, CalibrationError(f"{path}: not a video that OpenCV can read")) as video:
+    error = CalibrationError(f"{path}: not a video that OpenCV can read")
+    with opened_video(path, error) as video:
         count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        if count <= 0:  # the file does not say, as one of mere pictures
+            count = sum(1 for _ in iter(video.grab, False))
+    with opened_video(path, error) as video:
         # The frames are spread over the whole video.
         step = max(1, -(-count // most))
         number = taken = 0

@@ -78,7 +78,8 @@ def parse_yaml(text: str, name: str) -> dict[str, Any]:
         where = f":{mark.line + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or "not YAML"
         raise ConversionError(f"{name}{where}: {problem}: expected YAML") from None
-    except (ValueError, RecursionError) as error:
+    except (ValueError, LookupError, AttributeError, RecursionError) as error:
+        # A tag such as !!int on a value of another kind fails in whatever way reading that does.
         if isinstance(error, ConversionError):
             raise
         raise ConversionError(f"{name}: invalid YAML: {one_line(str(error), 100)}") from None

@@ -121,5 +121,6 @@ def test_discs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["board", *flags, "--columns", "2", "--rows", "3", "--force"]) == 0
     size, _ = page_of(output.read_bytes())
     assert size == pytest.approx((0.428, 0.672), abs=1e-5)
-    assert main(["board", "--board", "discs", "-o", str(tmp_path / "no.pdf")]) == 1
-    assert "--circle-m above 0" in capsys.readouterr().err
+    for wrong in ([], ["--circle-m", "1e9"], ["--circle-m", "0.2", "--columns", "100000"]):
+        assert main(["board", "--board", "discs", *wrong, "-o", str(tmp_path / "no.pdf")]) == 1
+        assert "--circle-m above 0, at most 10, and 1 to 1000 discs" in capsys.readouterr().err

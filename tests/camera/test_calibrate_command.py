@@ -207,6 +207,12 @@ def test_a_board_that_is_not_there_is_not_searched_in_a_whole_large_picture(
     assert searched == [(960, 1280), (1920, 1280), (1536, 2048), (3072, 2048)]
 
 
+@pytest.mark.parametrize("shape", [(14, 640), (640, 14), (1, 1)])
+def test_a_picture_of_a_few_rows_has_no_board(shape: tuple[int, int]) -> None:
+    with pytest.raises(CalibrationError, match="no checkerboard"):
+        find_board(np.zeros(shape, np.uint8), BOARD)
+
+
 def test_pose_on_the_floor_and_its_covariance(published_camera: Camera) -> None:
     rng = np.random.default_rng(6)
     floor_xy = rng.uniform([-0.8, -2.5], [0.8, -0.8], size=(25, 2))

@@ -140,6 +140,22 @@ def test_a_file_that_is_named_twice_is_taken_once(tmp_path: Path) -> None:
     assert [name for name, _ in calibration_images(named, 9)] == ["a.png", "b.png"]
 
 
+def test_pictures_that_a_calibration_wrote_are_none_of_a_board(tmp_path: Path) -> None:
+    written = ("my.residuals.png", "my.coverage.png", "a.png.corners.png")
+    for name in ("a.png", *written):
+        cv2.imwrite(str(tmp_path / name), np.zeros((8, 8), np.uint8))
+    assert [name for name, _ in calibration_images([tmp_path], 9)] == ["a.png"]
+
+
+def test_a_video_that_does_not_say_how_long_it_is_is_sampled_over_its_length(
+    tmp_path: Path,
+) -> None:
+    frames = [cv2.imencode(".jpg", np.full((48, 64), grey, np.uint8))[1] for grey in range(20)]
+    (tmp_path / "a.mjpeg").write_bytes(b"".join(frame.tobytes() for frame in frames))
+    names = [name for name, _ in calibration_images([tmp_path / "a.mjpeg"], 5)]
+    assert names == [f"a.mjpeg:{number}" for number in (0, 4, 8, 12, 16)]
+
+
 def test_a_board_in_a_picture_of_ten_bits_is_found(tmp_path: Path) -> None:
     """Of 16 bits such a camera fills the lowest, which makes a dark picture."""
     squares = np.add.outer(np.arange(6), np.arange(7)) % 2

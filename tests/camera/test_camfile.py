@@ -11,7 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from camera import Camera, CameraError, format_camera, parse_camera, read_camera, write_camera
+from camera import (
+    Camera,
+    CameraError,
+    camera_in,
+    format_camera,
+    parse_camera,
+    read_camera,
+    write_camera,
+)
 from redetect.storage import OutputExistsError
 from tests.camera.strategies import cameras
 from tools.published_camera import PUBLISHED_CAM
@@ -241,6 +249,14 @@ def test_a_written_camera_is_read_back(tmp_path: Path, published_camera: Camera)
     assert read_camera(path) == published_camera
     assert path.read_bytes().decode() == format_camera(published_camera)
     assert [p.name for p in tmp_path.iterdir()] == ["out.cam"]
+
+
+def test_hidden_files_beside_a_calibration_are_none(
+    tmp_path: Path, published_camera: Camera
+) -> None:
+    write_camera(published_camera, tmp_path / "front.cam")
+    (tmp_path / "._front.cam").write_bytes(b"notes")
+    assert camera_in(tmp_path) == published_camera
 
 
 def test_an_existing_file_stays_unless_told_otherwise(

@@ -45,6 +45,10 @@ def test_a_region_that_is_the_whole_image_is_none() -> None:
         ("a.yml", "%YAML:1.0\n---\nimage_Width: 3\n", "lacks image_height: add the images' size"),
         ("a.yml", "intrinsics: [1, 1, 1, 1]\n", "cam0: lacks resolution"),
         ("a.yml", "cam0: {resolution: [1, 1]}\n", "cam0 with intrinsics"),
+        ("a.yml", "image_width: !!int ''\n", "invalid YAML"),
+        ("a.yml", "image_width: !!float ''\n", "invalid YAML"),
+        ("a.yml", "image_width: !!timestamp foo\n", "invalid YAML"),
+        ("a.yml", "image_width: !!bool foo\n", "invalid YAML"),
     ],
 )
 def test_what_is_missing_is_told_with_what_to_do(

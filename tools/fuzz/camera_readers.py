@@ -55,7 +55,8 @@ _FISHEYE = ForeignCamera("fisheye", 64, 48, 50.0, 51.0, 31.5, 23.5, (0.1, 0.01, 
 _YAML_WORDS = (
     b"&a", b"*a", b"!!python/object/apply:os.system", b"!!opencv-matrix", b"<<: ", b"---\n",
     b"data: ", b"[", b"]", b"{", b"}", b"- ", b"? ", b": ", b"|", b"1" * 400, b"0x1f", b"1:30",
-    b"2001-13-45", b"!!binary ", b"!!set ", b"~", b".nan", b".inf", b"%YAML:1.0\n", *NUMBERS,
+    b"2001-13-45", b"!!binary ", b"!!set ", b"!!int ''", b"!!timestamp ", b"!!bool ", b"~",
+    b".nan", b".inf", b"%YAML:1.0\n", *NUMBERS,
 )  # fmt: skip
 
 
