@@ -6,7 +6,7 @@ Y backward, Z up), its x axis rotated from the robot's X axis.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from camera.calibration.start import best_poses, board_poses
 from camera.errors import CalibrationError
 from camera.model import Camera
 from camera.rotations import cross_matrices
-from camera.uncertainty import intrinsics_of, with_covariance, with_pose
+from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
 from redetect.storage.bounded import rows_of_numbers
 
@@ -30,13 +30,12 @@ _PRIOR_PX, _PRIOR_FREEDOM = 0.15, 3
 
 @dataclass(frozen=True, eq=False)
 class FloorPose:
-    """The camera's pose in the robot frame."""
+    """A camera placed in the robot frame."""
 
-    robot_from_camera: FloatArray  # (3, 4)
+    camera: Camera  # with the joint covariance of lens and pose, if that of the lens is known
     # (6, 6): of the position (m, robot frame) and of a small rotation from the left (rad, about the
     # robot's axes), in this order; errors of the points and of the intrinsics.
     covariance: FloatArray
-    by_intrinsics: FloatArray  # (6, 14): how the pose follows errors of the intrinsics
     fit: Adjusted  # the adjusted view, with its residuals
     warnings: tuple[str, ...] = ()
 
@@ -55,12 +54,11 @@ def place_on_floor(
     camera: Camera,
     pixels: FloatArray,
     floor_xy: FloatArray,
-    intrinsics_covariance: FloatArray | None = None,
     radius_m: float = 0.0,
 ) -> FloorPose:
     """The camera's pose from points on the floor.
 
-    Takes `pixels` (N, 2), `floor_xy` (N, 2), `intrinsics_covariance` (14, 14).
+    Takes `pixels` (N, 2), `floor_xy` (N, 2), and the radius of circles there, 0 for points.
     """
     floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
     _check(pixels, floor, (camera.width, camera.height))
@@ -96,8 +94,12 @@ def place_on_floor(
     variance = freedom * fit.sigma_px**2 + _PRIOR_FREEDOM * _PRIOR_PX**2
     variance /= freedom + _PRIOR_FREEDOM - 2
     covariance = to_pose @ fit.pose_covariances[0] @ to_pose.T * (variance / fit.sigma_px**2)
-    if intrinsics_covariance is not None:
-        covariance = covariance + by_intrinsics @ intrinsics_covariance @ by_intrinsics.T
+    placed = with_pose(camera, np.column_stack([R, t]))
+    if (known := covariance_of(camera)) is not None:
+        lens = known[:COUNT, :COUNT]
+        both = by_intrinsics @ lens
+        covariance = covariance + both @ by_intrinsics.T
+        placed = with_covariance(placed, np.block([[lens, both.T], [both, covariance]]))
     warnings = []
     if fit.rms_px > largest_rms_px(camera.width):
         away = np.linalg.norm(fit.residuals, axis=1)
@@ -107,19 +109,7 @@ def place_on_floor(
             f"worst, at pixel {u:.1f}, {v:.1f}, by {away.max():.1f} px): are all points right, "
             "is the floor flat, and is it this camera's calibration?"
         )
-    return FloorPose(np.column_stack([R, t]), covariance, by_intrinsics, fit, tuple(warnings))
-
-
-def placed_camera(
-    camera: Camera, pose: FloorPose, intrinsics_covariance: FloatArray | None
-) -> Camera:
-    """The camera at a pose, with the covariance of both if that of its lens is known."""
-    camera = with_pose(camera, pose.robot_from_camera)
-    if intrinsics_covariance is None:
-        return replace(camera, covariance=None)
-    both = pose.by_intrinsics @ intrinsics_covariance
-    joint = np.block([[intrinsics_covariance, both.T], [both, pose.covariance]])
-    return with_covariance(camera, joint)
+    return FloorPose(placed, covariance, fit, tuple(warnings))
 
 
 def read_floor_points(path: Path) -> tuple[FloatArray, FloatArray]:

@@ -11,20 +11,12 @@ from numpy.typing import NDArray
 
 from camera.boards.board import board_of
 from camera.boards.points import find_board
-from camera.calibration.floor import (
-    FloorPose,
-    on_floor,
-    place_on_floor,
-    placed_camera,
-    read_floor_points,
-)
-from camera.calibration.model import COUNT
+from camera.calibration.floor import FloorPose, on_floor, place_on_floor, read_floor_points
 from camera.calibration.pictures import drawn_floor, rectified_floor
 from camera.camfile import read_camera, write_camera
 from camera.errors import CalibrationError
 from camera.model import Camera
 from camera.options import Floor
-from camera.uncertainty import covariance_of
 from redetect.array_types import FloatArray
 from redetect.bounds import FINITE, demand
 from redetect.storage import demand_place, write_bytes
@@ -37,15 +29,12 @@ def perform(options: Floor) -> int:
     demand_place(options.output, overwrite=options.force)
     camera = read_camera(options.camera)
     pixels, floor_xy, radius_m = floor_points(options, (camera.width, camera.height))
-    known = covariance_of(camera)
-    lens = None if known is None else known[:COUNT, :COUNT]
-    placed = place_on_floor(camera, pixels, floor_xy, lens, radius_m)
+    placed = place_on_floor(camera, pixels, floor_xy, radius_m)
     print(describe_pose(placed))
-    if lens is None:
+    if placed.camera.covariance is None:
         print("the .cam file has no covariance of the lens: that of the pose is not written")
-    camera = placed_camera(camera, placed, lens)
-    write_floor_pictures(options, camera)
-    write_camera(camera, options.output, overwrite=options.force)
+    write_floor_pictures(options, placed.camera)
+    write_camera(placed.camera, options.output, overwrite=options.force)
     print(f"written: {options.output}")
     return 0
 
@@ -87,7 +76,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
 def describe_pose(pose: FloorPose) -> str:
     """The pose with its standard deviations, for people."""
     sigma, fit = np.sqrt(np.diag(pose.covariance)), pose.fit
-    R, t = pose.robot_from_camera[:, :3], pose.robot_from_camera[:, 3]
+    R, t = pose.camera.rotation, pose.camera.centre
     down = degrees(np.arcsin(np.clip(-R[2, 2], -1.0, 1.0)))
     bearing = degrees(np.arctan2(R[0, 2], -R[1, 2]))
     axes = ("X (left)    ", "Y (backward)", "Z (up)      ")

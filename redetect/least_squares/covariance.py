@@ -95,7 +95,8 @@ def inverse_blocks(
 def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
     """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns.
 
-    Within a column, rows are in any order.
+    Within a column, rows are in any order. SuperLU's own factor lacks entries that cancel or, as
+    around a long loop of poses, underflow: the entries of the inverse there would be missing.
     """
     n = len(indptr) - 1
     first_child = np.full(n, -1, dtype=np.int64)

@@ -238,16 +238,16 @@ def floor_errors(
     exact = camera.project_floor(floor_xy)
     # The file's rotation has six digits; the estimate's is a rotation.
     still = place_on_floor(camera, exact, floor_xy)
-    np.testing.assert_allclose(still.robot_from_camera[:, 3], camera.centre, atol=1e-3)
+    np.testing.assert_allclose(still.camera.centre, camera.centre, atol=1e-3)
     nees = []
     for _ in range(trials):
         noisy = exact + rng.normal(scale=0.2, size=exact.shape)
         found = place_on_floor(camera, noisy, floor_xy)
-        turn = found.robot_from_camera[:, :3] @ still.robot_from_camera[:, :3].T
+        turn = found.camera.rotation @ still.camera.rotation.T
         vector = 0.5 * np.array(
             [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
         )
-        shift = found.robot_from_camera[:, 3] - still.robot_from_camera[:, 3]
+        shift = found.camera.centre - still.camera.centre
         error = np.concatenate([shift, vector])
         scale = (0.2 / found.fit.sigma_px) ** 2 if known else 1.0
         nees.append(float(error @ np.linalg.solve(scale * found.covariance, error)))
@@ -276,7 +276,7 @@ def test_a_line_and_a_point_beside_it_are_told(published_camera: Camera) -> None
             place_on_floor(published_camera, pixels, np.array(floor_xy))
     square = np.array([[-0.5, -2.0], [0.5, -2.0], [0.5, -1.0], [-0.5, -1.0]])
     found = place_on_floor(published_camera, published_camera.project_floor(square), square)
-    np.testing.assert_allclose(found.robot_from_camera[:, 3], published_camera.centre, atol=1e-3)
+    np.testing.assert_allclose(found.camera.centre, published_camera.centre, atol=1e-3)
 
 
 @pytest.mark.parametrize(

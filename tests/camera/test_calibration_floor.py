@@ -29,7 +29,7 @@ def test_circles_on_the_floor_are_seen_through_perspective(published_camera: Cam
     seen = centres + circle_shifts(truth, points, 0.06)
     naive = place_on_floor(camera, seen, floor[:, :2])
     found = place_on_floor(camera, seen, floor[:, :2], radius_m=0.06)
-    away_m = [np.linalg.norm(p.robot_from_camera[:, 3] - camera.centre) for p in (naive, found)]
+    away_m = [np.linalg.norm(p.camera.centre - camera.centre) for p in (naive, found)]
     assert away_m[0] > 2e-3
     # The file's rotation has six digits.
     assert away_m[1] < 2e-5
@@ -50,7 +50,7 @@ def test_places_that_contradict_the_camera_are_told(published_camera: Camera) ->
     assert f"at pixel {wrong[3, 0]:.1f}, {wrong[3, 1]:.1f}, by 5" in told
     assert told in describe_pose(found)
     # One point of twelve pulls less than its share.
-    away = found.robot_from_camera[:, 3] - right.robot_from_camera[:, 3]
+    away = found.camera.centre - right.camera.centre
     assert np.all(np.abs(away) < 3.0 * np.sqrt(np.diag(found.covariance)[:3]))
     with pytest.raises(CalibrationError, match="outside of the calibrated camera's 768 x 288"):
         place_on_floor(camera, pixels * [1.0, 2.0], floor_xy)

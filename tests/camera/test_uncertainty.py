@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from camera import Camera, CameraError
-from camera.calibration.floor import place_on_floor, placed_camera
+from camera.calibration.floor import place_on_floor
 from camera.calibration.model import COUNT
 from camera.camfile import format_camera, parse_camera
 from camera.model import PARAMETERS
@@ -65,9 +65,10 @@ def test_poses_of_the_floor_err_as_stated(published_camera: Camera) -> None:
     """Monte Carlo: a lens that is a little wrong, pixels with noise, positions by both."""
     rng = np.random.default_rng(1)
     truth = published_camera
-    lens = np.zeros((COUNT, COUNT))
-    lens[range(4), range(4)] = np.array([1.0, 0.5, 1.0, 0.7]) ** 2
-    lens[0, 1] = lens[1, 0] = 0.4
+    known = np.zeros((PARAMETERS, PARAMETERS))
+    known[range(4), range(4)] = np.array([1.0, 0.5, 1.0, 0.7]) ** 2
+    known[0, 1] = known[1, 0] = 0.4
+    lens = known[:COUNT, :COUNT]
     places = np.stack(np.meshgrid(np.linspace(-1, 1, 5), np.linspace(-3, -1, 5)), -1).reshape(-1, 2)
     pixels, seen = truth.project_floor(places), truth.project_floor(FLOOR)
     squared = []
@@ -75,8 +76,9 @@ def test_poses_of_the_floor_err_as_stated(published_camera: Camera) -> None:
         wrong = with_intrinsics(
             truth, intrinsics_of(truth) + rng.multivariate_normal(np.zeros(COUNT), lens)
         )
-        pose = place_on_floor(wrong, pixels + 0.1 * rng.standard_normal(pixels.shape), places, lens)
-        camera = placed_camera(wrong, pose, lens)
+        wrong = with_covariance(wrong, known)
+        noisy = pixels + 0.1 * rng.standard_normal(pixels.shape)
+        camera = place_on_floor(wrong, noisy, places).camera
         covariance = covariance_of(camera)
         assert covariance is not None
         found = camera.floor_from_pixel(seen)

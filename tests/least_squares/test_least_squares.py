@@ -156,3 +156,15 @@ def test_inverse_blocks_are_right_where_the_matrix_has_zeros() -> None:
     np.testing.assert_allclose(found[1], dense[2:, 2:], rtol=1e-12)
     (alone,) = inverse_blocks(sparse.csc_array(np.diag([4.0, 2.0, 8.0])), [(3, np.array([0]))])
     np.testing.assert_allclose(alone[0], np.diag([0.25, 0.5, 0.125]))
+
+
+def test_variances_around_a_long_loop_are_right() -> None:
+    """Elimination leaves links across it, which in a numerical factor may underflow."""
+    count, decay = 3000, 1e-3
+    poses = np.arange(count)
+    links = sparse.csc_array((np.ones(count), (poses, np.roll(poses, 1))), shape=(count, count))
+    matrix = sparse.csc_array(2.0 * np.cosh(decay) * sparse.eye_array(count) - links - links.T)
+    (found,) = inverse_blocks(matrix, [(1, poses)])
+    # Of a circulant matrix.
+    variance = 1.0 / (2.0 * np.sinh(decay) * np.tanh(0.5 * count * decay))
+    np.testing.assert_allclose(found[:, 0, 0], variance, rtol=1e-8)
