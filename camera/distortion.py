@@ -189,6 +189,21 @@ def tangential_shift(xy: FloatArray, tangential: Tangential) -> FloatArray:
     return np.asarray(2.0 * (xy @ q)[..., None] * xy + np.sum(xy * xy, axis=-1)[..., None] * q)
 
 
+def before_fold(xy: FloatArray, lens: Lens) -> FloatArray:
+    """(..., 2) undistorted coordinates, NaN where the lens does not see them (past r_max)."""
+    radius = np.hypot(xy[..., 0], xy[..., 1])
+    seen = (radius <= one_to_one_radius(lens)) & np.isfinite(radius)
+    return np.where(seen[..., None], xy, np.nan)
+
+
+def distorted(xy: FloatArray, lens: Lens) -> FloatArray:
+    """(..., 2) distorted coordinates of (..., 2) undistorted ones."""
+    result = xy * radial_factor(np.hypot(xy[..., 0], xy[..., 1]), lens)[..., None]
+    if any(lens.tangential):
+        result = result + tangential_shift(xy, lens.tangential)
+    return np.asarray(result)
+
+
 def distorted_jacobian(xy: FloatArray, lens: Lens) -> FloatArray:
     """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
     q = np.array(lens.tangential[::-1])

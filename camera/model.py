@@ -199,19 +199,9 @@ class Camera:
 
     def distort(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted coordinates px/pz, py/pz; NaN past the fold."""
-        (xy, radius), scale = self._before_fold(normalised), np.array(self.pinhole[:2])
-        factor = distortion.radial_factor(radius, self.lens)
-        pixels = scale * xy * factor[..., None]
-        if self.decentred:
-            pixels = pixels + scale * distortion.tangential_shift(xy, self.tangential)
-        return np.asarray(pixels + self.pinhole[2:])
-
-    def _before_fold(self, normalised: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(..., 2) coordinates and their (...) radii, NaN past the fold."""
-        xy = np.asarray(normalised, dtype=np.float64)
-        radius = np.hypot(xy[..., 0], xy[..., 1])
-        defined = (radius <= self.r_max) & np.isfinite(radius)
-        return np.where(defined[..., None], xy, np.nan), np.where(defined, radius, np.nan)
+        xy = distortion.before_fold(np.asarray(normalised, dtype=np.float64), self.lens)
+        seen = distortion.distorted(xy, self.lens)
+        return np.asarray(seen * self.pinhole[:2] + self.pinhole[2:])
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
         """(..., 2) undistorted normalised coordinates of (..., 2) pixels; the inverse of `distort`.
@@ -231,7 +221,7 @@ class Camera:
 
         Both NaN for points not in front of the camera or past the distortion's fold.
         """
-        return self.distort(_normalised(points_camera)[0])
+        return self.distort(normalised_points(points_camera)[0])
 
     def pixel_grid(self) -> FloatArray:
         """(H, W, 2) all pixels (u, v)."""
@@ -277,7 +267,7 @@ class Camera:
 
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
-        xy, _ = self._before_fold(normalised)
+        xy = distortion.before_fold(np.asarray(normalised, dtype=np.float64), self.lens)
         jacobian = distortion.distorted_jacobian(xy, self.lens)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
@@ -286,7 +276,7 @@ class Camera:
 
         Pixels per metre; NaN where the projection is undefined.
         """
-        xy, depth = _normalised(points_camera)
+        xy, depth = normalised_points(points_camera)
         perspective = np.zeros((*depth.shape, 2, 3))
         perspective[..., 0, 0] = perspective[..., 1, 1] = 1.0
         perspective[..., :, 2] = -xy
@@ -320,7 +310,7 @@ class Camera:
         return inverse_2x2(pixels_per_metre)
 
 
-def _normalised(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def normalised_points(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """(..., 2) normalised coordinates of points in the camera frame, and (...) depths (m).
 
     NaN for points not in front of the camera.

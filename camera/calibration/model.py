@@ -14,6 +14,7 @@ import numpy as np
 
 from camera import distortion
 from camera.errors import CalibrationError
+from camera.model import normalised_points
 from camera.model_checks import border_pixels
 from redetect.array_types import FloatArray
 from redetect.bounds import ABOVE_0, demand, whole
@@ -63,24 +64,11 @@ def lens_of(intrinsics: FloatArray) -> distortion.Lens:
     return distortion.Lens((a2, a3, b1, b2, b3), (k1, k2, k3), (p1, p2))
 
 
-def _normalised(lens: distortion.Lens, points_camera: FloatArray) -> FloatArray:
-    """(N, 2) undistorted normalised coordinates of points; NaN where the lens does not see them."""
-    z = points_camera[:, 2:]
-    xy = points_camera[:, :2] / np.where(z > 0.0, z, np.nan)
-    within = np.hypot(xy[:, :1], xy[:, 1:]) <= distortion.one_to_one_radius(lens)
-    return np.where(within, xy, np.nan)
-
-
-def _distorted(lens: distortion.Lens, xy: FloatArray) -> FloatArray:
-    factor = distortion.radial_factor(np.hypot(xy[:, 0], xy[:, 1]), lens)
-    return np.asarray(xy * factor[:, None] + distortion.tangential_shift(xy, lens.tangential))
-
-
 def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> FloatArray:
     """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
     lens = lens_of(intrinsics)
-    seen = _distorted(lens, _normalised(lens, points_camera))
-    return np.asarray(intrinsics[:2] * seen + intrinsics[2:4])
+    xy = distortion.before_fold(normalised_points(points_camera)[0], lens)
+    return np.asarray(intrinsics[:2] * distortion.distorted(xy, lens) + intrinsics[2:4])
 
 
 def project_points(
@@ -93,8 +81,8 @@ def project_points(
     """
     scale, offset = intrinsics[:2], intrinsics[2:4]
     lens = lens_of(intrinsics)
-    xy = _normalised(lens, points_camera)
-    seen = _distorted(lens, xy)
+    xy = distortion.before_fold(normalised_points(points_camera)[0], lens)
+    seen = distortion.distorted(xy, lens)
     r = np.hypot(xy[:, 0], xy[:, 1])
     a2, a3, b1, b2, b3 = lens.coef
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
@@ -151,7 +139,7 @@ def _reach(r: float, lens: distortion.Lens, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
     if not any(lens.tangential):  # the same in all directions
         return np.asarray(r * distortion.radial_factor(np.array(r), lens))
-    edge = _distorted(lens, r * _DIRECTIONS)
+    edge = distortion.distorted(r * _DIRECTIONS, lens)
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),
         np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),
