@@ -30,7 +30,7 @@ _BEARINGS = np.linspace(-np.pi, np.pi, 145)
 _ELEVATIONS = np.linspace(-0.7, 0.7, 57)
 
 
-def pixel_grid(width: int, height: int) -> FloatArray:
+def coarse_pixel_grid(width: int, height: int) -> FloatArray:
     """(37 * 49, 2) pixels from corner to corner of an image, row by row."""
     columns, rows = np.linspace(0.0, width - 1.0, _COLUMNS), np.linspace(0.0, height - 1.0, _ROWS)
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
@@ -64,7 +64,7 @@ def projection_sigma(camera: Camera, covariance: FloatArray) -> FloatArray:
     so the component equivalent to a rotation is removed, as in mrcal. Returns the root of the trace
     of covariances at (37, 49) pixels, from the intrinsics' (14, 14) covariance.
     """
-    rays = camera.unproject(pixel_grid(camera.width, camera.height))
+    rays = camera.unproject(coarse_pixel_grid(camera.width, camera.height))
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), rays)
     J = by_intrinsics.reshape(-1, COUNT)
     turn = (-by_point @ cross_matrices(rays)).reshape(-1, 3)
@@ -88,7 +88,7 @@ def covariance_of(camera: Camera) -> FloatArray | None:
 
 
 def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
-    """Derivatives of pixels' positions on the floor by the camera's parameters.
+    """Derivatives of pixels' positions on the floor with respect to the camera's parameters.
 
     Parameters
     ----------

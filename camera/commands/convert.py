@@ -9,7 +9,7 @@ from camera.formats import files
 from camera.formats.models import ForeignCamera
 from camera.model import Camera
 from camera.options import Convert
-from camera.uncertainty import pixel_grid
+from camera.uncertainty import coarse_pixel_grid
 from redetect.storage import demand_place, write_bytes
 
 #: Rays farther off the axis, degrees, are beyond the model of ``.cam`` files.
@@ -38,7 +38,7 @@ def perform(options: Convert) -> int:
     if not converted.deviation_px <= options.limit_px:
         advice = "choose another --model or format, or raise the limit"
         if isinstance(camera, Camera):
-            rays = source.undistort(pixel_grid(source.width, source.height))
+            rays = source.undistort(coarse_pixel_grid(source.width, source.height))
             if (off := float(np.degrees(np.arctan(np.nanmax(np.hypot(*rays.T)))))) > _WIDEST_DEG:
                 advice = (
                     f"the lens sees {off:.0f} degrees off its axis, {_WIDEST_DEG:g} of which .cam "
@@ -59,8 +59,8 @@ def perform(options: Convert) -> int:
         print("the pose is dropped: the format has none (--pose-from restores it)")
     if getattr(source, "covariance", None) and not getattr(camera, "covariance", None):
         print("the covariance is dropped: it is kept in .cam files of the same rows and pose")
-    _, text_of, _ = files.FORMATS[to_format]
-    write_bytes(options.target, text_of(camera).encode(), overwrite=options.force)
+    written = files.FORMATS[to_format].format(camera)
+    write_bytes(options.target, written.encode(), overwrite=options.force)
     print(f"written: {options.target}")
     return 0
 

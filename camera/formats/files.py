@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from camera.camfile import LARGEST_FILE_BYTES, format_camera, parse_camera, read_camera
 from camera.errors import ConversionError
@@ -15,20 +15,26 @@ from camera.formats.models import ForeignCamera, Model
 from camera.options import Convert, Format
 from redetect.storage import bounded
 
-_Models = dict[Model, int]
-_WITH_K3: _Models = {"radtan": 5, "rational": 8, "fisheye": 4}
-_WITHOUT_K3: _Models = {"radtan": 4, "fisheye": 4}
-#: What parses and what writes the text of each format, and its models, the simplest first, with
-#: their numbers of coefficients: some lack k3.
-FORMATS: dict[Format, tuple[Callable[..., AnyCamera], Callable[[Any], str], _Models]] = {
-    "cam": (parse_camera, format_camera, {}),
-    "opencv": (yaml_files.parse_opencv, yaml_files.format_opencv, _WITH_K3),
-    "ros": (yaml_files.parse_ros, yaml_files.format_ros, _WITH_K3),
-    "kalibr": (yaml_files.parse_kalibr, yaml_files.format_kalibr, _WITHOUT_K3),
-    "colmap": (parse_colmap, format_colmap, {**_WITH_K3, "radtan": 4}),
+
+class FileFormat(NamedTuple):
+    """The text of a format, and what it can hold."""
+
+    parse: Callable[..., AnyCamera]
+    format: Callable[[Any], str]
+    #: Models, the simplest first, and their numbers of coefficients: some lack k3
+    coefficients: dict[Model, int]
+    several: bool = False  #: Whether a file may have several cameras
+
+
+_WITH_K3: dict[Model, int] = {"radtan": 5, "rational": 8, "fisheye": 4}
+_WITHOUT_K3: dict[Model, int] = {"radtan": 4, "fisheye": 4}
+FORMATS: dict[Format, FileFormat] = {
+    "cam": FileFormat(parse_camera, format_camera, {}),
+    "opencv": FileFormat(yaml_files.parse_opencv, yaml_files.format_opencv, _WITH_K3),
+    "ros": FileFormat(yaml_files.parse_ros, yaml_files.format_ros, _WITH_K3),
+    "kalibr": FileFormat(yaml_files.parse_kalibr, yaml_files.format_kalibr, _WITHOUT_K3, True),
+    "colmap": FileFormat(parse_colmap, format_colmap, {**_WITH_K3, "radtan": 4}, True),
 }
-# Formats whose files may have several cameras.
-_OF_SEVERAL = ("kalibr", "colmap")
 # Formats by parts of a YAML file's name.
 _YAML_NAMES: dict[str, Format] = {
     "opencv": "opencv",
@@ -85,10 +91,9 @@ def format_of_text(path: Path, text: str) -> Format:
 
 def parse(text: str, from_format: Format, name: str, camera_name: str = "") -> AnyCamera:
     """A camera of the text of a file."""
-    if camera_name and from_format not in _OF_SEVERAL:
+    if camera_name and not FORMATS[from_format].several:
         raise ConversionError(f"{name}: has one camera: expected no --camera-name")
-    parser, _, _ = FORMATS[from_format]
-    return parser(text, name, *([camera_name] if camera_name else []))
+    return FORMATS[from_format].parse(text, name, *([camera_name] if camera_name else []))
 
 
 def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted:
@@ -103,7 +108,7 @@ def convert(source: AnyCamera, to_format: Format, options: Convert) -> Converted
         return conversion.convert_to_camera(source, options.rows, pose)
     if options.pose_from is not None:
         raise ConversionError(f"{to_format} has no pose: expected no --pose-from")
-    _, _, models = FORMATS[to_format]
+    models = FORMATS[to_format].coefficients
     if options.model != "auto":
         if options.model not in models:
             raise ConversionError(

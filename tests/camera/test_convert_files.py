@@ -134,7 +134,7 @@ def test_what_a_format_holds_is_taken_over(
         # However much the loss of a term would be allowed to show.
         options = Convert(Path("source"), Path("target"), limit_px=100.0)
         found = convert(source, to_format, options).camera
-        back = parse(FORMATS[to_format][1](found), to_format, "back")
+        back = parse(FORMATS[to_format].format(found), to_format, "back")
         np.testing.assert_allclose(back.distort(rays), source.distort(rays), rtol=0, atol=1e-9)
 
 
@@ -142,7 +142,7 @@ def test_a_polynomial_of_three_terms_stays_whole_in_colmaps_format() -> None:
     source = replace(RADTAN, distortion=(-0.3, 0.1, 1e-3, -5e-4, -0.02))
     camera = convert_to_camera(source).camera
     options = Convert(Path("source"), Path("cameras.txt"), limit_px=100.0)
-    text = FORMATS["colmap"][1](convert(camera, "colmap", options).camera)
+    text = FORMATS["colmap"].format(convert(camera, "colmap", options).camera)
     back = parse(text, "colmap", "back")
     assert isinstance(back, ForeignCamera)
     assert back.distortion[:5] == source.distortion

@@ -14,7 +14,7 @@ from tyro.conf import Positional
 from camera import Camera, read_camera
 from camera.boards.board import Board, charuco_of
 from camera.rotations import rotation_of
-from camera.uncertainty import pixel_grid
+from camera.uncertainty import coarse_pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError
 from tools.evaluation.figures import Figures, Study
@@ -160,7 +160,7 @@ def projection_difference(camera: Camera, other: Camera, *, rotate: bool = True)
 
     NaN where the other camera does not see the direction; with `rotate` it is turned to fit best.
     """
-    pixels = pixel_grid(camera.width, camera.height)
+    pixels = coarse_pixel_grid(camera.width, camera.height)
     rays = camera.unproject(pixels)
     rotation = np.eye(3)
     if rotate:
