@@ -196,7 +196,7 @@ def before_fold(xy: FloatArray, lens: Lens) -> FloatArray:
     return np.where(seen[..., None], xy, np.nan)
 
 
-def distorted(xy: FloatArray, lens: Lens) -> FloatArray:
+def distort(xy: FloatArray, lens: Lens) -> FloatArray:
     """(..., 2) distorted coordinates of (..., 2) undistorted ones."""
     result = xy * radial_factor(np.hypot(xy[..., 0], xy[..., 1]), lens)[..., None]
     if any(lens.tangential):
@@ -205,7 +205,7 @@ def distorted(xy: FloatArray, lens: Lens) -> FloatArray:
 
 
 def distorted_jacobian(xy: FloatArray, lens: Lens) -> FloatArray:
-    """(..., 2, 2) derivative of the whole distortion of (..., 2) points by x, y."""
+    """(..., 2, 2) derivative of the whole distortion with respect to (..., 2) points."""
     q = np.array(lens.tangential[::-1])
     radius = np.hypot(xy[..., 0], xy[..., 1])
     factor = radial_factor(radius, lens)
@@ -264,12 +264,12 @@ def _least_determinant(radius: FloatArray, lens: Lens) -> FloatArray:
         return np.asarray(growth * factor - 4.0 * b * b + 2.0 * b * mean * c + 16.0 * (b * c) ** 2)
 
 
-def straightened(distorted: FloatArray, lens: Lens) -> FloatArray:
+def undistort(distorted: FloatArray, lens: Lens) -> FloatArray:
     """Undistorted normalised coordinates of distorted ones, all terms undone.
 
-    Newton's method from the radial inverse (`camera.kernels.straightened_point`).
+    Newton's method from the radial inverse (`camera.kernels.undistort_point`).
     """
-    from camera.kernels import straighten_points
+    from camera.kernels import undistort_points
 
     seen = np.ascontiguousarray(distorted, dtype=np.float64).reshape(-1, 2)
     with np.errstate(over="ignore"):
@@ -277,5 +277,5 @@ def straightened(distorted: FloatArray, lens: Lens) -> FloatArray:
     seen_there, there = inverse_table(lens)
     straight = np.empty_like(seen)
     numbers = np.array([*lens.coef, *lens.brown, one_to_one_radius(lens)])
-    straighten_points(numbers, seen, np.interp(radius, seen_there, there), straight)
+    undistort_points(numbers, seen, np.interp(radius, seen_there, there), straight)
     return straight.reshape(np.shape(distorted))

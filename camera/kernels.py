@@ -49,7 +49,7 @@ def published_camera_numbers(camera: Camera) -> FloatArray:
 
 
 @kernel()
-def straightened_point(
+def undistort_point(
     lens: FloatArray, x_seen: float, y_seen: float, x: float, y: float
 ) -> tuple[float, float]:
     """Undistorted normalised coordinates of a distorted point, of a lens with Brown's terms.
@@ -130,15 +130,15 @@ def straightened_point(
 
 
 @kernel()
-def straighten_points(
+def undistort_points(
     lens: FloatArray, seen: FloatArray, start_radius: FloatArray, straight: FloatArray
 ) -> None:
-    """`straightened_point` of many."""
+    """`undistort_point` of many."""
     for k in range(len(seen)):
         x, y = seen[k, 0], seen[k, 1]
         radius = math.sqrt(x * x + y * y)
         ratio = start_radius[k] / radius if radius > 0.0 else 1.0
-        straight[k, 0], straight[k, 1] = straightened_point(lens, x, y, x * ratio, y * ratio)
+        straight[k, 0], straight[k, 1] = undistort_point(lens, x, y, x * ratio, y * ratio)
 
 
 @kernel()

@@ -200,7 +200,7 @@ class Camera:
     def distort(self, normalised: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 2) undistorted coordinates px/pz, py/pz; NaN past the fold."""
         xy = distortion.before_fold(np.asarray(normalised, dtype=np.float64), self.lens)
-        seen = distortion.distorted(xy, self.lens)
+        seen = distortion.distort(xy, self.lens)
         return np.asarray(seen * self.pinhole[:2] + self.pinhole[2:])
 
     def undistort(self, pixels: ArrayLike) -> FloatArray:
@@ -210,7 +210,7 @@ class Camera:
         """
         seen = (np.asarray(pixels, dtype=np.float64) - self.pinhole[2:]) / self.pinhole[:2]
         if self.decentred:
-            return distortion.straightened(seen, self.lens)
+            return distortion.undistort(seen, self.lens)
         distorted = np.hypot(seen[..., 0], seen[..., 1])
         radius = distortion.undistorted_radius(distorted, self.lens)
         factor = distortion.radial_factor(radius, self.lens)
@@ -266,13 +266,16 @@ class Camera:
     # -- Jacobians --------------------------------------------------------------------------
 
     def distort_jacobian(self, normalised: ArrayLike) -> FloatArray:
-        """(..., 2, 2) derivatives of (u, v) of `distort` by (x, y), analytic; NaN past the fold."""
+        """(..., 2, 2) derivatives of `distort`'s (u, v) with respect to (x, y), analytic.
+
+        NaN past the fold.
+        """
         xy = distortion.before_fold(np.asarray(normalised, dtype=np.float64), self.lens)
         jacobian = distortion.distorted_jacobian(xy, self.lens)
         return np.asarray(jacobian * np.array([[self.scale_x], [self.scale_y]]))
 
     def project_jacobian(self, points_camera: ArrayLike) -> FloatArray:
-        """(..., 2, 3) derivatives of (u, v) of `project` by the (..., 3) points, analytic.
+        """(..., 2, 3) derivatives of `project` with respect to the (..., 3) points, analytic.
 
         Pixels per metre; NaN where the projection is undefined.
         """
@@ -284,7 +287,7 @@ class Camera:
         return np.asarray(self.distort_jacobian(xy) @ perspective)
 
     def floor_jacobian(self, pixels: ArrayLike) -> FloatArray:
-        """(..., 2, 2) derivatives of the floor's (X, Y) by (u, v) at (..., 2) pixels, analytic.
+        """(..., 2, 2) derivatives of the floor's (X, Y) with respect to (..., 2) pixels.
 
         Metres per pixel; NaN where the pixel does not see the floor.
         """

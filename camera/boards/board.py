@@ -101,7 +101,7 @@ class Board:
         return np.asarray(self.square_m * (flat - middle))
 
     @property
-    def looks_turned(self) -> bool:
+    def is_symmetric(self) -> bool:
         """Whether the board is symmetric under rotation by 180 deg: its direction is ambiguous."""
         if self.kind == "checkerboard":
             return (self.columns + self.rows) % 2 == 0

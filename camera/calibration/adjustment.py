@@ -18,7 +18,7 @@ from camera.distortion import undistorted_radius
 from camera.rotations import cross_matrices, rotation_of
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.least_squares import solver
-from redetect.least_squares.covariance import diagonal_blocks
+from redetect.least_squares.covariance import marginal_covariances
 from redetect.least_squares.solver import Block, Linear, Loss
 
 #: Huber's constant, in standard deviations: the influence of larger residuals is constant.
@@ -58,7 +58,7 @@ class Points:
         """(V,) number of points of each view."""
         return np.bincount(self.views)
 
-    def of(self, views: IntArray) -> Points:
+    def of_views(self, views: IntArray) -> Points:
         """Only the points of some views, ascending, which are renumbered."""
         return self.where(np.isin(self.views, views))
 
@@ -77,7 +77,7 @@ class Estimate:
     rotations: FloatArray
     translations: FloatArray
 
-    def of(self, views: IntArray) -> Estimate:
+    def of_views(self, views: IntArray) -> Estimate:
         """With the poses of some views only."""
         return Estimate(self.intrinsics, self.rotations[views], self.translations[views])
 
@@ -153,7 +153,10 @@ class _Problem:
 def project_estimate(
     estimate: Estimate, points: Points
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels of all points (N, 2), derivatives by intrinsics (N, 2, 14) and by pose (N, 2, 6)."""
+    """Pixels of all points (N, 2), and their derivatives.
+
+    With respect to the intrinsics (N, 2, 14) and to the pose (N, 2, 6).
+    """
     view = points.views
     turned = np.einsum("nij,nj->ni", estimate.rotations[view], points.board)
     in_camera = turned + estimate.translations[view]
@@ -220,7 +223,7 @@ def _summary(problem: _Problem, estimate: Estimate, *, sigma_known: bool) -> Adj
     counted = max(float(np.mean(weights == 1.0)), 0.05)
     spread = 1.0 if sigma_known else float(np.mean(psi**2)) / freedom / counted**2
     plain = solver.normal_equations(replace(problem, loss=Loss()).linear(estimate))
-    (poses,), free = diagonal_blocks(plain, [(6, 6 * np.arange(len(points.counts)))])
+    (poses,), free = marginal_covariances(plain, [(6, 6 * np.arange(len(points.counts)))])
     return Adjusted(
         estimate=estimate,
         sigma_px=sigma * float(np.sqrt(spread)),
@@ -268,7 +271,7 @@ def with_unfitted_terms(
     of_terms = np.array([*sigmas.values()]) ** -2.0
     prior = np.diag(np.concatenate([np.zeros(span.shape[1]), of_terms]))
     equations = replace(equations, corner=equations.corner + prior)
-    _, covariance = diagonal_blocks(equations, [])
+    _, covariance = marginal_covariances(equations, [])
     step = both @ equations.step(0.0)[1]
     return replace(fit, covariance=both @ covariance @ both.T + np.outer(step, step))
 

@@ -133,7 +133,7 @@ class Calibration:
     outliers: tuple[tuple[str, float], ...]  #: Excluded views, with their RMS residuals (px)
     lens: FreeLens  #: Which coefficients of the distortion are free
     #: RMS reprojection error (u and v together) in held-out views, by the lenses that were tried
-    holdout_px: dict[FreeLens, float]
+    cross_validation_px: dict[FreeLens, float]
     warnings: tuple[str, ...] = field(default=())
 
     @property
@@ -153,7 +153,7 @@ def calibrate(
     board : Board
     size : (int, int)
         Width and height of the pictures, pixels.
-    settings : CalibrationSettings, optional
+    settings : CalibrationSettings
 
     Returns
     -------
@@ -175,7 +175,7 @@ def calibrate(
         outliers = tuple((names[v], float(consensus.rms_px[v])) for v in np.flatnonzero(~kept))
         demand_enough(len(names) - len(outliers), f" without {listed(names, ~kept)}")
         used = np.flatnonzero(kept)
-        start, measured = consensus.estimate.of(used), measured.of(used)
+        start, measured = consensus.estimate.of_views(used), measured.of_views(used)
         wrong = 0
         if settings.robust:
             residuals = residuals_of(start, measured, radius)
@@ -193,7 +193,7 @@ def calibrate(
     warnings = warnings_of(adjusted, points, normals_spread_deg(adjusted.estimate.rotations))
     if wrong:
         warnings.insert(0, f"{wrong} points excluded: they are far from their expected positions")
-    holdout = {free: candidate.holdout_px for free, candidate in tried.items()}
+    holdout = {free: candidate.cross_validation_px for free, candidate in tried.items()}
     return Calibration(adjusted, points, names, outliers, lens, holdout, tuple(warnings))
 
 
@@ -226,7 +226,7 @@ def aspect_of(calibration: Calibration) -> Aspect:
     return Aspect(y / x, np.sqrt(variance) if variance > 1e-18 else 0.0)
 
 
-def calibrate_freely(
+def calibrate_with_free_aspect(
     views: Sequence[BoardView], board: Board, size: tuple[int, int], settings: CalibrationSettings
 ) -> Calibration:
     """As `calibrate`, with scales independent of each other if the views determine their ratio.

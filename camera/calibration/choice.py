@@ -31,8 +31,9 @@ from redetect.least_squares.solver import StartError
 _FOLDS = 8
 # Fits to folds end at a step that lowers the cost by less than this share: they begin where the fit
 # to all views ended, and what the rest would change is far less than a variance.
-_HOLDOUT_TOLERANCE = 1e-6
-# An additional coefficient must lower the sum of squared hold-out errors by this many variances.
+_FOLD_TOLERANCE = 1e-6
+# An additional coefficient must lower the sum of squared cross-validation errors by so many
+# variances.
 _WORTH = 4.0
 # With fewer coefficients than the lens has, a fold can bar the way to a fit of more: those are also
 # fitted from the fullest fit, if their residuals are this many times as large as its.
@@ -48,11 +49,11 @@ _POLYNOMIAL_WORTH = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A fit with some coefficients free: to points without the circles' shifts, `holdout_error`."""
+    """A fit with some coefficients free, to points without the circles' shifts."""
 
     adjusted: Adjusted
     points: Points
-    holdout_px: float
+    cross_validation_px: float  #: `cross_validation_error`
 
 
 Candidates = dict[FreeLens, Candidate]
@@ -65,7 +66,7 @@ def choose_lens(
 ) -> tuple[FreeLens, Candidates]:
     """Fit with an increasing number of free coefficients, and choose.
 
-    `start` is a fit with all of them. The choice is the fewest radial coefficients whose hold-out
+    `start` is a fit with all of them. The choice is the fewest radial coefficients whose
     error is not worse than the best. Tangential terms are added if they lower that error by more
     than they would by chance and are significant; then the radial coefficients are chosen again.
     The polynomial replaces the rational function if, with the same tangential terms, it needs fewer
@@ -132,21 +133,22 @@ def _fitted(
         estimate = adjusted.estimate
         # A lens with a pole is good for the next start, but useless where there are no points.
         pole = has_pole(estimate.intrinsics, points.width, points.height)
-        error = float("inf") if pole else holdout_error(estimate, seen, settings, lens)
+        error = float("inf") if pole else cross_validation_error(estimate, seen, settings, lens)
         tried[lens] = Candidate(adjusted, seen, error)
     return tried
 
 
 def _fewest_needed(tried: Candidates) -> FreeLens:
-    best = min(tried.values(), key=lambda candidate: candidate.holdout_px)
-    limit = best.holdout_px**2 + _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
-    return min(lens for lens, candidate in tried.items() if candidate.holdout_px**2 <= limit)
+    best = min(tried.values(), key=lambda candidate: candidate.cross_validation_px)
+    slack = _WORTH * best.adjusted.sigma_px**2 / len(best.points.board)
+    limit = best.cross_validation_px**2 + slack
+    return min(lens for lens, each in tried.items() if each.cross_validation_px**2 <= limit)
 
 
 def _is_lower(candidate: Candidate, other: Candidate, variances: float) -> bool:
-    """Whether a candidate's sum of squared hold-out errors is lower by at least `variances`."""
+    """Whether the sum of squared cross-validation errors is lower by at least `variances`."""
     slack = variances * candidate.adjusted.sigma_px**2 / len(candidate.points.board)
-    return candidate.holdout_px**2 + slack <= other.holdout_px**2
+    return candidate.cross_validation_px**2 + slack <= other.cross_validation_px**2
 
 
 def tangential_significance(adjusted: Adjusted) -> float:
@@ -156,7 +158,7 @@ def tangential_significance(adjusted: Adjusted) -> float:
     return float(found @ np.linalg.pinv(adjusted.covariance[np.ix_(places, places)]) @ found)
 
 
-def holdout_error(
+def cross_validation_error(
     estimate: Estimate,
     points: Points,
     settings: CalibrationSettings,
@@ -173,13 +175,13 @@ def holdout_error(
         folds = [every[every % number == fold] for fold in range(number)]
     squares = 0.0
     span, nothing = lens.span(settings.aspect), np.zeros((COUNT, 0))
-    fitted = partial(adjust, robust=settings.robust, tolerance=_HOLDOUT_TOLERANCE)
+    fitted = partial(adjust, robust=settings.robust, tolerance=_FOLD_TOLERANCE)
     for out in folds:
         used = np.setdiff1d(every, out)
-        fit = fitted(estimate.of(used), points.of(used), span)
-        there = replace(estimate.of(out), intrinsics=fit.estimate.intrinsics)
+        fit = fitted(estimate.of_views(used), points.of_views(used), span)
+        there = replace(estimate.of_views(out), intrinsics=fit.estimate.intrinsics)
         try:
-            test = fitted(there, points.of(out), nothing, sigma_px=fit.sigma_px)
+            test = fitted(there, points.of_views(out), nothing, sigma_px=fit.sigma_px)
         except StartError:  # a held-out point is beyond this fit's fold
             return float("inf")
         squares += float(np.sum(test.residuals**2))

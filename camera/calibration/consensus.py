@@ -14,7 +14,7 @@ import numpy as np
 
 from camera.calibration.adjustment import Adjusted, Estimate, Points, fit_points, residuals_of
 from camera.calibration.model import CalibrationSettings, FreeLens
-from camera.calibration.start import best_poses, first_estimate, normals_spread_deg, view_errors
+from camera.calibration.start import best_poses, initial_estimate, normals_spread_deg, view_errors
 from camera.errors import CalibrationError
 from redetect.array_types import BoolArray, FloatArray
 
@@ -66,7 +66,7 @@ def find_consensus(
         If none explains any.
     """
     fitted = partial(_fitted, points, settings, radius_m)
-    estimate = first_estimate(points, settings.aspect)
+    estimate = initial_estimate(points, settings.aspect)
     errors = view_errors(estimate, points)
     used = np.isfinite(errors)
     if used.any():
@@ -117,13 +117,13 @@ def _fitted(
 ) -> Consensus:
     """Fit to the views that are used; for the others, fit only the poses."""
     views, others = np.flatnonzero(used), np.flatnonzero(~used)
-    fit, _ = fit_points(estimate.of(views), points.of(views), settings, lens, radius_m)
+    fit, _ = fit_points(estimate.of_views(views), points.of_views(views), settings, lens, radius_m)
     found = replace(estimate, intrinsics=fit.estimate.intrinsics).with_poses(views, fit.estimate)
     residuals = np.empty_like(points.pixels)
     residuals[used[points.views]] = fit.residuals
     if len(others):
-        rest = points.of(others)
-        posed = best_poses(found.of(others), rest)
+        rest = points.of_views(others)
+        posed = best_poses(found.of_views(others), rest)
         found = found.with_poses(others, posed)
         residuals[~used[points.views]] = residuals_of(posed, rest)
     typical, rms = (view_rms(residuals, points, share) for share in (_COUNTED_SHARE, 1.0))

@@ -68,7 +68,7 @@ def pixels_of_points(intrinsics: FloatArray, points_camera: FloatArray) -> Float
     """The (N, 2) pixels of `project_points`, without derivatives: a third of its time."""
     lens = lens_of(intrinsics)
     xy = distortion.before_fold(normalised_points(points_camera)[0], lens)
-    return np.asarray(intrinsics[:2] * distortion.distorted(xy, lens) + intrinsics[2:4])
+    return np.asarray(intrinsics[:2] * distortion.distort(xy, lens) + intrinsics[2:4])
 
 
 def project_points(
@@ -82,7 +82,7 @@ def project_points(
     scale, offset = intrinsics[:2], intrinsics[2:4]
     lens = lens_of(intrinsics)
     xy = distortion.before_fold(normalised_points(points_camera)[0], lens)
-    seen = distortion.distorted(xy, lens)
+    seen = distortion.distort(xy, lens)
     r = np.hypot(xy[:, 0], xy[:, 1])
     a2, a3, b1, b2, b3 = lens.coef
     denominator = 1.0 + r * (b1 + r * (b2 + r * b3))
@@ -139,7 +139,7 @@ def _reach(r: float, lens: distortion.Lens, towards: FloatArray) -> FloatArray:
     """Distorted radii of an undistorted one, in the directions of places (N, 2)."""
     if not any(lens.tangential):  # the same in all directions
         return np.asarray(r * distortion.radial_factor(np.array(r), lens))
-    edge = distortion.distorted(r * _DIRECTIONS, lens)
+    edge = distortion.distort(r * _DIRECTIONS, lens)
     return np.interp(
         np.arctan2(towards[:, 1], towards[:, 0]),
         np.unwrap(np.arctan2(edge[:, 1], edge[:, 0])),

@@ -9,7 +9,7 @@ import numpy as np
 
 from camera.calibration.adjustment import Adjusted, Estimate, Points, adjust, residuals_of
 from camera.calibration.model import COUNT, FreeLens, lens_of
-from camera.distortion import straightened
+from camera.distortion import undistort
 from camera.rotations import rotation_of
 from redetect.array_types import FloatArray, IntArray
 from redetect.least_squares.solver import StartError
@@ -25,14 +25,14 @@ _FEW_VIEWS = 10
 _LOOSE = 1e-4
 
 
-def first_estimate(points: Points, aspect: float | None) -> Estimate:
+def initial_estimate(points: Points, aspect: float | None) -> Estimate:
     """The best of some focal lengths, with at most one coefficient, or those of a fisheye lens.
 
     `aspect` is scaleY / scaleX, None if unknown (then 1 to begin with). Views that contradict the
     others may be left with a pose from which their points are not seen.
     """
     chosen = np.unique(np.linspace(0, len(points.counts) - 1, _FEW_VIEWS).round().astype(np.int64))
-    few = points.of(chosen)
+    few = points.of_views(chosen)
     ratio = 1.0 if aspect is None else aspect
     best, lowest = None, (np.inf, 0)
     starts = [(widths, (0.0,) * 5, FreeLens(1)) for widths in _FOCAL_WIDTHS]
@@ -63,7 +63,7 @@ def board_poses(intrinsics: FloatArray, points: Points) -> tuple[Estimate, Estim
     Infinitesimal plane-based pose estimation, IJCV 109, 2014; OpenCV's solver).
     """
     normalised = (points.pixels - intrinsics[2:4]) / intrinsics[:2]
-    straight = straightened(normalised, lens_of(intrinsics))
+    straight = undistort(normalised, lens_of(intrinsics))
     # A point beyond the fold is not changed, which is sufficient for a start.
     straight = np.where(np.isnan(straight), normalised, straight)
     found = []
@@ -102,7 +102,7 @@ def _fitted_where_seen(
     if not len(seen):
         return None
     try:
-        return adjust(start.of(seen), points.of(seen), span, tolerance=_LOOSE), seen
+        return adjust(start.of_views(seen), points.of_views(seen), span, tolerance=_LOOSE), seen
     except (StartError, np.linalg.LinAlgError):
         return None
 

@@ -23,7 +23,7 @@ from camera.calibration.calibrate import (
     Calibration,
     aspect_of,
     calibrate,
-    calibrate_freely,
+    calibrate_with_free_aspect,
     calibrated_camera,
 )
 from camera.calibration.consensus import view_rms
@@ -45,11 +45,11 @@ from redetect.storage.images import opened_video, read_grey
 #: Number of pictures used to determine the true size of a checkerboard, and least number agreeing.
 _COUNTED_PICTURES, _VOTES = 8, 2
 #: Advice if a board is in no picture, by its kind.
-_RIGHT = {
+_NOT_FOUND_ADVICE = {
     "checkerboard": "--rows right? A board of 10 x 7 squares has 9 x 6 inner corners",
     "charuco": "--rows right, and the --dictionary?",
 }
-_WHETHER = {"auto": None, "on": True, "off": False}
+_THREE_STATE = {"auto": None, "on": True, "off": False}
 #: Endings of the pictures that are written, which no folder's photographs have.
 _WRITTEN = (".residuals.png", ".coverage.png", ".corners.png")
 #: Files that are read as videos.
@@ -89,15 +89,15 @@ def perform_calibrate(options: Calibrate) -> int:
     settings = CalibrationSettings(
         aspect=0.5 if options.half else 1.0,
         coefficients=None if options.coefficients == "auto" else int(options.coefficients),
-        tangential=_WHETHER[options.tangential],
-        polynomial=_WHETHER[options.polynomial],
+        tangential=_THREE_STATE[options.tangential],
+        polynomial=_THREE_STATE[options.polynomial],
         keep_outliers=options.keep_outliers,
     )
     images = partial(calibration_images, options.images, options.max_images)
     if board.kind == "checkerboard":
-        board = true_board(images(), board)
+        board = board_as_counted(images(), board)
     views, size = find_views(images(), board)
-    calibrated = calibrate_freely if options.free_aspect else calibrate
+    calibrated = calibrate_with_free_aspect if options.free_aspect else calibrate
     calibration = calibrated(views, board, size, settings)
     camera = calibrated_camera(calibration)
     print(describe(calibration, camera))
@@ -131,7 +131,9 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
         "sigma": dict(zip(INTRINSICS, np.sqrt(np.diag(adjusted.covariance)).tolist())),
         "lens": str(calibration.lens),
         "rms_px": adjusted.rms_px,
-        "holdout_rms_px": {str(lens): error for lens, error in calibration.holdout_px.items()},
+        "holdout_rms_px": {
+            str(lens): error for lens, error in calibration.cross_validation_px.items()
+        },
         "views": [dict(zip(("name", "points", "rms_px"), view)) for view in views],
         "left_out": [{"name": name, "rms_px": error} for name, error in calibration.outliers],
         "warnings": calibration.warnings,
@@ -139,7 +141,7 @@ def report_text(options: Calibrate, calibration: Calibration) -> str:
     return f"{json_text(content)}\n"
 
 
-def true_board(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
+def board_as_counted(images: Iterable[tuple[str, GreyImage]], board: Board) -> Board:
     """The board with the number of corners in the pictures, if that contradicts the given one.
 
     A larger board contains the given one. A smaller one may be part of a poorly visible board: it
@@ -199,7 +201,7 @@ def find_views(
     if size is None or not views:
         raise CalibrationError(
             f"no {board} in any of {count} pictures: are --board, --columns and "
-            f"{_RIGHT.get(board.kind, '--rows right?')}"
+            f"{_NOT_FOUND_ADVICE.get(board.kind, '--rows right?')}"
         )
     for reason, names in without.items():
         print(f"{', '.join(names)}: {reason}", file=sys.stderr)
@@ -223,7 +225,7 @@ def describe(calibration: Calibration, camera: Camera) -> str:
         f"RMS residual {calibration.adjusted.rms_px:.3f} px (u and v together), noise "
         f"{calibration.adjusted.sigma_px:.3f} px per coordinate"
     )
-    for lens, error in calibration.holdout_px.items():
+    for lens, error in calibration.cross_validation_px.items():
         mark = " <- chosen" if lens == calibration.lens else ""
         held = f"{error:.3f} px" if np.isfinite(error) else "none: a pole or fold in the image"
         lines.append(f"RMS in pictures held out, coefficients {lens}: {held}{mark}")

@@ -54,7 +54,7 @@ def floor_points(options: Floor, size: tuple[int, int]) -> tuple[FloatArray, Flo
             "of places on the floor (u,v,x,y) needs none"
         )
     board = board_of(options)
-    if board.looks_turned:
+    if board.is_symmetric:
         raise CalibrationError(
             f"a {board} looks the same turned by 180 degrees, so it can't say where the robot's "
             "axes point: use one with one even and one odd number, or a .csv of places u,v,x,y"

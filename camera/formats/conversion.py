@@ -25,7 +25,7 @@ EXACT_PX = 1e-6
 # Number of rounds of Lawson's reweighting, which minimises the largest deviation.
 _LAWSON_ROUNDS = 25
 # Number of rounds of the approximation from which the fit of a wide lens starts.
-_BENDS = 5
+_RATIONAL_ROUNDS = 5
 _STEPS, _LAWSON_STEPS = 60, 5
 # Cost of parameters that are impossible or do not see all rays: no step leads there.
 _REFUSED_PX = 1e6
@@ -112,7 +112,7 @@ def _nearest(fit: CameraFit, start: FloatArray, spans: Sequence[FloatArray]) -> 
     best = fit.measured(parameters)
     if best.deviation_px < EXACT_PX:
         return best
-    return nearer(best, fit.measured(smallest_largest(fit, parameters, span)))
+    return nearer(best, fit.measured(minimax_fit(fit, parameters, span)))
 
 
 def nearer(*found: Converted) -> Converted:
@@ -120,7 +120,7 @@ def nearer(*found: Converted) -> Converted:
     return min(found, key=lambda converted: converted.deviation_px)
 
 
-def smallest_largest(fit: CameraFit, start: FloatArray, span: FloatArray) -> FloatArray:
+def minimax_fit(fit: CameraFit, start: FloatArray, span: FloatArray) -> FloatArray:
     """Parameters with the least maximal distance, by increasing weights where it is large.
 
     References
@@ -260,7 +260,7 @@ def convert_to_camera(
     )
     best = _nearest(fit, start, spans)
     if best.deviation_px > _NEAR_PX:  # a wide fisheye lens is too far from a pinhole
-        bent = _bent_as(start, pixels, rays)
+        bent = _rational_start(start, pixels, rays)
         if is_possible(bent, width, height):
             best = nearer(best, _nearest(fit, bent, spans[5:]))
     if best.deviation_px <= _NEAR_PX:
@@ -270,7 +270,7 @@ def convert_to_camera(
     return nearer(best, _nearest(fit, intrinsics_of(best.camera), together))
 
 
-def _bent_as(intrinsics: FloatArray, pixels: FloatArray, rays: FloatArray) -> FloatArray:
+def _rational_start(intrinsics: FloatArray, pixels: FloatArray, rays: FloatArray) -> FloatArray:
     """Intrinsics with a rational part that approximates the radii of (N, 2) pixels and their rays.
 
     Least squares linear in a2, a3, b1, b2, b3, each time divided by the last denominator (C. K.
@@ -282,7 +282,7 @@ def _bent_as(intrinsics: FloatArray, pixels: FloatArray, rays: FloatArray) -> Fl
     powers = radius[:, None] ** np.arange(1, 4)
     matrix = np.hstack([radius[:, None] * powers[:, :2], -added[:, None] * powers])
     coef, denominator = np.zeros(5), np.ones(len(radius))
-    for _ in range(_BENDS):
+    for _ in range(_RATIONAL_ROUNDS):
         weight = 1.0 / np.maximum(denominator, 1.0)
         coef = np.linalg.lstsq(weight[:, None] * matrix, weight * added, rcond=None)[0]
         denominator = 1.0 + powers @ coef[2:]

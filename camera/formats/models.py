@@ -119,13 +119,13 @@ class ForeignCamera:
                 for _ in range(_NEWTON_STEPS):
                     seen = self._seen(xy)
                     off = target - seen.pixels
-                    xy = xy + (inverse_2x2(seen.by_place) @ off[..., None])[..., 0]
+                    xy = xy + (inverse_2x2(seen.by_normalised) @ off[..., None])[..., 0]
                     if not np.any(np.abs(off) >= _ROUNDING_PX):
                         break
             there = np.abs(self._seen(xy).pixels - pixels).max(axis=-1) < _CONVERGED_PX
             # A place beyond a fold may be seen at the same pixel, but there is a fold on the way.
             for share in np.linspace(0.0, 1.0, _WAY + 1)[1:]:
-                there &= np.linalg.det(self._seen(share * xy).by_place) > 0.0
+                there &= np.linalg.det(self._seen(share * xy).by_normalised) > 0.0
         return np.where(there[:, None], xy, np.nan)
 
     def _seen(self, normalised: FloatArray) -> Projected:
@@ -136,8 +136,8 @@ class Projected(NamedTuple):
     """Where N places are seen."""
 
     pixels: FloatArray  # (N, 2)
-    by_parameters: FloatArray  # (N, 2, P) derivatives by fx, fy, cx, cy and the coefficients
-    by_place: FloatArray  # (N, 2, 2) derivatives by the normalised coordinates
+    by_parameters: FloatArray  # (N, 2, P) derivatives with respect to `parameters`
+    by_normalised: FloatArray  # (N, 2, 2) derivatives with respect to `normalised`
 
 
 def projected(model: Model, parameters: FloatArray, normalised: FloatArray) -> Projected:
@@ -149,7 +149,7 @@ def projected(model: Model, parameters: FloatArray, normalised: FloatArray) -> P
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     points = np.column_stack([normalised, np.ones(len(normalised))])[:, None]
     nowhere = np.zeros(3)
-    # Derivatives by the pose are before those by the parameters, of a fisheye behind them.
+    # Derivatives with respect to the pose precede those to the parameters; a fisheye's follow them.
     if model == "fisheye":
         seen = cv2.fisheye.projectPoints(points, nowhere, nowhere, matrix, parameters[4:])
         own, translation = 0, 11

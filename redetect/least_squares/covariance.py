@@ -13,7 +13,7 @@ from redetect.least_squares.solver import NormalEquations, factor, scaled_invers
 _CHUNK = 128
 
 
-def diagonal_blocks(
+def marginal_covariances(
     equations: NormalEquations, blocks: list[tuple[int, IntArray]]
 ) -> tuple[list[FloatArray], FloatArray]:
     """Covariances of groups of unknowns, and of the shared ones, marginalised over all others.
@@ -29,8 +29,8 @@ def diagonal_blocks(
     return found, shared
 
 
-def chosen_covariance(equations: NormalEquations, chosen: IntArray) -> FloatArray:
-    """(n, n) joint covariance of n chosen unknowns; errors as `diagonal_blocks`."""
+def joint_marginal_covariance(equations: NormalEquations, chosen: IntArray) -> FloatArray:
+    """(n, n) joint covariance of n chosen unknowns; errors as `marginal_covariances`."""
     factored, size = factor(equations.matrix), equations.matrix.shape[0]
     covariance = np.empty((len(chosen), len(chosen)))
     for first in range(0, len(chosen), _CHUNK):

@@ -38,9 +38,12 @@ class Block(NamedTuple):
     """Whitened residuals of one kind, with their derivatives."""
 
     error: FloatArray  # (n, d): each row is one residual for the loss
-    # ((n,), (n, d, k)): index of the first of k unknowns (below 0: none), derivatives by them.
-    by: Sequence[tuple[IntArray, FloatArray]]
-    shared: FloatArray | None = None  # (n, d, s): by the shared unknowns; None: all are 0
+    # ((n,), (n, d, k)): index of the first of k unknowns (below 0: none), and derivatives with
+    # respect to them.
+    jacobians: Sequence[tuple[IntArray, FloatArray]]
+    shared: FloatArray | None = (
+        None  # (n, d, s): derivatives with respect to shared unknowns; None: 0
+    )
     loss: Loss = Loss()
 
 
@@ -107,9 +110,10 @@ def whitening(covariance: FloatArray) -> FloatArray:
 
 
 def robust(squared: FloatArray, loss: Loss) -> tuple[FloatArray, FloatArray]:
-    """Costs of (n,) squared residuals, and their weights: the costs' derivatives by the squares.
+    """Costs of (n,) squared residuals, and their weights.
 
-    Huber's, Cauchy's (Lorentzian) and Geman and McClure's losses are quadratic near 0.
+    A weight is the derivative of the cost with respect to the squared residual. Huber's, Cauchy's
+    (Lorentzian) and Geman and McClure's losses are quadratic near 0.
     """
     c2 = loss.scale**2
     if loss.kind == "huber":
@@ -142,10 +146,10 @@ def stack(blocks: Sequence[Block], unknowns: int, shared: int) -> Linear:
         by_shared = np.zeros((n, d, shared)) if block.shared is None else root * block.shared
         border.append(by_shared.reshape(n * d, shared))
         row = first_row + np.arange(n * d, dtype=np.int64).reshape(n, d, 1)
-        for first, by in block.by:
+        for first, jacobian in block.jacobians:
             free = slice(None) if np.all(first >= 0) else first >= 0
-            some = by[free] * root[free]
-            column = first[free, None, None] + np.arange(by.shape[2], dtype=np.int64)
+            some = jacobian[free] * root[free]
+            column = first[free, None, None] + np.arange(jacobian.shape[2], dtype=np.int64)
             values.append(some.ravel())
             rows.append(np.broadcast_to(row[free], some.shape).ravel())
             columns.append(np.broadcast_to(column, some.shape).ravel())

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from camera.calibration.calibrate import BoardView, Calibration, aspect_of, calibrate_freely
+from camera.calibration.calibrate import (
+    BoardView,
+    Calibration,
+    aspect_of,
+    calibrate_with_free_aspect,
+)
 from camera.calibration.model import CalibrationSettings
-from camera.commands.calibrate import calibration_images, true_board
+from camera.commands.calibrate import board_as_counted, calibration_images
 from tests.camera.conftest import BOARD, CAMERA
 from tools.evaluation.boards import board_poses
 
@@ -26,7 +31,7 @@ def calibrated(aspect: float, views: int, seed: int, noise_px: float = 0.1) -> C
         noise = noise_px * rng.standard_normal(pixels.shape)
         seen.append(BoardView(f"{number}", np.arange(len(pixels)), pixels + noise))
     settings = CalibrationSettings(coefficients=2, tangential=False, polynomial=False)
-    return calibrate_freely(seen, BOARD, (320, 240), settings)
+    return calibrate_with_free_aspect(seen, BOARD, (320, 240), settings)
 
 
 def test_the_aspect_ratio_is_found() -> None:
@@ -50,7 +55,7 @@ def test_a_wrong_count_is_mended(
     photographs: Path, columns: int, rows: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = replace(BOARD, columns=columns, rows=rows)
-    found = true_board(calibration_images([photographs], 60), given)
+    found = board_as_counted(calibration_images([photographs], 60), given)
     told = capsys.readouterr().err
     if (columns, rows) == (6, 9):  # the same board, lying
         assert (found, told) == (given, "")

@@ -166,7 +166,7 @@ def test_noisy_points_and_wrong_ones_give_the_projection_to_its_predicted_error(
     assert np.mean(away < 3.0 * sigma) > 0.95
     # Fewer coefficients than the lens has are seen through by the pictures held out.
     assert not result.lens.tangential
-    assert result.holdout_px[FreeLens(1)] > 2.0 * result.holdout_px[result.lens]
+    assert result.cross_validation_px[FreeLens(1)] > 2.0 * result.cross_validation_px[result.lens]
 
 
 def test_a_decentred_lens_is_found_and_a_radial_one_stays_radial() -> None:
@@ -179,7 +179,7 @@ def test_a_decentred_lens_is_found_and_a_radial_one_stays_radial() -> None:
         views = seen_views(truth, 9, 0.1, seed=3)
         result = calibrate(views, BOARD, (640, 480), settings)
         assert result.lens == FreeLens(2, found)
-        assert set(result.holdout_px) == {FreeLens(2, False), FreeLens(2, True)}
+        assert set(result.cross_validation_px) == {FreeLens(2, False), FreeLens(2, True)}
         camera = with_intrinsics(radial, result.intrinsics)
         assert projection_difference(truth, camera).max() < 0.3
         forced = replace(settings, tangential=not found)
@@ -200,11 +200,14 @@ def test_a_polynomial_instead_of_the_rational_function_comes_back() -> None:
     views = seen_views(euroc, 9, 0.1, seed=3)
     settings = CalibrationSettings(polynomial=True, tangential=False)
     result = calibrate(views, BOARD, (752, 480), settings)
-    assert set(result.holdout_px) == {FreeLens(0, False, count) for count in range(4)}
+    assert set(result.cross_validation_px) == {FreeLens(0, False, count) for count in range(4)}
     # k3 is 0, and one coefficient is seen through.
     assert result.lens == FreeLens(0, False, 2)
     assert str(result.lens) == "k1 k2"
-    assert result.holdout_px[FreeLens(0, False, 1)] > 1.2 * result.holdout_px[result.lens]
+    assert (
+        result.cross_validation_px[FreeLens(0, False, 1)]
+        > 1.2 * result.cross_validation_px[result.lens]
+    )
     assert result.intrinsics[4:11].tolist() == [0.0] * 7
     sigma = np.sqrt(np.diag(result.adjusted.covariance)[11:13])
     assert np.all(sigma > 0.0)
@@ -340,7 +343,7 @@ def test_a_lens_with_a_pole_is_not_chosen(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("camera.calibration.choice.has_pole", lambda lens, *_: lens[b2] != 0.0)
     found = calibrate(views, BOARD, (640, 480), settings)
     assert found.lens == FreeLens(1)
-    assert found.holdout_px[FreeLens(2)] == np.inf
+    assert found.cross_validation_px[FreeLens(2)] == np.inf
 
 
 def test_free_span_ties_the_scales() -> None:
@@ -440,10 +443,10 @@ def test_impossible_boards(arguments: tuple[object, ...], message: str) -> None:
 
 
 def test_boards_that_look_the_same_turned() -> None:
-    assert Board("checkerboard", 8, 6, 0.1).looks_turned
-    assert not Board("checkerboard", 9, 6, 0.1).looks_turned
-    assert Board("circles", 9, 6, 0.1).looks_turned
-    assert not Board("asymmetric-circles", 4, 11, 0.1).looks_turned
+    assert Board("checkerboard", 8, 6, 0.1).is_symmetric
+    assert not Board("checkerboard", 9, 6, 0.1).is_symmetric
+    assert Board("circles", 9, 6, 0.1).is_symmetric
+    assert not Board("asymmetric-circles", 4, 11, 0.1).is_symmetric
     for board in (Board("checkerboard", 9, 6, 0.1), Board("asymmetric-circles", 4, 11, 0.1)):
         # Turned by 180 degrees, the set of points (and of black squares) is or is not the same.
         turned = -board.points

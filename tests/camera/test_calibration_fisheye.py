@@ -34,4 +34,4 @@ def test_a_fisheye_lens_is_reached_and_chosen() -> None:
     assert result.adjusted.sigma_px == pytest.approx(0.05, rel=0.15)
     assert result.intrinsics[:2] == pytest.approx(focal, rel=0.005)
     assert result.lens.coefficients >= 2
-    assert all(result.holdout_px[FreeLens(count)] < 0.2 for count in (3, 4, 5))
+    assert all(result.cross_validation_px[FreeLens(count)] < 0.2 for count in (3, 4, 5))

@@ -11,10 +11,10 @@ from scipy import optimize, sparse
 
 from redetect.least_squares import LossKind
 from redetect.least_squares.covariance import (
-    chosen_covariance,
-    diagonal_blocks,
     filled_pattern,
     inverse_blocks,
+    joint_marginal_covariance,
+    marginal_covariances,
 )
 from redetect.least_squares.solver import (
     Block,
@@ -99,11 +99,11 @@ def test_covariances_are_those_of_the_dense_inverse() -> None:
     whole = np.hstack([linear.jacobian.toarray(), linear.border])
     dense = np.linalg.inv(whole.T @ whole)
     equations = normal_equations(linear)
-    (own,), shared = diagonal_blocks(equations, [(2, np.arange(0, 12, 2))])
+    (own,), shared = marginal_covariances(equations, [(2, np.arange(0, 12, 2))])
     np.testing.assert_allclose(shared, dense[12:, 12:], rtol=1e-8)
     np.testing.assert_allclose(own[2], dense[4:6, 4:6], rtol=1e-8)
     chosen = np.array([1, 4, 11])
-    joint = chosen_covariance(equations, chosen)
+    joint = joint_marginal_covariance(equations, chosen)
     np.testing.assert_allclose(joint, dense[np.ix_(chosen, chosen)], rtol=1e-8)
 
 

@@ -16,7 +16,7 @@ from camera.boards.board import Board
 from camera.boards.points import circle_centroids, find_board
 from camera.calibration.adjustment import Estimate, Points, circle_shifts
 from camera.calibration.calibrate import BoardView, Calibration, calibrate, points_of
-from camera.calibration.choice import holdout_error
+from camera.calibration.choice import cross_validation_error
 from camera.calibration.model import CalibrationSettings, FreeLens
 from camera.errors import CalibrationError
 from camera.uncertainty import intrinsics_of, projection_sigma, with_intrinsics
@@ -140,13 +140,13 @@ def opencv_holdout(points: Points, folds: list[IntArray], *, tangential: bool) -
     squares = 0.0
     size = (points.width, points.height)
     for out in folds:
-        used = points.of(np.setdiff1d(every, out))
+        used = points.of_views(np.setdiff1d(every, out))
         rows = [used.views == view for view in range(len(used.counts))]
         board = [used.board[chosen].astype(np.float32) for chosen in rows]
         seen = [used.pixels[chosen].astype(np.float32) for chosen in rows]
         _, K, d, _, _ = cv2.calibrateCamera(board, seen, size, np.eye(3), np.zeros(8), flags=flags)
         for view in out:
-            held = points.of(np.array([view]))
+            held = points.of_views(np.array([view]))
             _, rvec, tvec = cv2.solvePnP(held.board, held.pixels, K, d)
             rvec, tvec = cv2.solvePnPRefineLM(held.board, held.pixels, K, d, rvec, tvec)
             found = cv2.projectPoints(held.board, rvec, tvec, K, d)[0].reshape(-1, 2)
@@ -187,7 +187,7 @@ def compare(
     estimate = result.adjusted.estimate
     errors = {
         name: {
-            "ours": holdout_error(estimate, points, settings, lens, folds),
+            "ours": cross_validation_error(estimate, points, settings, lens, folds),
             **{peer: opencv_holdout(points, folds, tangential=OPENCV[peer]) for peer in peers},
         }
         for name, folds in splits(len(points.counts)).items()
@@ -221,7 +221,7 @@ class CameraRendered(Study):
             sigma = projection_sigma(made.camera, result.adjusted.covariance)
             table.row(
                 name, made.found, str(result.lens), result.adjusted.rms_px, made.floor_px,
-                result.holdout_px[result.lens], turned.max(), fixed, np.median(turned),
+                result.cross_validation_px[result.lens], turned.max(), fixed, np.median(turned),
                 sigma.max(), np.median(sigma),
             )  # fmt: skip
         return table.figures

@@ -139,7 +139,7 @@ def _board(entry: JsonObject) -> Board:
         board = Board("checkerboard", columns, rows, entry.number("square_m"))
     except CalibrationError as error:
         raise GroundTruthError(f"{entry.place}: {error}") from None
-    if board.looks_turned:
+    if board.is_symmetric:
         raise GroundTruthError(
             f"{entry.place}: board of {columns} x {rows} inner corners looks the same turned by "
             "180 degrees: expected one even and one odd number"

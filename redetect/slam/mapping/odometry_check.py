@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from redetect.array_types import FloatArray
-from redetect.least_squares.covariance import by_shared, diagonal_blocks
+from redetect.least_squares.covariance import by_shared, marginal_covariances
 from redetect.least_squares.solver import normal_equations
 from redetect.plane import between
 from redetect.slam.mapping.graph_terms import errors, linearise
@@ -69,7 +69,7 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     equations = normal_equations(problem)
     # Of each pose with the next; the first one is known.
     pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
-    found, spread = diagonal_blocks(equations, [pairs, (3, np.zeros(1, dtype=np.int64))])
+    found, spread = marginal_covariances(equations, [pairs, (3, np.zeros(1, dtype=np.int64))])
     jacobians = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     by_poses = graph.step_whitening @ np.concatenate(jacobians, axis=2)
     first, others = by_poses[:1, :, 3:], by_poses[1:]

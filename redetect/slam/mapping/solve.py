@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from redetect.array_types import FloatArray
 from redetect.least_squares import solver
-from redetect.least_squares.covariance import chosen_covariance, diagonal_blocks
+from redetect.least_squares.covariance import joint_marginal_covariance, marginal_covariances
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
 from redetect.slam.mapping.graph_terms import MOUNTING, Weighting, cost, linearise
@@ -139,7 +139,7 @@ def marginals(graph: Graph, estimate: Estimate, weighting: Weighting) -> Margina
         (2, np.arange(graph.first_line, graph.unknowns, 2)),
     ]
     with _determined("covariances"):
-        found, shared = diagonal_blocks(equations_at(graph, estimate, weighting), blocks)
+        found, shared = marginal_covariances(equations_at(graph, estimate, weighting), blocks)
     mounting = None
     if weighting.calibrate:
         mounting = np.zeros((MOUNTING, MOUNTING))
@@ -154,7 +154,7 @@ def joint_covariance(graph: Graph, estimate: Estimate, weighting: Weighting) -> 
     """
     landmarks = np.arange(graph.first_disc, graph.unknowns)
     with _determined("covariances"):
-        return chosen_covariance(equations_at(graph, estimate, weighting), landmarks)
+        return joint_marginal_covariance(equations_at(graph, estimate, weighting), landmarks)
 
 
 def moved(graph: Graph, estimate: Estimate, step: FloatArray, mounting: FloatArray) -> Estimate:
