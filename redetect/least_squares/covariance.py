@@ -68,11 +68,10 @@ def inverse_blocks(
     row = order[np.concatenate([entries.row, *(i for i, _ in asked)])]
     column = order[np.concatenate([entries.col, *(j for _, j in asked)])]
     pattern = sparse.csc_array((np.ones(len(row)), (row, column)))
-    indptr, indices = filled_pattern(
-        pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+    keys = np.sort(
+        filled_pattern(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
     )
-    columns = np.repeat(np.arange(len(order), dtype=np.int64), np.diff(indptr))
-    keys = np.sort(columns * len(order) + indices)
+    indptr = np.searchsorted(keys, len(order) * np.arange(len(order) + 1))
     indices = keys % len(order)
     lower = sparse.tril(factored.L, -1).tocoo()
     values = np.zeros(len(indices))
@@ -92,49 +91,32 @@ def inverse_blocks(
 
 
 @kernel()
-def filled_pattern(indptr: IntArray, indices: IntArray) -> tuple[IntArray, IntArray]:
-    """Pattern of the Cholesky factor of a symmetric matrix: strictly lower triangle, by columns.
+def filled_pattern(indptr: IntArray, indices: IntArray) -> IntArray:
+    """Entries of the Cholesky factor of a symmetric matrix, strictly below the diagonal.
 
-    Within a column, rows are in any order. SuperLU's own factor lacks entries that cancel or, as
-    around a long loop of poses, underflow: the entries of the inverse there would be missing.
+    Each is its column times the matrix's size plus its row; in any order. SuperLU's own factor
+    lacks entries that cancel or, as around a long loop of poses, underflow: the entries of the
+    inverse there would be missing.
+
+    T. A. Davis, Algorithm 849: A concise sparse Cholesky factorization package, ACM Transactions on
+    Mathematical Software 31, 2005.
     """
     n = len(indptr) - 1
-    first_child = np.full(n, -1, dtype=np.int64)
-    next_child = np.full(n, -1, dtype=np.int64)
+    parent = np.full(n, -1, dtype=np.int64)
     mark = np.full(n, -1, dtype=np.int64)
-    start = np.zeros(n + 1, dtype=np.int64)
-    rows = np.empty(4 * len(indices) + n, dtype=np.int64)
-    for j in range(n):
-        count = start[j]
-        if count + n > len(rows):
-            larger = np.empty(2 * len(rows) + n, dtype=np.int64)
-            for at in range(count):
-                larger[at] = rows[at]
-            rows = larger
-        mark[j] = j
-        for at in range(indptr[j], indptr[j + 1]):
-            i = indices[at]
-            if i > j and mark[i] != j:
-                mark[i] = j
-                rows[count] = i
-                count += 1
-        child = first_child[j]
-        while child >= 0:
-            for at in range(start[child], start[child + 1]):
-                i = rows[at]
-                if mark[i] != j:
-                    mark[i] = j
-                    rows[count] = i
-                    count += 1
-            child = next_child[child]
-        start[j + 1] = count
-        if count > start[j]:
-            parent = n
-            for at in range(start[j], count):
-                parent = min(parent, rows[at])
-            next_child[j] = first_child[parent]
-            first_child[parent] = j
-    return start, rows[: start[n]].copy()
+    entries: list[int] = []
+    for row in range(n):
+        mark[row] = row
+        for at in range(indptr[row], indptr[row + 1]):
+            column = indices[at]
+            # Up the elimination tree, to what is known to be in this row.
+            while column < row and mark[column] != row:
+                mark[column] = row
+                entries.append(column * n + row)
+                if parent[column] < 0:
+                    parent[column] = row
+                column = parent[column]
+    return np.array(entries, dtype=np.int64)
 
 
 @kernel()
