@@ -40,7 +40,7 @@ _OFFSET_MESSAGE = re.compile(
     rf"offset from master:\s*({NUMBER})\s*(?:s(?:ec)?\s+([+-]?[0-9]{{1,12}})\s*n|s\b|$)"
 )
 _DRIFT_MESSAGE = re.compile(rf"observed drift:\s*({NUMBER})")
-_LEADING_TIME = re.compile(rf"^\s*\[?({NUMBER})\]?[\s,:]")
+_LEADING_TIME = re.compile(rf"^\s*\[?({NUMBER})\]?(?:[\s,]|:(?![0-9]))")
 _CALENDAR = (
     "%Y-%m-%d %H:%M:%S.%f",
     "%Y-%m-%d %H:%M:%S",

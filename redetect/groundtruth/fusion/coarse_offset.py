@@ -8,7 +8,7 @@ offset far from the expected one is only taken if it explains them much better t
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -134,33 +134,56 @@ class OffsetSearch:
             return around_s
         return float(_STEP_S * steps[best])
 
-    def set_at_s(self, part: PlanarPoses) -> float | None:
+    def set_at_s(self, part: PlanarPoses, largest_drift: float) -> float | None:
         """Time at which the clock was set by more than a refinement finds, within a part."""
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return None
-        blocks = compared.single_errors(compared.overlapping(self._steps))
+        steps = compared.overlapping(self._steps)
+        if not len(steps):
+            return None
+        blocks = compared.single_errors(steps)
         costs = (np.minimum(block, compared.unrelated) for block in blocks)
         times_s = np.asarray(_STEP_S * (compared.at + compared.own.first))
         at, cost, offsets, whole = best_split(costs, times_s, _LEAST_PART_S)
-        is_set = cost < _MUCH_BETTER * whole and _STEP_S * np.ptp(offsets) > _LEAST_JUMP_S
-        return float(times_s[at]) if is_set else None
+        if cost > _MUCH_BETTER * whole or _STEP_S * np.ptp(offsets) < _LEAST_JUMP_S:
+            return None
+        # A clock that drifts has the mean offsets of both parts at their middles.
+        drifts = np.array([1.6, 2.0, 2.4]) * np.diff(offsets) / np.ptp(compared.at)
+        between = np.arange(steps[offsets.min()], steps[offsets.max()] + 1)
+        for drift in drifts[np.abs(drifts) <= largest_drift].tolist():
+            for block in compared.drifting(drift).single_errors(between):
+                if np.minimum(block, compared.unrelated).sum(axis=1).min() < cost:
+                    return None
+        return float(times_s[at])
 
-    def nearest_s(self, part: PlanarPoses, around_s: float) -> float:
-        """The best offset near the expected one."""
+    def best_near(
+        self, part: PlanarPoses, around_s: float, largest_drift: float
+    ) -> tuple[float, float]:
+        """The best offset (s) near the expected one, and the drift, 0 unless another is better."""
         compared = self._compared([part])
         if compared is None:
-            return around_s
+            return around_s, 0.0
         near = int(NEAR_S / _STEP_S)
         steps = round(around_s / _STEP_S) + np.arange(-near, near + 1)
-        return float(_STEP_S * steps[int(np.argmin(compared.errors(steps)))])
+        # From one to the next the ends of the part move by two steps.
+        count = int(largest_drift * np.ptp(compared.at) / 4)
+        drifts = np.arange(-count, count + 1) * (largest_drift / max(count, 1))
+        errors = np.stack([compared.drifting(drift).errors(steps) for drift in drifts.tolist()])
+        least = errors.min(axis=1)
+        best = int(np.argmin(least))
+        if not least[best] < _ALONE * least[count]:
+            best = count
+        if not np.isfinite(least[best]):
+            return around_s, 0.0
+        return float(_STEP_S * steps[np.argmin(errors[best])]), float(drifts[best])
 
-    def matches(self, part: PlanarPoses, offset_s: float) -> bool:
-        """Whether the movements of a part agree at an offset, unless there is hardly any."""
+    def matches(self, part: PlanarPoses, offset_s: float, drift: float) -> bool:
+        """Whether the movements of a part agree with a clock, unless there is hardly any."""
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return True
-        error = compared.errors(np.array([round(offset_s / _STEP_S)]))[0]
+        (error,) = compared.drifting(drift).errors(np.array([round(offset_s / _STEP_S)]))
         return bool(not np.isfinite(error) or error < _UNRELATED * compared.unrelated)
 
     def _compared(self, parts: Sequence[PlanarPoses]) -> _Compared | None:
@@ -197,6 +220,11 @@ class _Compared:
         own = self.own.values[self.own.known]
         apart = np.var(self.values, axis=0) + np.var(own, axis=0)
         return float((apart + (self.values.mean(axis=0) - own.mean(axis=0)) ** 2) @ self.weights)
+
+    def drifting(self, drift: float) -> _Compared:
+        """The same with a drift of odometry's clock from the middle."""
+        later = np.rint(drift * (self.at - self.at.mean())).astype(np.int64)
+        return replace(self, at=self.at + later)
 
     def overlapping(self, steps: IntArray) -> IntArray:
         """Those of some steps of the grid at which any movement is within odometry's time."""

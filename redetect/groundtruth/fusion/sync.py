@@ -23,7 +23,7 @@ from scipy.optimize import Bounds, minimize, minimize_scalar
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion import stream_errors
-from redetect.groundtruth.fusion.clock import ClockSegment, ClockStatus, knots_of, on_one_line
+from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, ClockStatus, on_one_line
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, best_split
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
@@ -86,7 +86,7 @@ def synchronise(
     tuple of ClockSegment
         In order. Segments without enough turns have the status `no turns`, those whose best clock
         is at a bound the status `at a bound`; both have infinite deviations and an offset
-        interpolated from the others (0 if no segment determines one). A segment in which
+        inter- or extrapolated from the others (0 if no segment determines one). A segment in which
         the clock was set is split there: its parts have the status `jump`. If one straight line
         through the session agrees with all segments, they get that line's values.
 
@@ -111,17 +111,22 @@ def synchronise(
     # Of all segments together, and of those before or after the clock was set.
     common_s = search.offset_s(parts, 0.0)
     near = replace(settings, largest_offset_s=min(settings.largest_offset_s, NEAR_S))
-    no_match = f"no offset within {settings.largest_offset_s:g} s makes odometry's movements agree"
+    no_match = (
+        f"no offset within {settings.largest_offset_s:g} s and drift within "
+        f"{settings.largest_drift:g} makes odometry's movements agree (--largest-offset-s, "
+        "--largest-drift)"
+    )
     found: list[ClockSegment] = []
-    parts, set_at_s = _parted_where_set(parts, search)
+    parts, set_at_s = _parted_where_set(parts, search, settings.largest_drift)
     for part in parts:
         around_s = search.offset_s([part], common_s)
         own = PlanarPoses(odometry.times_s - around_s, odometry.poses)
-        start_s = search.nearest_s(part, around_s) - around_s
-        for clock in _segment(own, part, near, start_s, _MOST_JUMPS):
+        best_s, drift = search.best_near(part, around_s, settings.largest_drift)
+        start = np.array([best_s - around_s, drift])
+        for clock in _segment(own, part, near, start, _MOST_JUMPS):
             clock = replace(clock, offset_s=clock.offset_s + around_s)
             here = part.only(part.during(clock.from_s, clock.to_s))
-            if clock.is_determined and not search.matches(here, clock.offset_s):
+            if clock.is_determined and not search.matches(here, clock.offset_s, clock.rate - 1.0):
                 clock = _undetermined(here, clock.turned_rad, no_match)
             beside = [at for at in set_at_s if at in (clock.from_s, clock.to_s)]
             found.append(_set_near(beside[0], clock) if beside else clock)
@@ -135,12 +140,12 @@ def synchronise(
 
 
 def _parted_where_set(
-    parts: list[PlanarPoses], search: OffsetSearch
+    parts: list[PlanarPoses], search: OffsetSearch, largest_drift: float
 ) -> tuple[list[PlanarPoses], list[float]]:
     """The parts of the ground truth, split where the clock was set by far, and the times beside."""
     found, times_s = [], []
     for part in parts:
-        at_s = search.set_at_s(part)
+        at_s = search.set_at_s(part, largest_drift)
         which = [part.times_s < at_s, part.times_s >= at_s] if at_s is not None else [slice(None)]
         halves = [part.only(one) for one in which]
         if len(halves) == 2:
@@ -150,12 +155,12 @@ def _parted_where_set(
 
 
 def _segment(
-    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start_s: float,
+    odometry: PlanarPoses, segment: PlanarPoses, bounds: SyncSettings, start: FloatArray,
     jumps_left: int,
 ) -> list[ClockSegment]:  # fmt: skip
     """One segment's clock; several parts if the clock was set within it.
 
-    `start_s`: an offset from which the refinement by whole poses also starts.
+    `start` (2,): offset at the middle (s) and drift from which the refinement starts.
     """
     # Means of ten, with less noise.
     tens = np.array_split(segment.continuous[:, 2], max(len(segment) // 10, 1))
@@ -171,15 +176,19 @@ def _segment(
     if len(measured) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
     jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
-    best = _fit_of_segment(own, jittered, start_s, bounds, measured.covariances is not None)
+    best = _fit_of_segment(own, jittered, start, bounds, measured.covariances is not None)
     if best is None:
-        return [_undetermined(segment, turned, "its turns do not determine the offset")]
+        note = f"its turns show no offset with a drift within {bounds.largest_drift:g} "
+        return [_undetermined(segment, turned, note + "(--largest-drift)")]
     # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, bounds) if jumps_left > 0 else None
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
-            parts += _segment(odometry, segment.only(which), bounds, start_s, jumps_left - 1)
+            part = segment.only(which)
+            away_s = np.mean(part.times_s) - np.mean(segment.times_s)
+            moved = np.array([start[0] + start[1] * away_s, start[1]])
+            parts += _segment(odometry, part, bounds, moved, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
     reference_s = float(np.mean(measured.times_s))
@@ -208,13 +217,16 @@ def _segment(
 
 
 def _fit_of_segment(
-    odometry: PlanarPoses, measured: PlanarPoses, start_s: float, bounds: SyncSettings, whole: bool
+    odometry: PlanarPoses,
+    measured: PlanarPoses,
+    start: FloatArray,
+    bounds: SyncSettings,
+    whole: bool,
 ) -> ClockFit | None:
     """The more certain of the clocks by headings alone and by whole poses, if these are known.
 
     None if turns do not determine the offset.
     """
-    start = np.array([start_s, 0.0])
     headings_alone = stream_errors.with_common(
         measured, np.diag([_UNKNOWN_M**2, _UNKNOWN_M**2, 0.0])
     )
@@ -226,7 +238,7 @@ def _fit_of_segment(
     if not whole or driven < _LEAST_WAY_M:
         return by_headings
     # Headings of a robot that hardly turns are a poor start.
-    far = abs(start_s - by_headings.clock[0]) > _ANOTHER_START_S
+    far = abs(start[0] - by_headings.clock[0]) > _ANOTHER_START_S
     starts = [by_headings.clock, start] if far else [by_headings.clock]
     fits = [_most_likely_clock(odometry, measured, at, bounds) for at in starts]
     maxima = [fit for fit in fits if fit is not None]
@@ -431,10 +443,16 @@ def _undetermined(segment: PlanarPoses, turned_rad: float, note: str) -> ClockSe
 
 
 def _interpolated(segments: list[ClockSegment]) -> list[ClockSegment]:
-    """Interpolate the offsets of undetermined segments from the others."""
+    """The segments, with clocks of undetermined ones from the others, as in `ClockModel`."""
     determined = [segment for segment in segments if segment.is_determined]
     if not determined:
         return segments
-    times, offsets = knots_of(determined)
-    between = np.interp([segment.reference_s for segment in segments], times, offsets).tolist()
-    return [s if s.is_determined else replace(s, offset_s=t) for s, t in zip(segments, between)]
+    model, first, last = ClockModel(tuple(determined)), determined[0], determined[-1]
+    found = []
+    for s in segments:
+        if not s.is_determined:
+            offset_s = float(model.robot_times(s.reference_s)) - s.reference_s
+            beyond = first if s.to_s <= first.from_s else last if s.from_s >= last.to_s else s
+            s = replace(s, offset_s=offset_s, rate=beyond.rate)
+        found.append(s)
+    return found

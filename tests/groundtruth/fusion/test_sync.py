@@ -50,6 +50,15 @@ def test_the_clock_comes_back_from_anywhere_within_the_bounds(offset: float, dri
     assert abs(found.offset_s - expected) < 4.0 * found.sigma_offset_s
 
 
+@pytest.mark.parametrize("drift", [-0.0095, 0.006])
+def test_a_drift_is_found_from_minutes(drift: float) -> None:
+    """Over them the offset changes by more than a second."""
+    (found,) = synchronise(*simulate(Clocks(offset_s=0.1, drift=drift, length_s=240.0), seed=4))
+    assert found.status == ClockStatus.OK
+    assert abs(found.rate - 1.0 - drift) < 2e-5
+    assert abs(found.offset_s - 0.1) < 0.003
+
+
 def test_gross_errors_of_the_ground_truth_do_not_hide_the_clock() -> None:
     clocks = Clocks(offset_s=0.4, drift=0.0)
     odometry, truth = simulate(clocks, seed=6)
@@ -157,6 +166,29 @@ def test_a_segment_without_turns_is_told_by_the_others() -> None:
     assert abs(found[1].offset_s - 0.2) < 0.003
 
 
+def test_a_segment_after_the_others_has_their_drift() -> None:
+    pieces = [
+        simulate(Clocks(offset_s=0.0, drift=2e-4, turns=turns, start_s=start, walk=0.001), seed=8)
+        for start, turns in ((0.0, True), (3600.0, False))
+    ]
+    first, last = synchronise(joined([p[0] for p in pieces]), joined([p[1] for p in pieces]))
+    assert last.status == ClockStatus.NO_TURNS
+    assert last.rate == first.rate
+    expected = first.offset_s + (first.rate - 1.0) * (last.reference_s - first.reference_s)
+    assert last.offset_s == pytest.approx(expected)
+
+
+def test_visits_without_odometry_cost_no_other_its_clock() -> None:
+    odometry, truth = simulate(Clocks(drift=0.0), seed=3)
+    away = truth.only(truth.times_s < 30.0)
+    away = PlanarPoses(away.times_s + 400.0, away.poses)
+    found = synchronise(odometry, joined([truth, away]))
+    assert [segment.status for segment in found] == ["ok", "no turns"]
+    assert found[1].note == "no odometry"
+    search = OffsetSearch(odometry, [truth, away], 60.0)
+    assert search.best_near(away, 3.0, 0.01) == (3.0, 0.0)
+
+
 @pytest.mark.parametrize("jump_s", [0.08, 0.3])
 def test_a_clock_set_within_a_segment_is_marked_and_bounded(jump_s: float) -> None:
     clocks = Clocks(offset_s=-0.1, drift=0.0, jump_at_s=25.0, jump_s=jump_s)
@@ -253,6 +285,10 @@ def test_noise_of_headings_is_told_from_turning() -> None:
     turning = 3.0 * np.sin(0.4 * times) + rng.normal(0, 0.01, len(times))
     noise = white_noise_sigmas(headings_only(times, turning))
     assert noise == pytest.approx([0.0, 0.0, 0.01], rel=0.05)
+    # At uneven times, too.
+    uneven = np.sort(rng.choice(len(times), 2000, replace=False))
+    noise = white_noise_sigmas(headings_only(times[uneven], turning[uneven]))
+    assert noise == pytest.approx([0.0, 0.0, 0.01], rel=0.1)
 
 
 def test_cuts_are_where_the_pauses_are() -> None:
@@ -298,6 +334,11 @@ def test_both_layouts_of_ptpd_are_read(tmp_path: Path) -> None:
     )
     log = read_ptpd(debug)
     np.testing.assert_allclose(log.times_s, [1235561680.5, 1235561681.5])
+    clock = tmp_path / "clock.log"
+    clock.write_text(
+        "12:34:56.789 offset from master: 0s 25000ns\n12: offset from master: 0s 1ns\n"
+    )
+    np.testing.assert_allclose(read_ptpd(clock).times_s, [np.nan, 12.0])
     np.testing.assert_allclose(log.offset_s, [25e-6, -25e-6])
     np.testing.assert_allclose(log.drift, [1.5e-6, np.nan])
 
@@ -378,6 +419,7 @@ def test_odometry_of_another_drive_is_not_synchronised() -> None:
     _, truth = simulate(Clocks(), seed=33)
     (found,) = synchronise(odometry, truth)
     assert found.status == "no turns"
+    assert "no offset with a drift within 0.01 (--largest-drift)" in found.note
     assert math.isinf(found.sigma_offset_s)
 
 
