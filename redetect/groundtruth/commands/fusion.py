@@ -12,7 +12,12 @@ from typing import Any
 import numpy as np
 
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
+from redetect.groundtruth.commands.outputs import (
+    check_outputs,
+    provenance,
+    remove_outdated,
+    warn,
+)
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion import clock, stream_errors
@@ -43,6 +48,7 @@ def perform_sync(options: Sync) -> int:
     for segment in segments:
         print(_line(segment))
     if not any(segment.is_determined for segment in segments):
+        remove_outdated([options.output], options.force)
         print("error: no segment could be synchronised: no clock file is written", file=sys.stderr)
         return EXIT_ERROR
     document: dict[str, Any] = {
@@ -94,17 +100,19 @@ def perform_fuse(options: Fuse) -> int:
             raise GroundTruthError(
                 f"{files[name]}: no covariances: expected t, x, y, theta and 9 more, as of {name}"
             )
+    inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     # Errors that the laser's poses have in common do not average out.
     common = np.zeros((3, 3))
     if options.laser is not None:
         known = stream_errors.read_common_covariance(options.laser)
         streams["laser"], common = stream_errors.without_common(streams["laser"], known)
+        beside = stream_errors.file_beside(options.laser)
+        inputs += [beside] if beside.is_file() else []
     left_out = leave_out(odometry, streams, settings) if options.leave_out else ()
     fusion = fuse(odometry, streams, settings)
     paths = (fusion.poses, fusion.filtered)
     poses, filtered = (stream_errors.with_common(path, common) for path in paths)
     fusion = replace(fusion, poses=poses, filtered=filtered)
-    inputs = [options.odometry, *files.values(), *([options.clock] if options.clock else [])]
     document = {
         **provenance(settings, inputs),
         "used": fusion.used,
@@ -145,9 +153,13 @@ def _print_summary(options: Fuse, fusion: Fusion, left_out: Sequence[LeftOut]) -
             f"{np.degrees(fusion.localisation.heading_sigma):.2f} degrees"
         )
     for segment in left_out:
+        without = f"without {segment.from_s:.1f} s to {segment.to_s:.1f} s: "
+        if segment.poses == 0:
+            print(without + "no odometry")
+            continue
         print(
-            f"without {segment.from_s:.1f} s to {segment.to_s:.1f} s: predicted to "
-            f"{segment.position_rms_m:.3f} m, {np.degrees(segment.heading_rms_rad):.2f} degrees "
+            f"{without}predicted to {segment.position_rms_m:.3f} m, "
+            f"{np.degrees(segment.heading_rms_rad):.2f} degrees "
             f"(rms; NEES {segment.normalised_error:.2f}); odometry aligned rigidly: "
             f"{segment.aligned_position_rms_m:.3f} m, "
             f"{np.degrees(segment.aligned_heading_rms_rad):.2f} degrees"

@@ -32,6 +32,13 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
             )
 
 
+def remove_outdated(paths: Sequence[Path | None], force: bool) -> None:
+    """Remove outputs of an earlier run that this one, which may replace them, does not write."""
+    for path in paths:
+        if force and path is not None and path.is_file():
+            path.unlink()
+
+
 def warn(text: str) -> None:
     """Print a warning."""
     print(f"warning: {text}", file=sys.stderr)

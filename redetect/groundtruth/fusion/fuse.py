@@ -333,7 +333,7 @@ class LeftOut:
     from_s: float  # Start of the segment
     to_s: float
     poses: int  # Number of its ground truth poses with a prediction
-    position_rms_m: float  # Root of the mean squared error of the fused path
+    position_rms_m: float  # Root of the mean squared error of the fused path; NaN without poses
     heading_rms_rad: float
     normalised_error: float  # Mean squared normalised error per number, 1 if covariances are right
     aligned_position_rms_m: float  # The same for odometry, aligned with the other segments
@@ -370,7 +370,8 @@ def leave_out(
         assert predicted.covariances is not None
         assert segment.covariances is not None
         covariances = predicted.covariances + segment.covariances[known]
-        nees = float(np.mean(squared_mahalanobis(error, covariances)) / 3.0)
+        squared = squared_mahalanobis(error, covariances)
+        nees = float(np.mean(squared) / 3.0) if len(squared) else np.nan
         beside, aligned = interpolate_poses(own, rest.times_s, _LARGEST_GAP_S)
         moved = moved_poses(own, planar_alignment(beside, rest.only(aligned)))
         rigid, known = interpolate_poses(moved, segment.times_s, _LARGEST_GAP_S)

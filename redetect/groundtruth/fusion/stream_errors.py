@@ -27,6 +27,8 @@ _MEDIAN_OF_NORMAL = 0.6745
 # Order of the differences that are compared with covariances: fifth ones cancel the motion even at
 # four poses a second, the fewest.
 _ORDER = 5
+# Of those from which the noise itself is estimated.
+_NOISE_ORDER = 3
 _LEAST_RATE_HZ = 4.0
 _FEWEST = 50
 # Differences over times longer than usual by this factor do not count.
@@ -47,11 +49,29 @@ _LEAST_OWN = 0.02
 
 def white_noise_sigmas(poses: PlanarPoses) -> FloatArray:
     """(3,) standard deviations of the noise of x, y and the heading, from third differences."""
-    third = np.diff(poses.continuous, 3, axis=0)
-    if not len(third):
+    if len(poses) <= _NOISE_ORDER:
         return np.zeros(3)
-    # Variance of a third difference of white noise: 1 + 9 + 9 + 1.
-    return np.asarray(np.median(np.abs(third), axis=0) / _MEDIAN_OF_NORMAL / np.sqrt(20.0))
+    weights = _divided_differences(poses.times_s, _NOISE_ORDER)
+    third = np.sum(weights * _neighbours(poses.continuous, _NOISE_ORDER), axis=0)
+    return np.asarray(np.median(np.abs(third), axis=0) / _MEDIAN_OF_NORMAL)
+
+
+def _divided_differences(times_s: FloatArray, order: int) -> FloatArray:
+    """(order + 1, N - order, 1) weights of neighbours in divided differences; squares add to 1.
+
+    Divided by time, differences cancel the motion at uneven times, too, such as those of cameras
+    that are not triggered together.
+    """
+    times = _neighbours(times_s, order)
+    apart = [np.prod(times[k] - np.delete(times, k, axis=0), axis=0) for k in range(order + 1)]
+    weights = 1.0 / np.stack(apart)[..., None]
+    return np.asarray(weights / np.linalg.norm(weights, axis=0))
+
+
+def _neighbours(values: FloatArray, order: int) -> FloatArray:
+    """(order + 1, N - order, ...) all rows of `order` + 1 neighbours among values (N, ...)."""
+    count = len(values) - order
+    return np.stack([values[k : k + count] for k in range(order + 1)])
 
 
 def jitter_ratio(poses: PlanarPoses) -> float:
@@ -77,20 +97,10 @@ def jitter_ratio(poses: PlanarPoses) -> float:
 
 
 def _normalised_differences(poses: PlanarPoses, variances: FloatArray) -> FloatArray:
-    """(N - 5, 3) divided differences of poses in their standard deviations, from (N, 3) variances.
-
-    Divided by time, differences cancel the motion at uneven times, too, such as those of cameras
-    that are not triggered together.
-    """
-    parts, count = range(_ORDER + 1), len(poses) - _ORDER
-    times, values, squares = (
-        np.stack([column[k : k + count] for k in parts])
-        for column in (poses.times_s, poses.continuous, variances)
-    )
-    apart = [np.prod(times[k] - np.delete(times, k, axis=0), axis=0) for k in parts]
-    weights = 1.0 / np.stack(apart)[..., None]
-    weights /= np.linalg.norm(weights, axis=0)
-    return np.asarray((weights * values).sum(axis=0) / np.sqrt((weights**2 * squares).sum(axis=0)))
+    """(N - 5, 3) divided differences of poses in their deviations, from (N, 3) variances."""
+    weights = _divided_differences(poses.times_s, _ORDER)
+    apart = np.sum(weights * _neighbours(poses.continuous, _ORDER), axis=0)
+    return np.asarray(apart / np.sqrt(np.sum(weights**2 * _neighbours(variances, _ORDER), axis=0)))
 
 
 def _gross_errors(values: FloatArray, sigmas: FloatArray) -> BoolArray:
@@ -145,11 +155,17 @@ def with_jitter_covered(poses: PlanarPoses) -> tuple[PlanarPoses, float]:
     return PlanarPoses(poses.times_s, poses.poses, factor**2 * poses.covariances), factor
 
 
+def file_beside(stream: PathLike) -> Path:
+    """The .json beside a stream, which may be packed (``.gz``)."""
+    path = Path(stream)
+    return (path.with_suffix("") if path.suffix == ".gz" else path).with_suffix(".json")
+
+
 def read_common_covariance(stream: PathLike) -> FloatArray:
     """(3, 3) covariance that is common to a stream's poses, from the .json that
     `groundtruth laser` wrote beside it; zeros if there is none.
     """
-    path = Path(stream).with_suffix(".json")
+    path = file_beside(stream)
     if path.is_file() and COMMON in (content := JsonObject.read(path)):
         return content.covariance(COMMON, 3)
     return np.zeros((3, 3))

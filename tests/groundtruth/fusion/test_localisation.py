@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -128,6 +129,17 @@ def test_each_segment_between_others_is_left_out(
     account = json.loads((tmp_path / "fused.json").read_text())
     assert len(account["left_out"]) == 1
     assert account["localisation"]["position_sigma"] > 0.0
+
+    # A segment without odometry cannot be predicted; that of a single pose can.
+    away = (odometry.times_s < 145.0) | (odometry.times_s > 175.0)
+    single = (laser.times_s < 145.0) | (laser.times_s > 175.0)
+    single[np.flatnonzero(~single)[0]] = True
+    (none,) = leave_out(odometry.only(away), {"laser": laser})
+    (one,) = leave_out(odometry, {"laser": laser.only(single)})
+    assert none.poses == 0
+    assert math.isnan(none.normalised_error)
+    assert one.poses == 1
+    assert one.position_rms_m < 1.0
 
     first = laser.times_s < 100.0
     alone = PlanarPoses(

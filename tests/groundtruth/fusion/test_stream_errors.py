@@ -88,3 +88,4 @@ def test_common_errors_are_taken_out_and_put_back(tmp_path: Path) -> None:
     assert not np.any(read_common_covariance(stream))
     stream.with_suffix(".json").write_text(json.dumps({"common_covariance": common.tolist()}))
     assert read_common_covariance(stream) == pytest.approx(common)
+    assert read_common_covariance(tmp_path / "laser.csv.gz") == pytest.approx(common)
