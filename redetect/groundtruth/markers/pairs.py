@@ -53,8 +53,9 @@ class PairConsensus:
 def pair_estimates(a: MarkerPose, b: MarkerPose) -> MarkerPose:
     """Estimates of `a_from_b` from all combinations of both markers' solutions at one time."""
     poses = se3.inverse(a.poses)[:, None] @ b.poses
-    own = se3.inverse_covariance(a.poses, a.covariances)[:, None]
-    covariances = se3.composed_covariance(own, b.poses, b.covariances)
+    moved = se3.adjoint(se3.inverse(poses))
+    own = moved @ a.covariances[:, None] @ np.swapaxes(moved, -1, -2)
+    covariances = own + b.covariances
     costs = np.add.outer(a.costs, b.costs).ravel()
     return MarkerPose(poses.reshape(-1, 4, 4), covariances.reshape(-1, 6, 6), costs)
 

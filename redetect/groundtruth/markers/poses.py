@@ -30,7 +30,7 @@ _SAME_PLACE_M = 0.005
 _FARTHEST_START_PX = 40.0
 # Number of poses by single views from which all views are fitted.
 _OWN_STARTS = 4
-# A robot outside the hall is not a solution: least squares diverged.
+# A robot farther than this from all cameras is not a solution: least squares diverged.
 _FARTHEST_M = 1e4
 
 
@@ -67,11 +67,13 @@ def solve_camera(
     normalised = camera.undistort(pixels)
     if not np.all(np.isfinite(normalised)):
         raise GeometryError("a corner lies where the lens sees nothing")
-    return _best_first(
+    found = _best_first(
         _opencv(points, normalised, solver),
         lambda pose: _rms(camera.project(se3.apply(pose, points)) - pixels),
-        f"{solver} found no pose with all points in front of the camera",
     )
+    if not found:
+        raise GeometryError(f"{solver} found no pose with all points in front of the camera")
+    return found
 
 
 def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> list[FloatArray]:
@@ -81,7 +83,8 @@ def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> li
     so there is a solution for each camera, and for `ippe` two for each marker in each image.
 
     `solver`: else as in `solve_camera`. Returns `world_from_robot`, those with the least residuals
-    over all cameras first. Solutions in which a corner is behind its camera are left out.
+    over all cameras first. Solutions in which a corner is behind its camera are left out: there may
+    be none.
     """
     if solver == "pycolmap":
         poses = _pycolmap(problem)
@@ -95,21 +98,13 @@ def solve_robot(problem: refinement.PoseProblem, solver: Solver = "sqpnp") -> li
             with suppress(GeometryError):
                 found = solve_camera(lens, problem.robot_points[chosen], pixels, solver)
                 poses += [problem.network.world_from_camera[index] @ pose for pose in found]
-    return _best_first(
-        poses,
-        lambda pose: robot_rms_px(problem, pose),
-        f"{solver} found no pose with all corners in front of their cameras",
-    )
+    return _best_first(poses, lambda pose: robot_rms_px(problem, pose))
 
 
-def _best_first(
-    poses: list[FloatArray], rms_px: Callable[[FloatArray], float], problem: str
-) -> list[FloatArray]:
-    """The poses with finite residuals, the least first; none is a problem."""
+def _best_first(poses: list[FloatArray], rms_px: Callable[[FloatArray], float]) -> list[FloatArray]:
+    """The poses with finite residuals, the least first."""
     scored = [(rms_px(pose), pose) for pose in poses]
     finite = [entry for entry in scored if np.isfinite(entry[0])]
-    if not finite:
-        raise GeometryError(problem)
     return [pose for _, pose in sorted(finite, key=lambda entry: entry[0])]
 
 
@@ -162,7 +157,7 @@ def _pycolmap(problem: refinement.PoseProblem) -> list[FloatArray]:
         chosen = problem.seen.camera == camera
         pixels[chosen] = lens.undistort(problem.seen.pixels[chosen]) * lens.scale_x
     if not np.all(np.isfinite(pixels)):
-        raise GeometryError("a corner lies where the lens sees nothing")
+        return []
     # Cameras without distortion whose pixels are about those of the images.
     kind = "SIMPLE_PINHOLE"
     pinholes = [
@@ -208,18 +203,22 @@ def estimate_pose(problem: refinement.PoseProblem) -> PoseEstimate:
     if problem.views == 0:
         raise GeometryError("no marker of the rig was seen")
     settings = problem.settings
-    found = _distinct(refinement.refined_poses(problem, _starts(problem)[:1]))
+    starts = solve_robot(problem, settings.solver)
+    found = _distinct(problem, refinement.refined_poses(problem, starts[:1]))
     # Least squares may not have reached the right minimum from the solver's start.
     if not found or np.any(_disagreeing(found[0], settings)):
-        found = _distinct(refinement.refined_poses(problem, _starts(problem) + _own_poses(problem)))
+        starts += solve_robot(problem, "ippe")[:_OWN_STARTS]
+        found = _distinct(problem, refinement.refined_poses(problem, starts))
     if found and not np.any(_disagreeing(found[0], settings)):
         views = np.ones(problem.views, dtype=np.bool_)
     else:
         views, refined = _consensus(problem)
         found = [refined]
     alone = problem.only(views)
-    starts = _starts(alone)[:1] + _mirrored(alone)
-    minima = _distinct(found + refinement.refined_poses(alone, starts))
+    starts = solve_robot(alone, settings.solver)[:1] + _mirrored(alone)
+    minima = _distinct(problem, found + refinement.refined_poses(alone, starts))
+    if not minima:
+        raise GeometryError(f"no pose within {_FARTHEST_M:g} m of a camera explains the markers")
     best = minima[0]
     # Squared residuals may be larger than their covariances imply.
     inflation = max(1.0, best.cost / max(1, best.degrees_of_freedom))
@@ -236,19 +235,6 @@ def _disagreeing(refined: refinement.RefinedPose, settings: PoseSettings) -> Boo
     return np.asarray(far & (refined.view_rms_px > settings.outlier_px))
 
 
-def _starts(problem: refinement.PoseProblem) -> list[FloatArray]:
-    try:
-        return solve_robot(problem, problem.settings.solver)
-    except GeometryError:
-        return []
-
-
-def _own_poses(problem: refinement.PoseProblem) -> list[FloatArray]:
-    """Poses by single views: those that explain all views best."""
-    poses = [pose for view in range(problem.views) for pose in view_poses(problem, view)]
-    return sorted(poses, key=lambda pose: robot_rms_px(problem, pose))[:_OWN_STARTS]
-
-
 def _mirrored(problem: refinement.PoseProblem) -> list[FloatArray]:
     """Both solutions of each camera's largest view: starts from which a mirror image is found."""
     largest = [
@@ -259,12 +245,15 @@ def _mirrored(problem: refinement.PoseProblem) -> list[FloatArray]:
     return [pose for pose in poses if robot_rms_px(problem, pose) < _FARTHEST_START_PX]
 
 
-def _distinct(minima: list[refinement.RefinedPose]) -> list[refinement.RefinedPose]:
-    """Those that differ, the best first."""
+def _distinct(
+    problem: refinement.PoseProblem, minima: list[refinement.RefinedPose]
+) -> list[refinement.RefinedPose]:
+    """Those near a camera that differ, the best first."""
+    cameras = problem.network.world_from_camera[:, :3, 3]
     kept: list[refinement.RefinedPose] = []
     for pose in sorted(minima, key=lambda pose: pose.cost):
-        near = np.abs(pose.world_from_robot).max() < _FARTHEST_M
-        if near and not any(_same(pose, other) for other in kept):
+        far_m = np.linalg.norm(cameras - pose.world_from_robot[:3, 3], axis=1).min()
+        if far_m < _FARTHEST_M and not any(_same(pose, other) for other in kept):
             kept.append(pose)
     return kept
 

@@ -116,19 +116,6 @@ def planar_covariance(world_from_robot: FloatArray, covariance: FloatArray) -> F
     return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
 
 
-def composed_covariance(
-    a_covariance: FloatArray, b_from_c: FloatArray, b_covariance: FloatArray
-) -> FloatArray:
-    """(..., 6, 6) covariance of a_from_b @ b_from_c with independent errors."""
-    return inverse_covariance(inverse(b_from_c), a_covariance) + b_covariance
-
-
-def inverse_covariance(a_from_b: FloatArray, covariance: FloatArray) -> FloatArray:
-    """(..., 6, 6) covariance of b_from_a, from that of a_from_b."""
-    moved = adjoint(a_from_b)
-    return np.asarray(moved @ covariance @ np.swapaxes(moved, -1, -2), dtype=np.float64)
-
-
 def mean_pose(
     poses: Sequence[FloatArray] | FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -148,6 +148,18 @@ def test_two_markers_that_exclude_each_other_are_no_pose() -> None:
         estimated(with_pixels(pair, pixels))
 
 
+def test_the_world_may_be_that_of_a_whole_country() -> None:
+    """Coordinates as of UTM: a hall is where its cameras are, not at the origin."""
+    there = se3.transform(np.eye(3), [450_000.0, 980_000.0, 0.0])
+    truth = planar_transform(0.2, 0.1, 0.3)
+    problem = pose_problem(truth)
+    network = dataclasses.replace(
+        problem.network, world_from_camera=there @ problem.network.world_from_camera
+    )
+    estimate = estimated(dataclasses.replace(problem, network=network))
+    assert error_of(estimate.candidates[0].world_from_robot, there @ truth) < 1e-6
+
+
 def test_nothing_seen_is_no_pose() -> None:
     problem = pose_problem(np.eye(4), cameras=1, pairs=[])
     with pytest.raises(GeometryError, match="no marker"):

@@ -17,6 +17,7 @@ from redetect.groundtruth.markers.adjustment import (
     project_chain,
     project_chain_with_jacobians,
 )
+from redetect.groundtruth.markers.pairs import MarkerPose, pair_estimates
 from redetect.groundtruth.markers.poses import solve_camera, solve_robot
 from redetect.groundtruth.markers.refinement import (
     predicted_errors,
@@ -87,23 +88,22 @@ def test_the_planes_jacobians_are_derivatives() -> None:
             np.testing.assert_allclose(numeric, to_plane[:, k], atol=1e-8)
 
 
-def test_covariances_of_composed_and_inverse_poses() -> None:
+def test_covariances_of_relative_poses() -> None:
     generator = np.random.default_rng(4)
     a, b = se3.exp(generator.normal(size=(2, 6)))
     root_a, root_b = generator.normal(0, 1e-3, (2, 6, 6))
     draws = 40000
     moved_a = a @ se3.exp(generator.normal(size=(draws, 6)) @ root_a.T)
     moved_b = b @ se3.exp(generator.normal(size=(draws, 6)) @ root_b.T)
-    for sample, expected in (
-        (
-            se3.log(se3.inverse(a @ b) @ moved_a @ moved_b),
-            se3.composed_covariance(root_a @ root_a.T, b, root_b @ root_b.T),
-        ),
-        (se3.log(a @ se3.inverse(moved_a)), se3.inverse_covariance(a, root_a @ root_a.T)),
-    ):
-        scale = np.sqrt(np.diagonal(expected))
-        empirical = np.cov(sample.T) / np.outer(scale, scale)
-        np.testing.assert_allclose(empirical, expected / np.outer(scale, scale), atol=0.03)
+    sample = se3.log(se3.inverse(b) @ a @ se3.inverse(moved_a) @ moved_b)
+    own, other = (
+        MarkerPose(pose[None], (root @ root.T)[None], np.zeros(1))
+        for pose, root in ((a, root_a), (b, root_b))
+    )
+    (expected,) = pair_estimates(own, other).covariances
+    scale = np.sqrt(np.diagonal(expected))
+    empirical = np.cov(sample.T) / np.outer(scale, scale)
+    np.testing.assert_allclose(empirical, expected / np.outer(scale, scale), atol=0.03)
 
 
 # -- exact recovery -------------------------------------------------------------------------
