@@ -265,4 +265,5 @@ def parse_numbers(
         pass
     fit = (re.fullmatch(NUMBER, w) and abs(float(w)) < below for w in words)
     wrong = next(word for word, fits in zip(words, fit) if not fits)
-    raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected {FINITE.expected}")
+    expected = FINITE.expected if below <= LARGEST_NUMBER else "a finite number"
+    raise GroundTruthError(f"{path}:{line}: {excerpt(wrong)}: expected {expected}")

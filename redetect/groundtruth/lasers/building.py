@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +62,17 @@ def read_building(path: PathLike) -> FloatArray:
     if Path(path).suffix.lower() == ".dxf":
         segments = _read_drawing(path)
     else:
-        segments = np.array([row.numbers for row in read_table(path, HEAD)])
-    if not len(segments):
-        raise GroundTruthError(f"{path}: no lines or curves: expected walls")
+        segments = np.array([row.numbers for row in read_table(path, HEAD)]).reshape(-1, 4)
     if len(segments) > MOST_SEGMENTS:
         raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
     # NaN fails this comparison too.
     if not np.all(np.abs(segments) < _FARTHEST_M):
         raise GroundTruthError(f"{path}: a wall ends {_FARTHEST_M:.0e} m or farther away")
+    # Equal neighbours occur where curves of a drawing meet, and if a line is vertical.
+    long = np.hypot(*(segments[:, 2:] - segments[:, :2]).T) > _SHORTEST_M
+    segments = np.asarray(segments[long])
+    if not len(segments):
+        raise GroundTruthError(f"{path}: no lines or curves: expected walls")
     return segments
 
 
@@ -85,9 +88,7 @@ def _read_drawing(path: PathLike) -> FloatArray:
         unit = InsertUnits(drawing.header.get("$INSUNITS", 0))
         unit_m = units.conversion_factor(unit, InsertUnits.Meters) if unit else 1.0
         for curve in _curves(path, drawing.modelspace(), CURVE_TOLERANCE_M / unit_m):
-            # Equal neighbours occur where curves meet, and if a line is vertical.
-            far = np.hypot(*np.diff(curve, axis=0).T) * unit_m > _SHORTEST_M
-            pieces += [(*a, *b) for a, b, wide in zip(curve, curve[1:], far) if wide]
+            pieces += [(*a, *b) for a, b in pairwise(curve)]
             if len(pieces) > MOST_SEGMENTS:
                 raise GroundTruthError(f"{path}: more than {MOST_SEGMENTS} walls")
     except GroundTruthError:
@@ -95,7 +96,7 @@ def _read_drawing(path: PathLike) -> FloatArray:
     except Exception as error:  # a damaged drawing may fail anywhere in the library
         text = one_line(str(error).partition("\n")[0] or type(error).__name__, 200)
         raise GroundTruthError(f"{path}: unreadable DXF: {text}") from None
-    return unit_m * np.array(pieces, dtype=np.float64)
+    return unit_m * np.array(pieces, dtype=np.float64).reshape(-1, 4)
 
 
 def _curves(

@@ -15,6 +15,8 @@ from redetect.plane import invert, rotation
 
 # Tolerance of the outline's symmetry under rotation.
 _SYMMETRY_M = 0.12
+# Faces fold back if 1 plus the cosine between their normals is smaller.
+_FOLDED = 1e-6
 
 
 def robot_body(outline: ArrayLike, outward_m: float = 0.0) -> Body:
@@ -30,7 +32,8 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     """Faces (k, 4) of a closed outline, counter-clockwise: their outward normal is to the right.
 
     `outline`: corners (k, 2) in order, in either direction (m); `outward_m`: by how much all faces
-    are moved. Raises `GroundTruthError` if corners coincide, faces cross, or there is no area.
+    are moved. Raises `GroundTruthError` if corners coincide, faces cross or fold back, or there is
+    no area.
     """
     corners = np.asarray(outline, dtype=np.float64)
     following = np.roll(corners, -1, axis=0)
@@ -44,6 +47,8 @@ def outline_faces(outline: ArrayLike, outward_m: float = 0.0) -> FloatArray:
     normals = face_normals(np.hstack([corners, np.roll(corners, -1, axis=0)]))
     before = np.roll(normals, 1, axis=0)
     shared = 1.0 + np.sum(normals * before, axis=1, keepdims=True)
+    if np.any(back := shared[:, 0] < _FOLDED):
+        raise GroundTruthError(f"outline: folds back at {corners[int(np.argmax(back))].tolist()}")
     corners = corners + outward_m * (normals + before) / shared
     faces = np.hstack([corners, np.roll(corners, -1, axis=0)])
     for i in range(len(faces)):

@@ -24,6 +24,7 @@ from redetect.array_types import FloatArray
 from redetect.bounds import ABOVE_0, FINITE, NOT_0, NotNegative, Positive, demand_fields, whole
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import JsonObject, PathLike, parse_numbers, read_rows, write_json
+from redetect.groundtruth.lasers.outline import outline_faces
 from redetect.messages import excerpt, one_line
 from redetect.storage.bounded import read_content, read_plain_array
 
@@ -150,6 +151,10 @@ def read_robot(path: PathLike) -> Robot:
     outline = content.numbers("outline", None, 2)
     if len(outline) < 3:
         raise content.wrong("outline", "three or more corners (x, y)")
+    try:
+        outline_faces(outline)
+    except GroundTruthError as error:
+        raise GroundTruthError(f"{content.place}: {error}") from None
     return Robot(
         outline,
         content.number("largest_speed_m_s", ABOVE_0),

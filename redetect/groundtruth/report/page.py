@@ -138,7 +138,7 @@ def _scanners(inputs: Inputs) -> list[Part]:
             moved = apply(fitted(places, last[:, :2]), places)
             far = 1e3 * np.hypot(*(moved - last[:, :2]).T)
             rows.append((str(step), *(f"{v:.1f}" for v in far)))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         rows = []
     if rows:
         caption = "Distance from the final position after each step, after rigid alignment (mm)"

@@ -171,6 +171,7 @@ def test_files_that_are_no_drawing_are_refused(tmp_path: Path, data: bytes) -> N
         ("1,2,3,4\n1,2,3,nan\n", ":2: "),
         ("1,2,3,4\nx1_m,y1_m,x2_m,y2_m\n", ":2: "),
         ("1,2,3,1e7\n", "farther away"),
+        ("1,2,1,2\n", "expected walls"),
     ],
 )
 def test_malformed_rows_are_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -179,6 +180,11 @@ def test_malformed_rows_are_refused(tmp_path: Path, text: str, message: str) -> 
     with pytest.raises(GroundTruthError, match=message) as error:
         read_building(path)
     assert str(path) in str(error.value)
+
+
+def test_walls_without_length_are_dropped(tmp_path: Path) -> None:
+    (tmp_path / "building.csv").write_text("0,0,4,0\n4,0,4,0\n")
+    assert read_building(tmp_path / "building.csv").tolist() == [[0.0, 0.0, 4.0, 0.0]]
 
 
 def test_the_map_of_a_session_is_found(tmp_path: Path) -> None:

@@ -45,3 +45,5 @@ def test_outlines_that_are_none() -> None:
         outline_faces([[0, 0], [0, 0], [1, 1]])
     with pytest.raises(GroundTruthError, match="encloses"):
         outline_faces([[0, 0], [1, 0], [2, 0]])
+    with pytest.raises(GroundTruthError, match=r"folds back at \[1.0, 0.0\]"):
+        outline_faces(np.array([[0, 0], [1, 0], [0.5, 0], [0.5, 1]]))

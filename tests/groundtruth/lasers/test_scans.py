@@ -178,6 +178,7 @@ def test_malformed_scanners_are_refused_by_place(
         ({"outline": [[0, 0], [1, 0]]}, "three or more corners"),
         ({"outline": [[0, 0], [1, 0], [1]]}, "outline"),
         ({"outline": None}, "outline"),
+        ({"outline": [[0, 0], [1, 0], [0.5, 0], [0.5, 1]]}, r"robot.json: outline: folds back"),
         ({"largest_speed_m_s": 0}, "above 0"),
         ({"largest_turn_rad_s": None}, "largest_turn_rad_s"),
     ],
@@ -230,6 +231,13 @@ def test_rows_in_metres_are_read(tmp_path: Path, packed: bool, numbered: bool) -
     np.testing.assert_array_equal(read.times_s, [5.25, 5.5])
     # 81.83 m is more than 65.535 m: none.
     np.testing.assert_array_equal(read.ranges_mm, [[1000, 0, 0], [2500, 3250, 65535]])
+
+
+def test_numbers_that_are_none_are_said_to_be_finite(tmp_path: Path) -> None:
+    """Readings may be larger than other numbers, as of beams without a return."""
+    (tmp_path / "a.scans.csv").write_text("1.0,3e38,1.0\n2.0,nan,1.0\n")
+    with pytest.raises(GroundTruthError, match=r"'nan': expected a finite number$"):
+        read_scans(tmp_path / "a.scans.csv")
 
 
 def test_infinite_readings_are_no_returns_but_infinite_times_are_refused(tmp_path: Path) -> None:

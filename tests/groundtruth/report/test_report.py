@@ -284,6 +284,14 @@ def test_what_cannot_be_read_is_said_and_the_rest_is_shown(
     assert main(["report", str(session), "--truth", str(session / "none.csv"), "--force"]) == 1
 
 
+def test_numbers_that_no_double_holds_are_survived(session: Path) -> None:
+    steps = {"merged": [[10**400, 0, 0]], "each to the map": [[0, 0, 0]]}
+    aligned = {"scanners": [{"name": "a"}], "steps": steps}
+    (session / "aligned.json").write_text(json.dumps(aligned))
+    page = Page(report_page(gather(session), "1.2.3"))
+    assert "after each step" not in page.text
+
+
 def test_the_same_session_gives_the_same_page(
     session: Path, unchanged: tuple[Inputs, bytes]
 ) -> None:
