@@ -11,7 +11,12 @@ import numpy as np
 from redetect.array_types import FloatArray
 from redetect.bounds import demand, whole
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
+from redetect.groundtruth.commands.outputs import (
+    check_outputs,
+    provenance,
+    remove_outdated,
+    warn,
+)
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.stream_errors import COMMON
@@ -161,6 +166,8 @@ def perform_laser(options: Laser) -> int:
     poses = tracking.combined_poses(track, average)
     if len(poses):
         write_planar_poses(output, poses, overwrite=options.force)
+    else:
+        remove_outdated([output], options.force)
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]

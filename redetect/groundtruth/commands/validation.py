@@ -14,7 +14,12 @@ import numpy as np
 
 from redetect import __version__
 from redetect.array_types import FloatArray
-from redetect.groundtruth.commands.outputs import check_outputs, provenance, warn
+from redetect.groundtruth.commands.outputs import (
+    check_outputs,
+    provenance,
+    remove_outdated,
+    warn,
+)
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
@@ -58,7 +63,11 @@ def perform_validate(options: Validate) -> int:
         clock = None if clock_path is None else read_clock(clock_path)
         files += [map_file, *scan_files, *([clock_path] if clock_path else [])]
     solved = reference_poses.poses_from_distances(survey, measured)
-    references, refused = onboard.reference_poses(solved, on_board, segments, clock)
+    near = None if segments is None else onboard.walls_in_view(segments, solved, on_board)
+    if on_board and near is not None and not len(near):
+        warn(f"no wall of {map_file} is near a reference pose: using distances only")
+        on_board = []
+    references, refused = onboard.reference_poses(solved, on_board, near, clock)
     for entry in refused:
         print(f"pose {entry.index}: {entry.status}: {entry.reason}", file=sys.stderr)
     if not references:
@@ -87,13 +96,15 @@ def perform_validate(options: Validate) -> int:
         ],
     }
     pictures = {"errors.png": draw_errors(errors, score)}
-    if segments is not None and any(r.still is not None for r in errors.references):
-        content |= _scanners_on_board(references, segments)
-        pictures["scans.png"] = draw_scans(errors, segments)
+    if near is not None and any(r.still is not None for r in errors.references):
+        content |= _scanners_on_board(references, near)
+        pictures["scans.png"] = draw_scans(errors, near)
     folder.mkdir(parents=True, exist_ok=True)
     stream = scoring.stream_of(references)
     write_planar_poses(outputs["reference.csv"], stream, overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
+    unwritten = [outputs["scans.png"]] if "scans.png" not in pictures else []
+    remove_outdated(unwritten, options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         write_bytes(outputs[name], data, overwrite=options.force)
     for line in summary_lines(references, refused, score, content["distances"]):

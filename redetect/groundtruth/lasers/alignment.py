@@ -40,8 +40,6 @@ _WEAK_M = 0.02
 _TURNS_DEG = (0.0, -2.0, 2.0, -4.0, 4.0)
 # Decrease of the share of a scan that others explain, by its pose on the map, that is noticed.
 _MUCH_WORSE = 0.1
-# Walls farther than this from what scanners see, by their measured poses, are ignored (m).
-_AROUND_M = 5.0
 # Neighbouring walls may be chords of a curve that leaves them by less than this (m).
 _MOST_BULGE_M = 0.1
 # A scanner's start on the map is found with standard deviations down to this (m).
@@ -101,8 +99,10 @@ def align_scanners(
             )
     scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
     measured = np.stack([scanner.pose for scanner in scanners])
-    reach = max(float(still.range_m.max()) for still in stills) + _AROUND_M
-    building = _walls_near(building, measured, reach)
+    reach = max(float(still.range_m.max()) for still in stills)
+    building = walls.walls_near(building, measured, reach)
+    if not len(building):
+        raise GeometryError("no wall of the map is near the scanners: expected some")
     shares, steps = _together(scans, measured, s)
     narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
     whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
@@ -141,16 +141,6 @@ def align_scanners(
     )  # fmt: skip
 
 
-def _walls_near(building: FloatArray, poses: FloatArray, reach_m: float) -> FloatArray:
-    """The walls that a scanner can see; drawings may show a whole city."""
-    low, high = poses[:, :2].min(axis=0) - reach_m, poses[:, :2].max(axis=0) + reach_m
-    ends = building.reshape(-1, 2, 2)
-    near = building[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
-    if not len(near):
-        raise GeometryError("no wall of the map is near the scanners: expected some")
-    return near
-
-
 def _together(
     scans: list[Scan], measured: FloatArray, s: AlignmentSettings
 ) -> tuple[dict[tuple[int, int], float], dict[str, FloatArray]]:
@@ -160,7 +150,7 @@ def _together(
     steps["pairs"], order = _chained(measured, pairs)
     # One scan after the other, the best overlapping first, with those merged already.
     targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
-    gates = np.geomspace(s.gate_m, 0.08, 8)
+    gates = np.geomspace(s.gate_m, min(s.gate_m, 0.08), 8)
     steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
     steps["realigned"] = together = _round(scans, steps["merged"], s)
     for _ in range(_ROUNDS):  # until no scanner moves
@@ -293,5 +283,9 @@ def icp_by_step(
     """(steps + 1,) rms distances (m) of the readings used from the map, after each step of an ICP
     of a scanner's points (n, 2) to it, from a start (3,).
     """
-    from_map = (points, building, invert(start), s.gate_m, s.keep, 0.0)
-    return np.array([fit_outline(*from_map, k)[1] for k in range(steps + 1)])
+    near = walls.walls_near(building, start[None], float(np.hypot(*points.T).max()) + s.gate_m)
+    pose, errors = invert(start), []
+    for k in range(steps + 1):
+        pose, rms, _ = fit_outline(points, near, pose, s.gate_m, s.keep, 0.0, min(k, 1))
+        errors.append(rms)
+    return np.array(errors)

@@ -44,9 +44,10 @@ _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
 _THRESHOLD_M = 1e-5
 # The robot is lost after this time without a pose, and then searched for at this interval (s).
 _COAST_S, _ACQUIRE_S = 0.25, 0.05
-# The readings identify the front if the residuals differ by this many standard errors; otherwise it
-# is known after the robot has driven this much farther forward than backward (m).
-_FRONT_SIGMA, _FORWARD_M = 5.0, 0.3
+# The readings identify the front if the residuals differ by this many standard errors, in this many
+# sets at least; otherwise it is known after the robot has driven this much farther forward than
+# backward (m).
+_FRONT_SIGMA, _FRONT_SETS, _FORWARD_M = 5.0, 5, 0.3
 # Residuals over this time show whether covariances are too small (s).
 _RESIDUALS_S = 0.48
 # Velocities are from this time before and after, at least from this number of sets; the robot is
@@ -340,8 +341,10 @@ class Tracker:
         costs = np.array([[self._cost(i, choice) for choice in choices] for i in sample.tolist()])
         best = int(np.argmin(costs.mean(axis=0)))
         worse = np.delete(costs, best, axis=1) - costs[:, best : best + 1]
-        error = worse.std(axis=0) / math.sqrt(len(sample)) + 1e-9
-        sigmas = float(np.min(worse.mean(axis=0) / error))
+        sigmas = 0.0
+        if len(sample) >= _FRONT_SETS:
+            error = worse.std(axis=0, ddof=1) / math.sqrt(len(sample)) + 1e-9
+            sigmas = float(np.min(worse.mean(axis=0) / error))
         by = f"outline, by {sigmas:.0f} sigma"
         if sigmas < _FRONT_SIGMA:
             ahead = self._ahead(rows, velocity, choices)

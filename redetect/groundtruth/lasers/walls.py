@@ -46,6 +46,8 @@ _SIGMA_PER_MEDIAN = 1.4826  # Of a normal distribution
 # Of the grid of starts: standard deviations from the measured pose, number of readings, largest
 # cost of that deviation, and the difference (m, rad) up to which poses are the same.
 _START_SIGMAS, _COARSE_READINGS, _LARGEST_PRIOR_COST, _SAME_POSE = 1.5, 240, 50.0, 2e-3
+# Walls farther than this from what scanners at their measured poses see are ignored (m).
+_AROUND_M = 5.0
 # Change of a mount (m, rad) for derivatives.
 _DIFFERENCE = 1e-5
 # Neighbouring walls are chords of a curve that leaves them by less than this (m), and turns by less
@@ -110,6 +112,14 @@ def first_walls(
     rows, first = np.arange(len(directions)), np.argmin(far, axis=1)
     cosines = np.abs(across[rows, first]) / np.hypot(*along[first].T)
     return far[rows, first], first, cosines
+
+
+def walls_near(walls: FloatArray, poses: FloatArray, reach_m: float) -> FloatArray:
+    """The walls (S, 4) that scanners at poses (N, 3) may see; drawings may show a whole city."""
+    around = reach_m + _AROUND_M
+    low, high = poses[:, :2].min(axis=0) - around, poses[:, :2].max(axis=0) + around
+    ends = walls.reshape(-1, 2, 2)
+    return walls[np.all((ends.max(axis=1) > low) & (ends.min(axis=1) < high), axis=1)]
 
 
 class WallCurves(NamedTuple):
@@ -288,7 +298,8 @@ class MapProblem(NamedTuple):
         for start in (aligned, *grid):
             with suppress(GeometryError):
                 poses, _, cost = coarse.narrowed(start[None], narrowing_m)
-                if not any(np.allclose(poses[0], other, atol=_SAME_POSE) for _, other in found):
+                off = [np.abs(pose_differences(poses[0], other)).max() for _, other in found]
+                if min(off, default=np.inf) > _SAME_POSE:
                     found.append((cost, poses[0]))
         if not found:
             raise GeometryError("hardly any readings lie on the map")

@@ -25,9 +25,11 @@ from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.walls import (
     AveragedScan,
     MapProblem,
+    WallCurves,
     averaged_scan,
     first_walls,
     wall_curves,
+    walls_near,
 )
 from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose, DistanceStatus
@@ -149,15 +151,27 @@ def reference_poses(
     """
     references: list[ReferencePose] = []
     refused: list[Refused] = []
+    curves = None if segments is None else wall_curves(segments)
     for d in distances:
         if d.status != DistanceStatus.OK:
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
-        elif onboard and segments is not None:
+        elif onboard and segments is not None and curves is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            references.append(refined_by_walls(d, averaged_scans(onboard, time), segments))
+            references.append(refined_by_walls(d, averaged_scans(onboard, time), segments, curves))
         else:
-            references.append(_unrefined(d, ScanUse.NOT_ASKED))
+            references.append(
+                _unrefined(d, ScanUse.NOT_ASKED if segments is None else ScanUse.NO_SCANS)
+            )
     return references, refused
+
+
+def walls_in_view(
+    segments: FloatArray, distances: Sequence[DistancePose], onboard: Sequence[Onboard]
+) -> FloatArray:
+    """Those walls (S, 4) that scanners on board may see from poses by distances."""
+    poses = [d.pose for d in distances if d.status == DistanceStatus.OK]
+    reach = [b.scanner.max_range_m + float(np.hypot(*b.scanner.pose[:2])) for b in onboard]
+    return walls_near(segments, np.stack(poses), max(reach)) if poses and reach else segments[:0]
 
 
 def _unrefined(
@@ -177,12 +191,12 @@ def averaged_scans(onboard: Sequence[Onboard], time_s: float) -> AveragedScans:
 
 
 def refined_by_walls(
-    distances: DistancePose, still: AveragedScans, segments: FloatArray
+    distances: DistancePose, still: AveragedScans, segments: FloatArray, curves: WallCurves
 ) -> ReferencePose:
-    """Combine a pose from distances with a fit to the walls (S, 4) (m)."""
+    """Combine a pose from distances with a fit to the walls (S, 4) (m), some of them `curves`."""
     prior, covariance = distances.pose, distances.covariance
     try:
-        free, curves = np.eye(3) / _FREE_SIGMA**2, wall_curves(segments)
+        free = np.eye(3) / _FREE_SIGMA**2
         problem = MapProblem(still.scans, prior[None], free, segments, curves, still.mounts)
         found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:

@@ -20,7 +20,7 @@ from redetect.groundtruth.lasers.scanners import (
     read_scanners,
     with_measured_noise,
 )
-from redetect.groundtruth.lasers.walls import averaged_scan
+from redetect.groundtruth.lasers.walls import MapProblem, averaged_scan, wall_curves
 from redetect.groundtruth.options import Lasers
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.landmarks import wrap_angle
@@ -318,6 +318,27 @@ def test_a_drawing_that_is_centimetres_off_is_noticed(
     _, _, fixed, _ = load_session(tmp_path, tmp_path / "aligned.json")
     assert fixed.covariance.shape == (12, 12)
     assert fixed.covariance[0, 3] != 0.0
+
+
+def test_places_alike_are_told_apart_in_the_coordinates_of_a_country() -> None:
+    """A corridor with equal recesses: three metres are three metres, far from the origin, too."""
+    along = np.array([1.0, 0.0, 1.0, 0.0])
+    recess = np.array([[0.0, 2, 1, 2], [1, 2, 1, 3], [1, 3, 2, 3], [2, 3, 2, 2], [2, 2, 3, 2]])
+    walls = np.concatenate([recess + x * along for x in np.arange(-30.0, 30.0, 3.0)])
+    walls = np.vstack([walls, [[-30.0, 0.0, 30.0, 0.0]]])
+    one = replace(
+        scanner("a", np.array([0.4, 1.0, 0.5]), 0.01, 6.0), covariance=np.diag([4.0, 0.01, 0.01])
+    )
+    seen = averaged_scan(one, ranges_mm(one, walls)[None])
+    spreads = []
+    for x in (0.0, 450_000.0):
+        pose, there = one.pose + x * np.eye(3)[0], walls + x * along
+        prior = np.asarray(np.linalg.inv(one.covariance))
+        problem = MapProblem([seen], pose[None], prior, there, wall_curves(there))
+        _, others = problem.likely_pose(pose, [0.2, 0.1, 0.05, 0.02])
+        spreads.append(others[0, 0])
+    assert spreads[0] > 1.0
+    assert spreads[1] == pytest.approx(spreads[0], rel=0.01)
 
 
 def test_an_exact_drawing_stays_exact() -> None:

@@ -356,6 +356,18 @@ def test_the_front_of_a_plain_box_shows_when_it_drives(
     assert len(combined_poses(standing)) == 0
 
 
+def test_a_single_set_does_not_show_the_front(
+    scanners: tuple[Scanner, ...], tables: FixedScanners
+) -> None:
+    """Its corners are cut by two centimetres only."""
+    cut = np.array(
+        [[-0.4, 0.3], [-0.4, -0.3], [0.28, -0.3], [0.3, -0.28], [0.3, 0.28], [0.28, 0.3]]
+    )
+    sets = one_set(scanners, circle(1.0), cut, np.random.default_rng(14))
+    track = track_by_lasers(sets, tables, Robot(cut, 1.0, 1.0))
+    assert track.status.tolist() == [SetStatus.FRONT_UNKNOWN]
+
+
 def test_a_wrong_scanner_is_marked_and_its_effect_bounded(
     scanners: tuple[Scanner, ...], recorded: ScanSets
 ) -> None:
@@ -454,6 +466,10 @@ def test_a_session_without_the_robot_gives_no_pose(
     assert perform_laser(Laser(tmp_path)) == 1
     assert "error: no pose: " in capsys.readouterr().err
     assert (tmp_path / "laser.jsonl").exists()
+    assert not (tmp_path / "laser.csv").exists()
+    # Nor does an older one stay, which would look like the result.
+    (tmp_path / "laser.csv").write_text("old\n")
+    assert perform_laser(Laser(tmp_path, force=True)) == 1
     assert not (tmp_path / "laser.csv").exists()
 
 

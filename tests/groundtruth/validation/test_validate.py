@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.cli import main
+from redetect.groundtruth.lasers.building import read_building
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -206,6 +207,10 @@ def test_without_scans_distances_alone_count(
     assert "no invertible covariance" in out
     assert main([*command, "--force", "--clock", "absent.json"]) == 1
     assert "--clock is for scans on board" in capsys.readouterr().err
+    # Nor does an older picture of scans stay beside the new results.
+    (session / "v" / "scans.png").write_bytes(b"old")
+    assert main([*command, "--force"]) == 0
+    assert not (session / "v" / "scans.png").exists()
     # Without the clock the scans are from another time, when the robot was elsewhere or unseen.
     (session / "clock.json").unlink()
     assert main(["validate", str(session), str(poses), "-o", str(session / "w")]) == 0
@@ -213,6 +218,24 @@ def test_without_scans_distances_alone_count(
     assert "no clock.json" in captured.err
     assert "0 refined by scans" in captured.out
     content = json.loads((session / "w" / "validation.json").read_text())
+    assert {row["scans"] for row in content["rows"]} == {"no scans"}
+
+
+def test_walls_elsewhere_do_not_count(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Drawings of a whole city are cut to what can be seen; one of another place is said."""
+    poses, building = session / "poses.csv", read_building(session / "building.csv")
+    write_planar_poses(poses, ground_truth(STANDS))
+    command = ["validate", str(session), str(poses), "-o", str(session / "v"), "--force"]
+    assert main(command) == 0
+    before = (session / "v" / "table.csv").read_bytes()
+    city = np.concatenate([building, building + 5000.0])
+    write_building(session / "building.csv", city, overwrite=True)
+    assert main(command) == 0
+    assert (session / "v" / "table.csv").read_bytes() == before
+    write_building(session / "building.csv", building + 5000.0, overwrite=True)
+    assert main(command) == 0
+    assert "no wall of" in capsys.readouterr().err
+    content = json.loads((session / "v" / "validation.json").read_text())
     assert {row["scans"] for row in content["rows"]} == {"no scans"}
 
 

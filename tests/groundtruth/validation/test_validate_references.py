@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.lasers.walls import wall_curves
 from redetect.groundtruth.validation.onboard import Onboard, averaged_scans, refined_by_walls
 from redetect.groundtruth.validation.reference_poses import (
     Distance,
@@ -227,7 +228,9 @@ def test_scans_make_a_pose_surer_and_its_covariance_is_right() -> None:
     for _ in range(20):
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
         prior = solved(measured(truth, survey, rng), survey)
-        refined = refined_by_walls(prior, averaged_scans(onboard(truth, ROOM, rng), 5.0), ROOM)
+        refined = refined_by_walls(
+            prior, averaged_scans(onboard(truth, ROOM, rng), 5.0), ROOM, wall_curves(ROOM)
+        )
         assert refined.scans == "used", refined.note
         error = refined.pose - truth
         error[2] = (error[2] + math.pi) % (2 * math.pi) - math.pi
@@ -244,7 +247,9 @@ def test_a_corridor_leaves_a_direction_open_and_distances_stand() -> None:
     survey = survey_of()
     truth = np.array([4.0, 1.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
-    refined = refined_by_walls(prior, averaged_scans(onboard(truth, corridor, rng), 5.0), corridor)
+    refined = refined_by_walls(
+        prior, averaged_scans(onboard(truth, corridor, rng), 5.0), corridor, wall_curves(corridor)
+    )
     assert refined.scans == "undetermined"
     np.testing.assert_array_equal(refined.pose, prior.pose)
 
@@ -255,12 +260,15 @@ def test_walls_elsewhere_disagree_and_distances_stand() -> None:
     truth = np.array([4.0, 2.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
     points = averaged_scans(onboard(truth, ROOM, rng), 5.0)
-    refined = refined_by_walls(prior, points, ROOM + np.array([0.1, 0.05, 0.1, 0.05]))
+    walls = ROOM + np.array([0.1, 0.05, 0.1, 0.05])
+    refined = refined_by_walls(prior, points, walls, wall_curves(walls))
     assert refined.scans == "disagrees"
     assert "more than the covariances allow" in refined.note
     np.testing.assert_array_equal(refined.pose, prior.pose)
     # No readings at all about the time.
-    nothing = refined_by_walls(prior, averaged_scans(onboard(truth, ROOM, rng), 99.0), ROOM)
+    nothing = refined_by_walls(
+        prior, averaged_scans(onboard(truth, ROOM, rng), 99.0), ROOM, wall_curves(ROOM)
+    )
     assert nothing.scans == "no scans"
 
 
@@ -270,11 +278,11 @@ def test_an_unsure_mount_makes_the_pose_unsure() -> None:
     truth = np.array([4.0, 2.5, 0.2])
     prior = solved(measured(truth, survey, rng), survey)
     points = averaged_scans(onboard(truth, ROOM, rng), 5.0)
-    sure = refined_by_walls(prior, points, ROOM)
+    sure = refined_by_walls(prior, points, ROOM, wall_curves(ROOM))
     sigma = np.diag([0.01, 0.01, 0.005]) ** 2
     mounted = tuple(replace(one, covariance=sigma) for one in points.scanners)
     loose = points._replace(scanners=mounted)
-    unsure = refined_by_walls(prior, loose, ROOM)
+    unsure = refined_by_walls(prior, loose, ROOM, wall_curves(ROOM))
     assert unsure.scans == "used"
     # Two mounts, each 1 cm unsure, share the pose: somewhere about 7 mm.
     assert 0.003 < math.sqrt(unsure.covariance[0, 0]) < 0.015
