@@ -113,7 +113,7 @@ class Score(Bounded, error=GroundTruthError):
 class Lasers:
     """Align the fixed laser scanners with each other and with the building.
 
-    Example: groundtruth lasers SESSION -o scanners.json
+    Example: groundtruth lasers SESSION
     """
 
     # Folder with scanners.json (poses measured by hand), the scans of the empty area and
@@ -127,7 +127,7 @@ class Lasers:
 
 
 @dataclass(frozen=True)
-class Laser:
+class Laser(Bounded, error=GroundTruthError):
     """Track the robot with the fixed laser scanners.
 
     Example: groundtruth laser SESSION -o laser.csv
@@ -138,7 +138,7 @@ class Laser:
     scanners: MaybePath = None
     # Number of sets of scans per written pose, none of which is used twice; by default those of
     # 0.08 s.
-    average: MaybeInt = None
+    average: Annotated[MaybeInt, whole(1)] = None
     # Poses to write (t, x, y, theta and 9 of covariance); by default laser.csv in the session. A
     # report on every set of scans is written to a .jsonl, settings and version to a .json beside.
     output: Annotated[MaybePath, arg(aliases=["-o"])] = None

@@ -17,7 +17,7 @@ from camera.commands.calibrate import calibration_images
 from detect.sources.interface import decode_gray
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards import BoardImage, find_boards
+from redetect.groundtruth.markers.boards import BoardImage, view_of_board
 from redetect.storage.images import read_grey, without_orientation
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -92,7 +92,7 @@ def test_a_board_is_looked_for_in_the_sensors_pixels(tmp_path: Path) -> None:
     path.write_bytes(held(jpeg, PORTRAIT))
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, (0.0,) * 5, IDENTITY)
     with pytest.raises(GroundTruthError) as refused:
-        find_boards(BoardImage("a", "b", 0, path), Board("checkerboard", 4, 5, 0.1), camera)
+        view_of_board(BoardImage("a", "b", 0, path), Board("checkerboard", 4, 5, 0.1), camera)
     # None is in it, but it has the calibration's size.
     assert "expected 32x24" not in str(refused.value)
 
@@ -166,7 +166,7 @@ def test_a_board_in_a_picture_of_ten_bits_is_found(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), picture.astype(np.uint16))
     camera = Camera(width, height, 300.0, 300.0, 80.0, 70.0, (0.0,) * 5, IDENTITY)
-    found = find_boards(BoardImage("a", "b", 0, path), Board("checkerboard", 6, 5, 0.1), camera)
+    found = view_of_board(BoardImage("a", "b", 0, path), Board("checkerboard", 6, 5, 0.1), camera)
     columns, rows = np.meshgrid(np.arange(6) * 16 + 39.5, np.arange(5) * 16 + 39.5)
     corners = np.stack([columns, rows], axis=-1).reshape(-1, 2)
     away = np.linalg.norm(found.corners[:, None] - corners, axis=-1)

@@ -293,15 +293,14 @@ def test_two_outputs_in_one_place_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_wrong_average_is_refused_before_tracking(tmp_path: Path, capsys: Captured) -> None:
-    refused(["laser", str(tmp_path), "--average", "0"], "average is 0", capsys)
-
-
-def test_settings_that_cannot_be_are_a_wrong_command_line(capsys: Captured) -> None:
+@pytest.mark.parametrize("flag", [("poses", "--outlier-sigma"), ("laser", "--average")])
+def test_settings_that_cannot_be_are_a_wrong_command_line(
+    capsys: Captured, flag: tuple[str, str]
+) -> None:
     with pytest.raises(SystemExit) as caught:
-        main(["poses", "somewhere", "--outlier-sigma", "0"])
+        main([flag[0], "somewhere", flag[1], "0"])
     assert caught.value.code == 2
-    assert "--outlier-sigma is 0" in capsys.readouterr().err
+    assert f"{flag[1]} is 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -336,7 +335,7 @@ def test_a_network_from_corners(
 ) -> None:
     views = [(view, number) for number, shot in enumerate(shots(0.1, 8)) for view in shot]
     monkeypatch.setattr(
-        "redetect.groundtruth.commands.markers.find_boards",
+        "redetect.groundtruth.commands.markers.view_of_board",
         lambda image, *_: views[int(image.image.stem)][0],
     )
     folder = tmp_path / "boards"

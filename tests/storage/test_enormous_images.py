@@ -15,7 +15,7 @@ from camera.boards.board import Board
 from detect.errors import FrameError
 from detect.sources.interface import decode_gray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.markers.boards import BoardImage, find_boards
+from redetect.groundtruth.markers.boards import BoardImage, view_of_board
 from redetect.storage.images import MOST_PIXELS, claimed_size, read_grey
 from tests.detect.runs.claimed_images import SIDE, jpeg, png
 
@@ -33,7 +33,7 @@ def test_pictures_for_calibrations_and_of_boards(
         read_grey(path, CameraError)
     board = Board("checkerboard", 5, 4, 0.1)
     with pytest.raises(GroundTruthError, match=said):
-        find_boards(BoardImage("a", "b", 0, path), board, published_camera)
+        view_of_board(BoardImage("a", "b", 0, path), board, published_camera)
 
 
 @pytest.mark.parametrize("deep", [False, True])

@@ -104,7 +104,7 @@ class LaserSessions(_Sessions):
         write_session(settings, session, seed=seed)
         exact, aligned = session / "scanners.truth.json", session / "aligned.json"
         run_program("groundtruth", "lasers", session, "-o", aligned)
-        scanners, robot, tables, sets = load_session(session, aligned)
+        scanners, robot, tables, sets, _ = load_session(session, aligned)
         rows = slice(0, 50)
         first = replace(
             sets, times_s=sets.times_s[rows], rows=sets.rows[rows], ages_s=sets.ages_s[rows]

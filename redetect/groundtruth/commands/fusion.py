@@ -12,12 +12,7 @@ from typing import Any
 import numpy as np
 
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.outputs import (
-    check_outputs,
-    provenance,
-    remove_outdated,
-    warn,
-)
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, remove_old, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion import clock, stream_errors
@@ -48,7 +43,7 @@ def perform_sync(options: Sync) -> int:
     for segment in segments:
         print(_line(segment))
     if not any(segment.is_determined for segment in segments):
-        remove_outdated([options.output], options.force)
+        remove_old([options.output], options.force)
         print("error: no segment could be synchronised: no clock file is written", file=sys.stderr)
         return EXIT_ERROR
     document: dict[str, Any] = {

@@ -9,15 +9,8 @@ from typing import Any
 import numpy as np
 
 from redetect.array_types import FloatArray
-from redetect.bounds import demand, whole
 from redetect.command_line import EXIT_ERROR
-from redetect.groundtruth.commands.outputs import (
-    check_outputs,
-    provenance,
-    remove_outdated,
-    warn,
-)
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, remove_old, warn
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.stream_errors import COMMON
 from redetect.groundtruth.lasers import scanners, tracking
@@ -144,8 +137,6 @@ def _sigmas(before: scanners.Scanner, after: scanners.Scanner) -> float:
 
 def perform_laser(options: Laser) -> int:
     """Execute the command; returns the exit code: 1 without a single pose."""
-    if options.average is not None:
-        demand(options, GroundTruthError, average=whole(1))
     output = options.output or options.session / "laser.csv"
     per_set, summary = output.with_suffix(".jsonl"), output.with_suffix(".json")
     check_outputs([output, per_set, summary], options.force)
@@ -157,7 +148,9 @@ def perform_laser(options: Laser) -> int:
             f"{calibration}; their errors are common to all poses, and do not average out in a "
             "fusion"
         )
-    scanners, robot, fixed, sets = load_session(options.session, calibration, warn)
+    scanners, robot, fixed, sets, texts = load_session(options.session, calibration)
+    for text in texts:
+        warn(text)
     warn_of_sweeps(scanners, sets, robot)
     settings = options.settings
     track, left_out = tracking.track_without_suspects(sets, fixed, robot, scanners, settings)
@@ -167,7 +160,7 @@ def perform_laser(options: Laser) -> int:
     if len(poses):
         write_planar_poses(output, poses, overwrite=options.force)
     else:
-        remove_outdated([output], options.force)
+        remove_old([output], options.force)
     write_bytes(per_set, ("\n".join(set_lines(track)) + "\n").encode(), overwrite=options.force)
     described = describe(track, scanners, left_out)
     files = [calibration, options.session / "robot.json"]
@@ -234,7 +227,7 @@ def set_lines(track: tracking.LaserTrack) -> list[str]:
     for i, status in enumerate(map(SetStatus, track.status.tolist())):
         line: dict[str, Any] = {"t": round(float(track.times_s[i]), 6), "status": status.words}
         if status != SetStatus.LOST:
-            line["visit"] = int(track.segment[i])
+            line["visit"] = int(track.visit[i])
         if status not in (SetStatus.LOST, SetStatus.COASTING):
             beams = {name: int(n) for name, n in zip(BeamCounts._fields, track.beams[i])}
             line["readings"] = int(track.readings[i])
@@ -243,7 +236,7 @@ def set_lines(track: tracking.LaserTrack) -> list[str]:
             line["beams"] = beams
             line["disturbed"] = beams["hidden"] + beams["beside"] >= _DISTURBED
         if status == SetStatus.UNDETERMINED_DIRECTION:
-            line["direction"] = [round(float(v), 4) for v in track.weak[i]]
+            line["direction"] = [round(float(v), 4) for v in track.weakest[i]]
         if i in track.reasons and status == SetStatus.COASTING:
             line["reason"] = track.reasons[i]
         lines.append(json_text(line, indent=None))
@@ -255,9 +248,9 @@ def describe(
 ) -> dict[str, Any]:
     """Sets by status, visits and how their front was found, and the residuals of scanners."""
     segments = []
-    for segment, front in sorted(track.fronts.items()):
-        times = track.times_s[track.segment == segment].tolist()
-        segments.append({"visit": segment, "from_s": times[0], "to_s": times[-1], "front": front})
+    for visit, front in sorted(track.fronts.items()):
+        times = track.times_s[track.visit == visit].tolist()
+        segments.append({"visit": visit, "from_s": times[0], "to_s": times[-1], "front": front})
     entries = []
     excess = tracking.excess_shifts(track, scanners)
     for k, scanner in enumerate(scanners):

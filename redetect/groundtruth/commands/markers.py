@@ -15,7 +15,12 @@ from redetect.bounds import demand
 from redetect.groundtruth.commands import outputs
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers import session
-from redetect.groundtruth.markers.boards import BoardView, calibration_of, find_boards, read_boards
+from redetect.groundtruth.markers.boards import (
+    BoardView,
+    calibration_of,
+    read_boards,
+    view_of_board,
+)
 from redetect.groundtruth.markers.network_estimation import estimate_network
 from redetect.groundtruth.markers.rig_estimation import estimate_rig
 from redetect.groundtruth.options import Network, Rig
@@ -36,7 +41,7 @@ def perform_network(command: Network) -> int:
     shots: dict[int, list[BoardView]] = {}
     for image in outputs.progress(boards.images, "boards"):
         try:
-            view = find_boards(image, boards.boards[image.board], boards.cameras[image.camera])
+            view = view_of_board(image, boards.boards[image.board], boards.cameras[image.camera])
             shots.setdefault(image.placement, []).append(view)
         except GroundTruthError as error:
             print(f"left out: {error}", file=sys.stderr)

@@ -32,7 +32,7 @@ def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
             )
 
 
-def remove_outdated(paths: Sequence[Path | None], force: bool) -> None:
+def remove_old(paths: Sequence[Path | None], force: bool) -> None:
     """Remove outputs of an earlier run that this one, which may replace them, does not write."""
     for path in paths:
         if force and path is not None and path.is_file():

@@ -60,7 +60,7 @@ def perform(command: Poses) -> int:
         lines = [f"{json_text(report_entry(t, network), indent=None)}\n" for t in track.times]
         write_bytes(command.report, "".join(lines).encode(), overwrite=command.force)
     if not len(poses):
-        outputs.remove_outdated([output, settings_path, command.tum], command.force)
+        outputs.remove_old([output, settings_path, command.tum], command.force)
         print("error: no pose", file=sys.stderr)
         return EXIT_ERROR
     print(f"squared residuals per degree of freedom: {track.chi2_per_dof:.2f}")

@@ -14,12 +14,7 @@ import numpy as np
 
 from redetect import __version__
 from redetect.array_types import FloatArray
-from redetect.groundtruth.commands.outputs import (
-    check_outputs,
-    provenance,
-    remove_outdated,
-    warn,
-)
+from redetect.groundtruth.commands.outputs import check_outputs, provenance, remove_old, warn
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
@@ -96,7 +91,7 @@ def perform_validate(options: Validate) -> int:
         ],
     }
     pictures = {"errors.png": draw_errors(errors, score)}
-    if near is not None and any(r.still is not None for r in errors.references):
+    if near is not None and any(r.averaged is not None for r in errors.references):
         content |= _scanners_on_board(references, near)
         pictures["scans.png"] = draw_scans(errors, near)
     folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +99,7 @@ def perform_validate(options: Validate) -> int:
     write_planar_poses(outputs["reference.csv"], stream, overwrite=options.force)
     write_json(outputs["validation.json"], content, overwrite=options.force)
     unwritten = [outputs["scans.png"]] if "scans.png" not in pictures else []
-    remove_outdated(unwritten, options.force)
+    remove_old(unwritten, options.force)
     for name, data in (("table.csv", _table_text(rows).encode()), *pictures.items()):
         write_bytes(outputs[name], data, overwrite=options.force)
     for line in summary_lines(references, refused, score, content["distances"]):
@@ -131,7 +126,7 @@ def _scanners_on_board(
             {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
             for s, m, e in zip(found.scanners, found.poses, sigma)
         ]
-        on_board = next(r.still.scanners for r in references if r.still is not None)
+        on_board = next(r.averaged.scanners for r in references if r.averaged is not None)
         for scanner in on_board:
             if scanner not in found.scanners:
                 warn(f"scanner {scanner.name}: no readings of walls: its mount is not refined")

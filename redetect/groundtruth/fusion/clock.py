@@ -32,7 +32,7 @@ from redetect.storage.bounded import read_content
 
 #: A rate is nearly 1, which is above 0.5 and below 1.5; times are seconds since 1970 at most.
 _RATE, _SECONDS, _SIGMA = inside(0.5, 1.5), from_to(-1e15, 1e15), NOT_NEGATIVE
-# Probability that segments of one line pass the test whether they are.
+# Confidence level of the chi-square test that all segments lie on one line.
 _AGREEMENT = 0.999
 _LARGEST_FILE_BYTES = 1 << 28
 # Messages, column and times in logs of ptpd.
@@ -61,7 +61,7 @@ class ClockStatus(StrEnum):
     OK = "ok"
     NO_TURNS = "no turns"  #: It cannot be synchronised: its numbers follow from the others
     JUMP = "jump"  #: Its two halves disagree, since a clock was set
-    AT_A_BOUND = "at a bound"  #: The same, since the optimum is at a limit of the search range
+    AT_A_BOUND = "at a bound"  #: Not synchronised either: the optimum is at a limit of the search
 
 
 @dataclass(frozen=True)
@@ -218,10 +218,10 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     covariance = np.linalg.inv(design.T @ design)
     line = covariance @ design.T @ target
     squared = float(np.sum((target - design @ line) ** 2))
-    freedom = len(rows) - 2
-    if squared > chdtri(freedom, 1.0 - _AGREEMENT):
+    dof = len(rows) - 2
+    if squared > chdtri(dof, 1.0 - _AGREEMENT):
         return list(segments)
-    note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {freedom}"
+    note = f"one line through {len(determined)} segments: chi2 {squared:.1f} of {dof}"
     result = []
     for segment in segments:
         at = np.array([1.0, segment.reference_s - middle])

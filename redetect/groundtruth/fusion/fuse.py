@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -169,17 +168,16 @@ def wrong_starts(problem: MovementProblem) -> FloatArray:
     """
     squared, times_s = np.zeros(len(problem.streams)), problem.measured_s
     noise, every = noise_of(problem.settings), np.arange(len(times_s))
-    starts = [0, *(np.flatnonzero(np.diff(times_s) > UNMEASURED_S) + 1), len(times_s)]
-    for start, end in pairwise(starts):
-        for first in range(start, min(start + _MOST_WRONG, end - _FEWEST_JUDGES)):
-            judged = (every >= first) & (every <= min(first + _MOST_JUDGES, end - 1))
+    for run in segments_between_gaps(times_s, UNMEASURED_S):
+        for first in range(run.start, min(run.start + _MOST_WRONG, run.stop - _FEWEST_JUDGES)):
+            judged = (every >= first) & (every <= min(first + _MOST_JUDGES, run.stop - 1))
             (part,) = problem.with_only(judged).split(math.inf)
             found = part.innovations(noise)
             if np.mean(found.accepted[1:]) > 0.5:
                 break
             squared[first] = np.median(found.squared[1:])
         else:
-            squared[start:end] = 0.0  # Those after them do not agree either.
+            squared[run] = 0.0  # Those after them do not agree either.
     return squared
 
 

@@ -11,6 +11,9 @@ t - 1/2 of the arc moves the end by
 
 of which `arc_integrals` gives means and variances over t from -1/2 to 1/2. (The covariance of both
 parts is zero, one being odd and the other even.)
+
+The state: x, y (m) and heading (rad); of odometry the relative excess of true turns, the turn that
+it misses per metre (rad), and the relative excess of true distances.
 """
 
 from __future__ import annotations
@@ -72,12 +75,12 @@ def predict(
 ) -> None:
     """Propagate a state and its covariance by a movement of odometry, in place.
 
-    `x`, `p` (6,), (6, 6): state (see `redetect.groundtruth.fusion.kernels`) and covariance;
-    replaced. `f` (6, 6): identity on the first call; becomes the derivative of the new state by the
-    old one. `control` (4,): distance forward, distance to the left (m) and turn (rad), accumulated
-    over the movement in the robot's own, turning frame; and the part of the turn to which the turn
-    scale applies. `variances` (3,): accumulated noise along the path, across it (m^2) and of the
-    turn (rad^2). `point` (6,): the state at which the movement is linearised.
+    `x`, `p` (6,), (6, 6): state and covariance; replaced. `f` (6, 6): identity on the first
+    call; becomes the derivative of the new state by the old one. `control` (4,): distance forward,
+    distance to the left (m) and turn (rad), accumulated over the movement in the robot's own,
+    turning frame; and the part of the turn to which the turn scale applies.
+    `variances` (3,): accumulated noise along the path, across it (m^2) and of the turn (rad^2).
+    `point` (6,): the state at which the movement is linearised.
     """
     distance = math.sqrt(control[0] * control[0] + control[1] * control[1])
     turn, distinct = control[2], control[3]

@@ -1,7 +1,7 @@
 """Odometry from a localisation: a rigid motion plus stationary errors, without drift.
 
 A localisation in a map, or a path with closed loops, does not drift as wheels do. Its poses are
-those of the ground truth after a rigid motion, for another point on the robot, plus stationary
+those of the ground truth after a rigid motion and with a lever arm on the robot, plus stationary
 errors: an Ornstein-Uhlenbeck process for x, y and the heading, each with a deviation and a
 correlation time (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, appendix
 B). The process is Markov: in a gap between measurements the errors depend only on those at its two
@@ -43,9 +43,9 @@ _MOST_TO_LEARN_FROM = 500
 # determine, and the deviation of their logarithms.
 _POSITION_CORRELATION_S, _HEADING_CORRELATION_S = 10.0, 2.0
 _LOG_CORRELATION_SIGMA = 0.7
-# Prior deviation of the motion (m, rad), and those of the point on the robot (m): the same point as
-# the ground truth's, or another.
-_LEVEL_SIGMA, _POINT_SIGMAS = 10.0, (1e-6, 0.2)
+# Prior deviation of the motion (m, rad), and those of the lever arm on the robot (m), from its
+# point to that of the ground truth: none, or one.
+_LEVEL_SIGMA, _LEVER_ARM_SIGMAS = 10.0, (1e-6, 0.2)
 # Differences this many times the median are gross errors, of which there is one in 10000, anywhere
 # within 10 m by 10 m.
 _USUAL = 6.0
@@ -62,8 +62,8 @@ class LocalisationErrors:
     position_correlation_s: float  # Time after which the correlation is 1/e
     heading_correlation_s: float
     heading_offset: float  # Heading of the ground truth minus that of the localisation (rad)
-    # Forward and left from the localisation's point on the robot to that of the ground truth (m). A
-    # clock with a constant error looks like a distance forward.
+    # Lever arm, forward and left: from the localisation's point on the robot to that of the ground
+    # truth (m). A clock with a constant error looks like a distance forward.
     forward_m: float
     left_m: float
 
@@ -93,13 +93,13 @@ def as_localisation(
     errors = pose_differences(measured.poses[usual], there)
     variances = np.diagonal(thin.measured.covariances[usual], axis1=1, axis2=2)
     centre = there[:, :2].mean(axis=0)
-    design, motion_priors = _by_motion_and_point(there, centre), np.full(POSE, _LEVEL_SIGMA)
+    design, motion_priors = _by_motion_and_lever_arm(there, centre), np.full(POSE, _LEVEL_SIGMA)
     variance = np.mean(variances[:, :2], axis=1)
-    # Another point on the robot only if the measurements say so.
+    # A lever arm only if the measurements say so.
     position = min(
         (
             _stationary(times_s, errors[:, :2], variance, design, priors, _POSITION_CORRELATION_S)
-            for priors in (np.append(motion_priors, [point] * 2) for point in _POINT_SIGMAS)
+            for priors in (np.append(motion_priors, [arm] * 2) for arm in _LEVER_ARM_SIGMAS)
         ),
         key=lambda found: found.deviance,
     )
@@ -116,7 +116,7 @@ def as_localisation(
     if not deviance < sum(by_movements):
         return None
     aligned = moved_poses(odometry, motion)
-    design = _by_motion_and_point(aligned.poses, centre)
+    design = _by_motion_and_lever_arm(aligned.poses, centre)
     aligned.poses[:, :2] += design @ position.mean
     aligned.poses[:, 2] += heading.mean
     spread = np.zeros((len(aligned), POSE, POSE))
@@ -150,9 +150,9 @@ def _trimmed_alignment(
     return motion, usual
 
 
-def _by_motion_and_point(poses: FloatArray, centre: FloatArray) -> FloatArray:
+def _by_motion_and_lever_arm(poses: FloatArray, centre: FloatArray) -> FloatArray:
     """(M, 2, 5) derivatives of the positions of poses (M, 3) by a motion x, y, theta about a centre
-    (2,), and by another point on the robot, forward and to the left.
+    (2,), and by the lever arm on the robot, forward and to the left.
     """
     derivatives = np.zeros((len(poses), 2, POSE + 2))
     derivatives[:, :, :2] = np.eye(2)

@@ -7,7 +7,7 @@ from every heading.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -166,12 +166,13 @@ def sets_of_scans(scans: Sequence[Scans]) -> ScanSets:
 
 
 def load_session(
-    folder: Path, calibration: Path, warn: Callable[[str], object] = str
-) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets]:
+    folder: Path, calibration: Path
+) -> tuple[tuple[Scanner, ...], Robot, FixedScanners, ScanSets, list[str]]:
     """Read fixed scanners, robot and scans, and learn the background.
 
-    Scanners whose readings of the empty area scatter far more than stated get that noise, and are
-    warned of. Raises `GroundTruthError` if a file is missing or does not fit the others.
+    Scanners whose readings of the empty area scatter far more than stated get that noise; the last
+    result is what to say about these. Raises `GroundTruthError` if a file is missing or does not
+    fit the others.
     """
     content = JsonObject.read(calibration)
     scanners, joint = scanners_in(content), None
@@ -183,9 +184,7 @@ def load_session(
         for place in (folder / "empty", folder)
     )
     scanners, texts = with_measured_noise(scanners, empties, calibration)
-    for text in texts:
-        warn(text)
-    return scanners, robot, fixed_scanners(scanners, empties, joint), sets_of_scans(scans)
+    return scanners, robot, fixed_scanners(scanners, empties, joint), sets_of_scans(scans), texts
 
 
 def acquire(
@@ -253,7 +252,7 @@ def _search(
             continue
         tried.append(pose)
         refined = refine_outline(seen, body, pose, fixed, settings.gate_m, 0.1)
-        if refined.used < _ACQUIRED_READINGS or refined.open_directions:
+        if refined.used < _ACQUIRED_READINGS or refined.undetermined_directions:
             continue
         if refined.chi2 > _LARGEST_CHI2 * (refined.used - 3.0):
             continue

@@ -20,7 +20,13 @@ from scipy.linalg import block_diag
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.lasers import walls
-from redetect.groundtruth.lasers.icp import Scan, align_scans, explained, fit_outline, scan_normals
+from redetect.groundtruth.lasers.icp import (
+    Scan,
+    align_scans,
+    fit_outline,
+    overlap_score,
+    scan_normals,
+)
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.settings import AlignmentSettings
 from redetect.plane import apply, between, compose, fitted, invert
@@ -70,7 +76,7 @@ def align_scanners(
     scanners: Sequence[Scanner],
     empties: Sequence[Scans],
     building: FloatArray,
-    s: AlignmentSettings = _DEFAULT,
+    settings: AlignmentSettings = _DEFAULT,
 ) -> Alignment:
     """Align fixed scanners with each other and with the building.
 
@@ -82,6 +88,8 @@ def align_scanners(
         Scans of the empty area, one for each scanner.
     building : (k, 4) float64
         The map's walls x1, y1, x2, y2 (m).
+    settings : AlignmentSettings
+        The gate, and the share of matches that are used.
 
     Raises
     ------
@@ -90,45 +98,45 @@ def align_scanners(
     GeometryError
         If too few of a scanner's readings are within the gate of the map.
     """
-    stills = [walls.averaged_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
-    for scanner, still in zip(scanners, stills):
-        if len(still.range_m) < 10:
+    averaged = [walls.averaged_scan(a, b.ranges_mm) for a, b in zip(scanners, empties)]
+    for scanner, scan in zip(scanners, averaged):
+        if len(scan.range_m) < 10:
             raise GroundTruthError(
-                f"scanner {scanner.name}: {len(still.range_m)} beams see something in the empty "
+                f"scanner {scanner.name}: {len(scan.range_m)} beams see something in the empty "
                 "area: expected 10 or more"
             )
-    scans = [Scan(still.points, scan_normals(still.points, *_NORMALS)) for still in stills]
+    scans = [Scan(one.points, scan_normals(one.points, *_NORMALS)) for one in averaged]
     measured = np.stack([scanner.pose for scanner in scanners])
-    reach = max(float(still.range_m.max()) for still in stills)
+    reach = max(float(one.range_m.max()) for one in averaged)
     building = walls.walls_near(building, measured, reach)
     if not len(building):
         raise GeometryError("no wall of the map is near the scanners: expected some")
-    shares, steps = _together(scans, measured, s)
-    narrowing = [n for n in _NARROWING_M if n <= s.gate_m] or [s.gate_m]
-    whole, curves = _whole_to_map(stills, steps["together"], measured, building, narrowing)
+    shares, steps = _together(scans, measured, settings)
+    narrowing = [n for n in _NARROWING_M if n <= settings.gate_m] or [settings.gate_m]
+    whole, curves = _whole_to_map(averaged, steps["together"], measured, building, narrowing)
     steps["map as a whole"] = whole
     priors = [_prior(scanner) for scanner in scanners]
     coarse = [n for n in narrowing if n >= _COARSE_M] or narrowing
     starts, others = [], []
-    for one, still, pose, prior in zip(scanners, stills, whole, priors):
+    for one, scan, pose, prior in zip(scanners, averaged, whole, priors):
         try:
-            lone = walls.MapProblem([still], one.pose[None], prior, building, curves)
+            lone = walls.MapProblem([scan], one.pose[None], prior, building, curves)
             start, other = lone.likely_pose(pose, coarse)
         except GeometryError as error:
             raise GeometryError(f"scanner {one.name}: {error}") from None
         starts.append(start)
         others.append(other)
-    problem = walls.MapProblem(stills, measured, block_diag(*priors), building, curves)
+    problem = walls.MapProblem(averaged, measured, block_diag(*priors), building, curves)
     fit = problem.fit(np.stack(starts), narrowing, _WEAK_M)
     steps["each to the map"] = fit.poses
     covariance = fit.covariance + block_diag(*others)
     blocks = [covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(scanners))]
     elsewhere = np.array([np.trace(other[:2, :2]) for other in others]) > _WEAK_M**2
-    is_open = (fit.open_directions > 0) | elsewhere
+    is_undetermined = (fit.undetermined_directions > 0) | elsewhere
     wrong = [_contradicts(scans, fit.poses, steps["together"], k) for k in range(len(scanners))]
     undetermined, inconsistent = (
         tuple(one.name for one, noted in zip(scanners, which) if noted)
-        for which in (is_open, wrong)
+        for which in (is_undetermined, wrong)
     )
     placed = tuple(
         replace(scanner, pose=pose, covariance=block)
@@ -142,19 +150,19 @@ def align_scanners(
 
 
 def _together(
-    scans: list[Scan], measured: FloatArray, s: AlignmentSettings
+    scans: list[Scan], measured: FloatArray, settings: AlignmentSettings
 ) -> tuple[dict[tuple[int, int], float], dict[str, FloatArray]]:
     """Align scans with each other: overlaps of pairs, and the poses after each step."""
     steps: dict[str, FloatArray] = {}
-    pairs = _pairs(scans, measured, s)
+    pairs = _pairs(scans, measured, settings)
     steps["pairs"], order = _chained(measured, pairs)
     # One scan after the other, the best overlapping first, with those merged already.
     targets = [(k, order[:i]) for i, k in enumerate(order)][1:]
-    gates = np.geomspace(s.gate_m, min(s.gate_m, 0.08), 8)
-    steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, s.keep)
-    steps["realigned"] = together = _round(scans, steps["merged"], s)
+    gates = np.geomspace(settings.gate_m, min(settings.gate_m, 0.08), 8)
+    steps["merged"] = _realigned(scans, steps["pairs"], targets, gates, settings.keep)
+    steps["realigned"] = together = _round(scans, steps["merged"], settings)
     for _ in range(_ROUNDS):  # until no scanner moves
-        before, together = together, _round(scans, together, s)
+        before, together = together, _round(scans, together, settings)
         if np.abs(together - before).max() < 1e-5:
             break
     shares = {pair: found.share for pair, found in pairs.items()}
@@ -174,7 +182,7 @@ def _contradicts(scans: list[Scan], poses: FloatArray, aligned: FloatArray, k: i
     if not others:
         return False
     on_map, best = (
-        explained(scans[k].points, _merge(scans, where, others), where[k], _JUDGED_M)
+        overlap_score(scans[k].points, _merge(scans, where, others), where[k], _JUDGED_M)
         for where in (poses, aligned)
     )
     return best - on_map > _MUCH_WORSE
@@ -188,20 +196,20 @@ class _AlignedPair(NamedTuple):
 
 
 def _pairs(
-    scans: list[Scan], measured: FloatArray, s: AlignmentSettings
+    scans: list[Scan], measured: FloatArray, settings: AlignmentSettings
 ) -> dict[tuple[int, int], _AlignedPair]:
     """ICP of every pair from the measured poses."""
     found: dict[tuple[int, int], _AlignedPair] = {}
-    gates = np.geomspace(max(2.0 * s.gate_m, 0.1), 0.1, 12)
+    gates = np.geomspace(max(2.0 * settings.gate_m, 0.1), 0.1, 12)
     for i, j in combinations(range(len(scans)), 2):
         apart = between(measured[i], measured[j])
         target, points = scans[i], scans[j].points
         tried = [_AlignedPair(0.0, apart)]
         for turn in np.radians(_TURNS_DEG):
             start = apart + np.array([0.0, 0.0, turn])
-            pose = align_scans(points, target, start, gates, s.keep, 1e-6)
+            pose = align_scans(points, target, start, gates, settings.keep, 1e-6)
             if np.isfinite(pose).all():
-                tried.append(_AlignedPair(explained(points, target, pose, _JUDGED_M), pose))
+                tried.append(_AlignedPair(overlap_score(points, target, pose, _JUDGED_M), pose))
         found[i, j] = max(tried, key=lambda pair: pair.share)
     return found
 
@@ -243,15 +251,15 @@ def _realigned(
     return poses
 
 
-def _round(scans: list[Scan], poses: FloatArray, s: AlignmentSettings) -> FloatArray:
+def _round(scans: list[Scan], poses: FloatArray, settings: AlignmentSettings) -> FloatArray:
     """Align each scanner but the first again with the merged scans of all others."""
     count = len(scans)
     targets = ((k, [m for m in range(count) if m != k]) for k in range(1, count))
-    return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), s.keep)
+    return _realigned(scans, poses, targets, np.geomspace(0.15, 0.06, 4), settings.keep)
 
 
 def _whole_to_map(
-    stills: list[walls.AveragedScan],
+    averaged: list[walls.AveragedScan],
     poses: FloatArray,
     measured: FloatArray,
     building: FloatArray,
@@ -269,7 +277,7 @@ def _whole_to_map(
     start, least = body[None], inf
     curves = walls.wall_curves(building)
     for tried in (curves, walls.wall_curves(building, _MOST_BULGE_M)):
-        problem = walls.MapProblem(stills, start, prior, building, tried, poses)
+        problem = walls.MapProblem(averaged, start, prior, building, tried, poses)
         with suppress(GeometryError):  # then each scanner is searched around its measured pose
             found, _, cost = problem.narrowed(start, narrowing_m)
             if cost < least:
@@ -278,14 +286,16 @@ def _whole_to_map(
 
 
 def icp_by_step(
-    points: FloatArray, building: FloatArray, start: FloatArray, s: AlignmentSettings, steps: int
-) -> FloatArray:
+    points: FloatArray, building: FloatArray, start: FloatArray, settings: AlignmentSettings,
+    steps: int,
+) -> FloatArray:  # fmt: skip
     """(steps + 1,) rms distances (m) of the readings used from the map, after each step of an ICP
     of a scanner's points (n, 2) to it, from a start (3,).
     """
-    near = walls.walls_near(building, start[None], float(np.hypot(*points.T).max()) + s.gate_m)
-    pose, errors = invert(start), []
+    gate_m, keep = settings.gate_m, settings.keep
+    reach_m = float(np.hypot(*points.T).max()) + gate_m
+    near, pose, errors = walls.walls_near(building, start[None], reach_m), invert(start), []
     for k in range(steps + 1):
-        pose, rms, _ = fit_outline(points, near, pose, s.gate_m, s.keep, 0.0, min(k, 1))
+        pose, rms, _ = fit_outline(points, near, pose, gate_m, keep, 0.0, min(k, 1))
         errors.append(rms)
     return np.array(errors)

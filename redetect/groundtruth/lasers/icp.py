@@ -120,7 +120,7 @@ def align_scans(
     return pose
 
 
-def explained(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float) -> float:
+def overlap_score(points: FloatArray, target: Scan, pose: FloatArray, sigma_m: float) -> float:
     """How well a pose explains both scans: mean over all points of exp(-d^2 / 2 sigma^2).
 
     d is the distance to the nearest point of the other scan. Both directions count; otherwise a

@@ -93,7 +93,7 @@ class LaserTrack:
 
     times_s: FloatArray  # (N,)
     status: IntArray  # (N,): of `SetStatus`
-    segment: IntArray  # (N,): number of the set's acquisition; -1 if the robot is lost
+    visit: IntArray  # (N,): number of the set's acquisition; -1 if the robot is lost
     poses: FloatArray  # (N, 3): x, y (m), theta (rad); NaN without a pose.
     covariances: FloatArray  # (N, 3, 3): from the readings' noise and the scanners' poses
     noise: FloatArray  # (N, 3, 3): the part from the readings' noise, independent from set to set
@@ -102,11 +102,11 @@ class LaserTrack:
     rms_m: FloatArray  # (N,): their root mean square distance from the outline
     chi2_per_dof: FloatArray  # (N,): their squared normalised residuals per degree of freedom
     beams: FloatArray  # (N, 6): as in `BeamCounts`
-    weak: FloatArray  # (N, 3): least determined direction of x, y, theta times the radius
+    weakest: FloatArray  # (N, 3): least determined direction of x, y, theta times the radius
     reasons: dict[int, str]  # Why a set has no pose, where the robot was expected
     corrections: FloatArray  # (scanners, 3): of their poses, as their residuals suggest
     correction_sigma: FloatArray  # (scanners, 3)
-    fronts: dict[int, str]  # How the front was found, by segment
+    fronts: dict[int, str]  # How the front was found, by visit
     outline_moved_m: float = 0.0  # By how much its faces were moved outward to fit (m)
     # Standard deviation of its faces from the readings (m), where it is noticed; else 0
     outline_sigma_m: float = 0.0
@@ -135,11 +135,11 @@ class Tracker:
         n, scanners = len(sets), len(fixed.origins)
         self.track = LaserTrack(
             sets.times_s,
-            status=np.full(n, SetStatus.LOST), segment=np.full(n, -1),
+            status=np.full(n, SetStatus.LOST), visit=np.full(n, -1),
             poses=np.full((n, 3), np.nan), covariances=np.full((n, 3, 3), np.nan),
             noise=np.full((n, 3, 3), np.nan), motion=np.zeros((n, 3)),
             readings=np.zeros(n, dtype=np.int64), rms_m=np.full(n, np.nan),
-            chi2_per_dof=np.full(n, np.nan), beams=np.zeros((n, 6)), weak=np.zeros((n, 3)),
+            chi2_per_dof=np.full(n, np.nan), beams=np.zeros((n, 6)), weakest=np.zeros((n, 3)),
             reasons={},
             corrections=np.full((scanners, 3), np.nan),
             correction_sigma=np.full((scanners, 3), np.nan), fronts={},
@@ -153,7 +153,7 @@ class Tracker:
         # Times of the last set, the last pose, the last one determined in all directions, and the
         # last search.
         before_s = posed_s = determined_s = searched_s = -math.inf
-        segment, begun, tracked = -1, 0, False
+        visit, begun, tracked = -1, 0, False
         coast_s = max(_COAST_S, _COASTED_SETS * _interval_s(self.sets.times_s))
         for i, t in enumerate(self.sets.times_s.tolist()):
             tracked = tracked and t - posed_s <= coast_s
@@ -169,13 +169,13 @@ class Tracker:
                     pose, motion = self._fit(i, found, np.zeros(3), 0.0), np.zeros(3)
                     if self.track.status[i] == SetStatus.OK:
                         self.track.status[i] = SetStatus.REACQUIRED
-                    segment, begun, tracked = segment + 1, i, True
+                    visit, begun, tracked = visit + 1, i, True
                     posed_s = before_s = determined_s = t
-                    self.track.segment[i] = segment
+                    self.track.visit[i] = visit
                 continue
             step, before_s = t - before_s, t
             predicted = pose + motion * step
-            self.track.segment[i] = segment
+            self.track.visit[i] = visit
             # Undetermined directions: as uncertain as the motion since they were last determined.
             self.prior_m[i] = _PRIOR_M + 0.5 * self.speed * (t - determined_s)
             try:
@@ -248,21 +248,21 @@ class Tracker:
         calibration = found.by_scanner @ self.fixed.covariance @ found.by_scanner.T
         self.track.noise[i] = found.covariance
         self.track.covariances[i] = found.covariance + calibration
-        self.track.weak[i] = found.weak
+        self.track.weakest[i] = found.weakest
         self.track.poses[i] = found.pose
         self.track.poses[i, 2] = wrap_angle(found.pose[2])
         self.track.readings[i], self.track.rms_m[i] = found.used, found.rms_m
         self.track.chi2_per_dof[i] = found.chi2 / max(found.used - 3.0, 1.0)
         self.track.beams[i] = beams
-        is_open = found.open_directions
-        self.track.status[i] = SetStatus.UNDETERMINED_DIRECTION if is_open else SetStatus.OK
+        undetermined = found.undetermined_directions
+        self.track.status[i] = SetStatus.UNDETERMINED_DIRECTION if undetermined else SetStatus.OK
 
     def _finished(self) -> LaserTrack:
         good = np.flatnonzero(np.isfinite(self.track.poses[:, 0]))
-        for segment in np.unique(self.track.segment[good]).tolist():
-            rows = good[self.track.segment[good] == segment]
+        for visit in np.unique(self.track.visit[good]).tolist():
+            rows = good[self.track.visit[good] == visit]
             velocity = _velocities(self.sets.times_s[rows], self.track.poses[rows])
-            self.track.fronts[segment] = self._front(rows, velocity)
+            self.track.fronts[visit] = self._front(rows, velocity)
             velocity = _velocities(self.sets.times_s[rows], self.track.poses[rows])
             self.track.motion[rows] = velocity
             for row, motion in zip(rows.tolist(), velocity):
@@ -389,11 +389,11 @@ class Tracker:
 
     def _scales(self, good: IntArray) -> FloatArray:
         """Factors on covariances if residuals exceed noise, over half a second: a set has few."""
-        freedom = np.maximum(self.track.readings[good] - 3.0, 1.0)
+        dof = np.maximum(self.track.readings[good] - 3.0, 1.0)
         sets = 2 * round(0.5 * _RESIDUALS_S / max(_interval_s(self.sets.times_s), 1e-3)) + 1
         total, squared = (
             convolve1d(values, np.ones(sets), mode="constant")
-            for values in (freedom, self.track.chi2_per_dof[good] * freedom)
+            for values in (dof, self.track.chi2_per_dof[good] * dof)
         )
         # A ratio above 1 within its own scatter is not significant.
         ratio = squared / total
@@ -502,7 +502,7 @@ def combined_poses(track: LaserTrack, sets_per_pose: int = 1) -> PlanarPoses:
     # A new block begins with a visit, after a gap, and before and after an undetermined set.
     parted = np.ones(len(rows), dtype=np.bool_)
     parted[1:] = (
-        (track.segment[rows[1:]] != track.segment[rows[:-1]])
+        (track.visit[rows[1:]] != track.visit[rows[:-1]])
         | (np.diff(times) > max(_LARGEST_GAP_S, _GAP_INTERVALS * _interval_s(track.times_s)))
         | ~determined[rows[1:]]
         | ~determined[rows[:-1]]

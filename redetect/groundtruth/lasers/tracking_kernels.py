@@ -82,9 +82,9 @@ class OutlinePose(NamedTuple):
     by_scanner: FloatArray  # (3, 3 scanners): derivatives of the pose by the scanners' poses
     used: int  # Number of readings used
     chi2: float  # Their squared normalised residuals
-    open_directions: int
+    undetermined_directions: int
     rms_m: float  # Of their distances from the outline
-    weak: FloatArray  # (3,): least determined direction of x, y, theta times the body's radius
+    weakest: FloatArray  # (3,): least determined direction of x, y, theta times the body's radius
     information: FloatArray  # (scanners, 3, 3): correction of each scanner's own pose
     gradient: FloatArray  # (scanners, 3): the same
 
@@ -197,13 +197,13 @@ class _NormalEquations(NamedTuple):
 
 
 @kernel()
-def _hold_open(
+def _add_prior_where_undetermined(
     at: _NormalEquations, to_start: FloatArray, prior_m: float, scale: float
 ) -> tuple[int, FloatArray]:
     """Add the start as a prior of the directions that the readings do not determine, in place.
 
     Directions are evaluated about the middle of the readings; a radian is as much as `scale` (m).
-    Returns how many are open, and the least determined one.
+    Returns how many these are, and the least determined one.
     """
     h, g, middle = at.h, at.g, at.middle
     # Turning about the middle: xi' = (t + theta x middle, theta * scale).
@@ -213,15 +213,15 @@ def _hold_open(
     values, vectors = np.linalg.eigh(np.ascontiguousarray(back.T) @ h @ back)
     there = np.linalg.inv(back)
     p = 1.0 / (prior_m * prior_m)
-    open_count = 0
+    undetermined = 0
     for k in range(3):
         if values[k] < 1.0 / _WEAK_SIGMA_M**2:
-            open_count += 1
+            undetermined += 1
             row = np.ascontiguousarray(vectors[:, k]) @ there
             g -= p * row * (row @ to_start)
             for a in range(3):  # np.outer takes longer to compile
                 h[a] += p * row[a] * row
-    return open_count, vectors[:, 0].copy()
+    return undetermined, vectors[:, 0].copy()
 
 
 @kernel()
@@ -295,8 +295,8 @@ def refine_outline(
     pose = start.copy()
     covariance = np.full((3, 3), np.nan)
     calibration = np.zeros((3, 3 * fixed.sigmas_m.size))
-    rms, open_count = 0.0, 0
-    weak = np.zeros(3)
+    rms, undetermined = 0.0, 0
+    weakest = np.zeros(3)
     local_covariance: FloatArray = np.zeros((3, 3))
     for step in range(_MOST_STEPS):
         # While the pose may be off, the nearest faces.
@@ -307,8 +307,8 @@ def refine_outline(
         c, s = math.cos(pose[2]), math.sin(pose[2])
         dx, dy = start[0] - pose[0], start[1] - pose[1]
         to_start = np.array([c * dx + s * dy, -s * dx + c * dy, start[2] - pose[2]])
-        open_count, v = _hold_open(at, to_start, prior_m, body.radius_m)
-        weak[0], weak[1], weak[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
+        undetermined, v = _add_prior_where_undetermined(at, to_start, prior_m, body.radius_m)
+        weakest[0], weakest[1], weakest[2] = c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
         local_covariance = np.ascontiguousarray(np.linalg.inv(at.h))
         delta = -local_covariance @ at.g
         if step == _MOST_STEPS - 1 or (
@@ -325,8 +325,8 @@ def refine_outline(
         covariance = turned @ np.ascontiguousarray(turn_world.T)
         calibration = -turned @ at.cross
     return OutlinePose(
-        pose, covariance, calibration, at.used, at.chi2, open_count, rms, weak, at.information,
-        at.gradient,
+        pose, covariance, calibration, at.used, at.chi2, undetermined, rms, weakest,
+        at.information, at.gradient,
     )  # fmt: skip
 
 

@@ -54,7 +54,7 @@ _DIFFERENCE = 1e-5
 # (rad) from one to the next; ends this close are the same corner (m).
 BULGE_M, _MOST_TURN, _SAME_CORNER_M = 0.003, 0.6, 1e-4
 # Largest correlation of the offsets of a curve's chords, and the distance in which it falls (m).
-_MOST_ALIKE, _ALIKE_M = 0.99, 3.0
+_LARGEST_CORRELATION, _CORRELATION_LENGTH_M = 0.99, 3.0
 # A direction that only this many readings determine is undetermined.
 _FEW_READINGS = 3
 # Away from a pose: joint standard deviation (m), and share of the prior that holds a pose there.
@@ -164,7 +164,7 @@ class MapFit(NamedTuple):
     map_sigma_m: float
     used: IntArray  # (poses,): number of readings on walls
     rms_m: FloatArray  # (poses,): of their distances from the walls
-    open_directions: IntArray  # (poses,): number of directions that walls do not determine
+    undetermined_directions: IntArray  # (poses,): number of directions that walls do not determine
     by_mounts: FloatArray  # (3, 3 scanners): derivative of a body's pose by its scanners' mounts
 
 
@@ -258,13 +258,13 @@ class MapProblem(NamedTuple):
             for k in parts
         ]
         values = np.linalg.eigvalsh(np.array(of_readings) / np.outer(scale, scale))
-        rms, is_open = np.sqrt(squares / np.maximum(used, 1)), values < 1.0 / weak_sigma_m**2
+        rms, undetermined = np.sqrt(squares / np.maximum(used, 1)), values < 1.0 / weak_sigma_m**2
         covariance, of_mounts = found.covariance, np.array(by_mounts).T
-        if is_open.any():
+        if undetermined.any():
             covariance = covariance + self._by_curvature(poses, offsets, found)
         poses[:, 2] = wrap_angle(poses[:, 2])
         return MapFit(
-            poses, covariance, found.map_sigma_m, used, rms, is_open.sum(axis=1), of_mounts
+            poses, covariance, found.map_sigma_m, used, rms, undetermined.sum(axis=1), of_mounts
         )
 
     def _by_curvature(self, poses: FloatArray, offsets: FloatArray, found: _Solution) -> FloatArray:
@@ -369,7 +369,7 @@ class MapProblem(NamedTuple):
         jacobian[rows, columns] = *on.by_pose.T, on.share - 1.0, -on.share
         weighted = on.weight[:, None] * jacobian
         h, g = jacobian.T @ weighted, weighted.T @ on.error_m
-        root = np.linalg.cholesky(self._alike(seen))
+        root = np.linalg.cholesky(self._offset_correlations(seen))
         h[count:], g[count:] = root.T @ h[count:], root.T @ g[count:]
         h[:, count:] = h[:, count:] @ root
         own = np.linalg.inv(h[:count, :count] + self.prior)
@@ -388,15 +388,16 @@ class MapProblem(NamedTuple):
         covariance = own + inflation * by_offsets @ of_offsets @ by_offsets.T
         return _Solution(step.reshape(-1, 3), offsets, map_sigma_m, covariance)
 
-    def _alike(self, seen: IntArray) -> FloatArray:
+    def _offset_correlations(self, seen: IntArray) -> FloatArray:
         """(2 s, 2 s) correlation of the offsets of s walls' ends: of neighbours on a curve."""
         ends, along = self.walls[seen].reshape(-1, 2), self.walls[seen, 2:] - self.walls[seen, :2]
         along = np.repeat(along / np.hypot(*along.T)[:, None], 2, axis=0)
         curve = np.repeat(self.curves.curve[seen], 2)
         same = (curve[:, None] == curve) & np.repeat(self.curves.bends[seen].any(axis=1), 2)
         squared = np.sum((ends[:, None] - ends) ** 2, axis=-1)
-        alike = _MOST_ALIKE * np.exp(-0.5 * squared / _ALIKE_M**2) * (along @ along.T)
-        return np.where(np.eye(len(ends)), 1.0, np.where(same, alike, 0.0))
+        correlation = _LARGEST_CORRELATION * np.exp(-0.5 * squared / _CORRELATION_LENGTH_M**2)
+        correlation = correlation * (along @ along.T)
+        return np.where(np.eye(len(ends)), 1.0, np.where(same, correlation, 0.0))
 
 
 def _map_sigma(h: FloatArray, g: FloatArray) -> tuple[float, float]:
@@ -413,5 +414,5 @@ def _map_sigma(h: FloatArray, g: FloatArray) -> tuple[float, float]:
         usual = deviance[np.argmin(np.abs(_MAP_SIGMAS_M - _USUAL_MAP_SIGMA_M))]
         return (0.0 if usual > _REFUTED else _USUAL_MAP_SIGMA_M), 1.0
     # Few walls hardly determine it: then errors have Student's distribution.
-    freedom = float(np.sum(gain[best] * values))
-    return float(_MAP_SIGMAS_M[best]), freedom / max(freedom - 2.0, freedom / _MOST_INFLATED)
+    dof = float(np.sum(gain[best] * values))
+    return float(_MAP_SIGMAS_M[best]), dof / max(dof - 2.0, dof / _MOST_INFLATED)

@@ -104,7 +104,7 @@ def calibration_of(camera: str) -> str:
     return f"{camera}/{camera}.cam"
 
 
-def find_boards(image: BoardImage, board: Board, camera: Camera) -> BoardView:
+def view_of_board(image: BoardImage, board: Board, camera: Camera) -> BoardView:
     """Find the corners of the board in an image.
 
     Raises `GroundTruthError` if the image cannot be read, its size differs from the calibration's,

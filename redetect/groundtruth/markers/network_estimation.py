@@ -110,9 +110,9 @@ def _disagreement(adjusted: adjustment.AdjustedBundle) -> tuple[float, int]:
         own = residuals[part.view == view].ravel()
         q = np.linalg.qr(by_pose[part.view == view].reshape(-1, 6))[0]
         rest += float(own @ own - np.sum((q.T @ own) ** 2))
-    freedom = residuals.size - 6 * len(views)
-    connections = adjusted.degrees_of_freedom - freedom
-    variance = rest / freedom
+    dof = residuals.size - 6 * len(views)
+    connections = adjusted.degrees_of_freedom - dof
+    variance = rest / dof
     squared = (adjusted.cost - rest) / variance
     if connections < 1 or chdtrc(connections, squared) > _BY_CHANCE:
         return 1.0, connections

@@ -78,8 +78,8 @@ class Track:
     @property
     def chi2_per_dof(self) -> float:
         """Sum of all costs over their degrees of freedom: 1 if the covariances are right."""
-        freedom = sum(pose.degrees_of_freedom for _, pose in self.posed)
-        return sum(pose.cost for _, pose in self.posed) / freedom if freedom else float("nan")
+        dof = sum(pose.degrees_of_freedom for _, pose in self.posed)
+        return sum(pose.cost for _, pose in self.posed) / dof if dof else float("nan")
 
     def planar(self) -> PlanarPoses:
         """The poses on the floor with their covariances, raised where residuals contradict them."""
@@ -95,10 +95,10 @@ class Track:
 
 def excess_of(pose: RefinedPose) -> float:
     """Factor by which a pose's covariance is too small; 1 if its residuals may be so by chance."""
-    freedom = pose.degrees_of_freedom
-    if freedom < 1 or pose.cost <= chdtri(freedom, _CHANCE):
+    dof = pose.degrees_of_freedom
+    if dof < 1 or pose.cost <= chdtri(dof, _CHANCE):
         return 1.0
-    return pose.cost / freedom
+    return pose.cost / dof
 
 
 def track_by_markers(

@@ -376,10 +376,10 @@ def draw_scans(errors: ReferenceErrors, building: FloatArray) -> bytes:
     The sets are the reference poses from distances alone, those refined by scans, and the ground
     truth. The same input gives the same bytes.
     """
-    kept = [i for i, r in enumerate(errors.references) if r.still is not None]
+    kept = [i for i, r in enumerate(errors.references) if r.averaged is not None]
     refined = np.stack([errors.references[i].pose for i in kept])
     distances = np.stack([errors.references[i].distances.pose for i in kept])
-    clouds = [still.robot_points() for i in kept if (still := errors.references[i].still)]
+    clouds = [one.robot_points() for i in kept if (one := errors.references[i].averaged)]
     sets = {
         "poses by distances": distances,
         "refined by the scans": refined,

@@ -102,7 +102,7 @@ class ReferencePose:
     note: str  # Why the scans are not used
     points: int = 0  # Number of points of the scans that are matched to walls
     rms_m: float = math.nan  # Of their distances from the walls; NaN without points
-    still: AveragedScans | None = None  # The averaged scans of the scanners on board
+    averaged: AveragedScans | None = None  # The averaged scans of the scanners on board
 
     @property
     def index(self) -> int:
@@ -175,10 +175,10 @@ def walls_in_view(
 
 
 def _unrefined(
-    d: DistancePose, scans: ScanUse, reason: str = "", still: AveragedScans | None = None
+    d: DistancePose, scans: ScanUse, reason: str = "", averaged: AveragedScans | None = None
 ) -> ReferencePose:
     """The pose from distances alone."""
-    return ReferencePose(d, d.pose, d.covariance, scans, reason, still=still)
+    return ReferencePose(d, d.pose, d.covariance, scans, reason, averaged=averaged)
 
 
 def averaged_scans(onboard: Sequence[Onboard], time_s: float) -> AveragedScans:
@@ -191,20 +191,20 @@ def averaged_scans(onboard: Sequence[Onboard], time_s: float) -> AveragedScans:
 
 
 def refined_by_walls(
-    distances: DistancePose, still: AveragedScans, segments: FloatArray, curves: WallCurves
+    distances: DistancePose, averaged: AveragedScans, segments: FloatArray, curves: WallCurves
 ) -> ReferencePose:
     """Combine a pose from distances with a fit to the walls (S, 4) (m), some of them `curves`."""
     prior, covariance = distances.pose, distances.covariance
     try:
         free = np.eye(3) / _FREE_SIGMA**2
-        problem = MapProblem(still.scans, prior[None], free, segments, curves, still.mounts)
+        problem = MapProblem(averaged.scans, prior[None], free, segments, curves, averaged.mounts)
         found = problem.fit(prior[None], _NARROWING_M, _WEAK_SIGMA_M)
     except GeometryError as error:
         return _unrefined(distances, ScanUse.NO_SCANS, str(error))
-    if found.open_directions[0]:
+    if found.undetermined_directions[0]:
         reason = "the walls do not determine a direction"
-        return _unrefined(distances, ScanUse.UNDETERMINED, reason, still)
-    of_mounts = block_diag(*(scanner.covariance for scanner in still.scanners))
+        return _unrefined(distances, ScanUse.UNDETERMINED, reason, averaged)
+    of_mounts = block_diag(*(scanner.covariance for scanner in averaged.scanners))
     own = found.covariance + found.by_mounts @ of_mounts @ found.by_mounts.T
     apart = pose_differences(found.poses[0], prior)
     misfit = float(apart @ np.linalg.solve(own + covariance, apart))
@@ -213,7 +213,7 @@ def refined_by_walls(
             f"{1e3 * math.hypot(apart[0], apart[1]):.0f} mm and {math.degrees(apart[2]):.2f} deg "
             "from the pose by distances, more than the covariances allow"
         )
-        return _unrefined(distances, ScanUse.DISAGREES, reason, still)
+        return _unrefined(distances, ScanUse.DISAGREES, reason, averaged)
     gain = np.linalg.solve(own + covariance, covariance).T
     pose = prior + gain @ apart
     pose[2] = wrap_angle(pose[2])
@@ -221,7 +221,7 @@ def refined_by_walls(
     rest = np.eye(3) - gain
     combined = rest @ covariance @ rest.T + gain @ own @ gain.T
     points, rms_m = int(found.used[0]), float(found.rms_m[0])
-    return ReferencePose(distances, pose, combined, ScanUse.USED, "", points, rms_m, still)
+    return ReferencePose(distances, pose, combined, ScanUse.USED, "", points, rms_m, averaged)
 
 
 class RefinedMounts(NamedTuple):
@@ -242,9 +242,9 @@ def range_errors(
     """
     angles, errors = [np.zeros(0)], [np.zeros(0)]
     for reference in references:
-        if reference.still is None or reference.scans != ScanUse.USED:
+        if reference.averaged is None or reference.scans != ScanUse.USED:
             continue
-        for mount, scan in zip(reference.still.mounts, reference.still.scans):
+        for mount, scan in zip(reference.averaged.mounts, reference.averaged.scans):
             pose = compose(reference.pose, mount)
             far, _, cosines = first_walls(pose[:2], scan.direction @ rotation(pose[2]).T, segments)
             of_a_wall = np.abs(scan.range_m - far) < OF_A_WALL_M
@@ -265,12 +265,12 @@ def refine_mounts(
     # With wrong mounts, scans disagree with distances: those are used, too.
     accepted = [r for r in references if r.distances.status == DistanceStatus.OK]
     used = [r for r in accepted if r.scans in (ScanUse.USED, ScanUse.DISAGREES)]
-    stills = [r.still for r in used if r.still is not None]
-    if len(stills) < 3:
+    every = [r.averaged for r in used if r.averaged is not None]
+    if len(every) < 3:
         return None
     priors = np.stack([r.distances.pose for r in used])
     roots = whitening(np.stack([r.distances.covariance for r in used]))
-    mounts = stills[0].mounts
+    mounts = every[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
     along = segments[:, 2:] - segments[:, :2]
     normals = np.column_stack([-along[:, 1], along[:, 0]])
@@ -279,8 +279,8 @@ def refine_mounts(
     unknowns, of_poses = 3 * (count + len(used)), 3 * (count + np.arange(len(used)))
     for gate in _GATES_M:
         blocks = []
-        for r, still in enumerate(stills):
-            for m, scan in enumerate(still.scans):
+        for r, averaged in enumerate(every):
+            for m, scan in enumerate(averaged.scans):
                 world = apply(compose(poses[r], mounts[m]), scan.points)
                 target, index, squared = nearest_on_segments(world, segments)
                 near = squared <= gate * gate
@@ -310,7 +310,7 @@ def refine_mounts(
         step = -covariance @ (of_walls.gradient / variance + of_priors.gradient)
         mounts = mounts + step.reshape(-1, 3)[:count]
         poses = poses + step.reshape(-1, 3)[count:]
-    scanners = tuple(s for s, there in zip(stills[0].scanners, seen) if there)
+    scanners = tuple(s for s, there in zip(every[0].scanners, seen) if there)
     own = np.flatnonzero(np.repeat(seen, 3))
     return RefinedMounts(scanners, mounts[seen], covariance[np.ix_(own, own)])
 

@@ -126,7 +126,7 @@ class DistancePose:
     chi2: float  # Squared normalised residuals, with K - 3 degrees of freedom
 
     @property
-    def freedom(self) -> int:
+    def dof(self) -> int:
         """Degrees of freedom."""
         return len(self.residuals_m) - 3
 
@@ -144,11 +144,11 @@ def distance_figures(solved: Sequence[DistancePose], sigma_m: float) -> dict[str
     """Residuals of the poses that fit their distances, of standard deviation `sigma_m` (m)."""
     good = [d for d in solved if d.status in (DistanceStatus.OK, DistanceStatus.AMBIGUOUS)]
     residuals = np.concatenate([d.residuals_m for d in good]) if good else np.zeros(0)
-    freedom = sum(d.freedom for d in good)
+    dof = sum(d.dof for d in good)
     return {
         "sigma_m": sigma_m,
         "rms_m": float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0,
-        "chi2_per_freedom": float(sum(d.chi2 for d in good) / freedom) if freedom else None,
+        "chi2_per_freedom": float(sum(d.chi2 for d in good) / dof) if dof else None,
     }
 
 
@@ -220,8 +220,8 @@ def _solve(index: int, rows: Sequence[Distance], survey: Survey) -> DistancePose
     )
     poses, costs = distance_minima(measured)
     residuals, jacobian = distance_residuals(poses[0], measured)
-    covariance, freedom = _covariance(jacobian, survey.sigma_m), len(rows) - 3
-    if freedom > 0 and float(chdtrc(freedom, costs[0])) < _GROSS_PROBABILITY:
+    covariance, dof = _covariance(jacobian, survey.sigma_m), len(rows) - 3
+    if dof > 0 and float(chdtrc(dof, costs[0])) < _GROSS_PROBABILITY:
         status = DistanceStatus.INCONSISTENT
         worst = int(np.argmax(np.abs(residuals)))
         reason = (

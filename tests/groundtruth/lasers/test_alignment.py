@@ -315,7 +315,7 @@ def test_a_drawing_that_is_centimetres_off_is_noticed(
     write_building(tmp_path / "building.csv", 1000.0 * ROOM, overwrite=True)
     assert perform_lasers(Lasers(tmp_path, output=tmp_path / "other.json")) == 0
     assert "of its readings lie on walls of" in capsys.readouterr().err
-    _, _, fixed, _ = load_session(tmp_path, tmp_path / "aligned.json")
+    _, _, fixed, *_ = load_session(tmp_path, tmp_path / "aligned.json")
     assert fixed.covariance.shape == (12, 12)
     assert fixed.covariance[0, 3] != 0.0
 

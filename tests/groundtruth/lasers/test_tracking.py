@@ -150,7 +150,7 @@ def test_exact_readings_give_the_exact_pose(
     refined = refine_outline(seen, body, found, tables, GATE_M, 0.02)
     assert refined.pose == pytest.approx(pose, abs=1e-8)
     assert refined.used == len(seen.points)
-    assert refined.open_directions == 0
+    assert refined.undetermined_directions == 0
 
 
 def test_derivatives_by_the_scanners_poses(
@@ -218,8 +218,8 @@ def test_one_scanner_before_a_flat_side_leaves_a_direction_open() -> None:
     pose = np.array([4.0, 3.0, 0.0])  # its long side to the scanner
     seen = seen_in(one_set(lone, pose, PLAIN, np.random.default_rng(4)), tables, pose)
     found = refine_outline(seen, body, pose + np.array([0.05, 0.0, 0.0]), tables, GATE_M, 0.3)
-    assert found.open_directions == 1
-    assert np.abs(found.weak) == pytest.approx([1.0, 0.0, 0.0], abs=0.1)
+    assert found.undetermined_directions == 1
+    assert np.abs(found.weakest) == pytest.approx([1.0, 0.0, 0.0], abs=0.1)
     # Along it the pose stays where it was, and says so; across it is known.
     assert found.pose[0] == pytest.approx(4.05, abs=0.02)
     assert found.pose[1] == pytest.approx(3.0, abs=0.02)

@@ -21,8 +21,8 @@ from redetect.groundtruth.markers.boards import (
     BoardsFile,
     BoardView,
     DoubleBoard,
-    find_boards,
     read_boards,
+    view_of_board,
 )
 from redetect.groundtruth.markers.network_estimation import (
     NetworkEstimate,
@@ -236,12 +236,12 @@ def test_corners_come_in_the_boards_order_however_it_is_held(
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), painted(board, camera, pose))
     image = BoardImage("a", "first", 0, path)
-    corners = find_boards(image, board, camera).corners
+    corners = view_of_board(image, board, camera).corners
     expected = camera.project(se3.apply(pose, board.points))
     assert np.abs(corners - expected).max() < 0.3
     if turn_deg == 0.0:
         with pytest.raises(GroundTruthError, match="no checkerboard of 9 x 4"):
-            find_boards(image, Board("checkerboard", 9, 4, 0.08), camera)
+            view_of_board(image, Board("checkerboard", 9, 4, 0.08), camera)
 
 
 # -- boards.json ----------------------------------------------------------------------------

@@ -86,14 +86,14 @@ def test_a_scanner_without_readings_costs_no_other_its_mount() -> None:
     found = references(np.random.default_rng(5), np.zeros(3), 4)
     blind = []
     for reference in found:
-        assert reference.still is not None
-        first, second = reference.still.scans
+        assert reference.averaged is not None
+        first, second = reference.averaged.scans
         nothing = second._replace(range_m=np.zeros(0), direction=np.zeros((0, 2)))
-        still = reference.still._replace(scans=(first, nothing))
-        blind.append(replace(reference, still=still))
+        averaged = reference.averaged._replace(scans=(first, nothing))
+        blind.append(replace(reference, averaged=averaged))
     refined = refine_mounts(blind, ROOM)
     assert refined is not None
-    assert refined.scanners == blind[0].still.scanners[:1]  # type: ignore[union-attr]
+    assert refined.scanners == blind[0].averaged.scanners[:1]  # type: ignore[union-attr]
     np.testing.assert_allclose(refined.poses, [[0.3, 0.0, 0.0]], atol=0.01)
     assert refined.covariance.shape == (3, 3)
 

@@ -114,7 +114,7 @@ def test_exact_distances_give_the_exact_pose(x: float, y: float, theta: float) -
     assert found.status == "ok"
     np.testing.assert_allclose(found.pose[:2], [x, y], atol=1e-7)
     assert abs(float(wrap_angle(found.pose[2:] - theta)[0])) < 1e-7
-    assert found.freedom == 9
+    assert found.dof == 9
 
 
 @pytest.mark.long

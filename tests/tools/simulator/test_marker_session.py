@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from camera import parse_camera, read_camera
 from camera.boards.board import Board
 from redetect.groundtruth.markers.adjustment import Chain, ChainPoints, project_chain
-from redetect.groundtruth.markers.boards import BoardImage, find_boards
+from redetect.groundtruth.markers.boards import BoardImage, view_of_board
 from redetect.groundtruth.markers.session import read_network, read_rig
 from redetect.groundtruth.trajectories import se3
 from redetect.groundtruth.trajectories.streams import read_planar_poses
@@ -348,5 +348,5 @@ def test_boards_have_the_frame_of_those_that_are_looked_for(
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), grey_image(light, 1.0, imaging, np.random.default_rng(0)))
         truth = camera.project(se3.apply(camera_from_board, board.points))
-        found = find_boards(BoardImage("a", "b", 0, path), same, camera)
+        found = view_of_board(BoardImage("a", "b", 0, path), same, camera)
         assert np.abs(found.corners - truth).max() < 0.5
