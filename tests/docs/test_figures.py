@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 import shutil
+import subprocess
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from jinja2 import UndefinedError
 
+from tools.benchmark.__main__ import Benchmark
 from tools.evaluation.__main__ import STUDIES, main
-from tools.evaluation.figures import documents, numbers_in
+from tools.evaluation.figures import Study, documents, numbers_in
 from tools.evaluation.tables import Table
+from tools.soak.__main__ import Soak
 
 #: Studies that measure nothing.
 _OTHERS = {"documents", "pictures", "train-rim-network", "tutorial-photographs"}
@@ -40,12 +46,52 @@ def test_files_of_figures_are_made_by_one_command_each_and_quoted(project_root: 
     assert {
         name for name in names if not re.search(rf"\b{name.replace('-', '_')}\b", text)
     } == set()
-    for path in folder.glob("*.json"):
-        command = json.loads(path.read_text("utf-8"))["command"].split()
-        if path.stem == "speed":
-            assert command[2] == "tools.benchmark"
-        elif path.stem != "left-out":
-            assert command[3] in STUDIES.keys() - _OTHERS
+    lines = make(project_root, "commands").stdout.splitlines()
+    commands = dict(line.split(": ", 1) for line in lines)
+    assert commands.keys() == names - {"left-out"}
+    for name, command in commands.items():
+        recorded = json.loads((folder / f"{name}.json").read_text("utf-8"))["command"]
+        assert shlex.split(command) == shlex.split(recorded)
+        assert name == "speed" or command.split()[3] in STUDIES.keys() - _OTHERS
+
+
+def make(root: Path, *words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """What `make -f tools/evaluation/figures.mk` does, whatever the environment says."""
+    file, path = root / "tools/evaluation/figures.mk", {"PATH": os.environ["PATH"]}
+    return subprocess.run(
+        ["make", "-f", file, *words], cwd=cwd or root, env=path, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+
+
+def test_figures_are_made_one_by_one_and_those_of_a_failed_study_are_not_kept(
+    project_root: Path, tmp_path: Path
+) -> None:
+    program = tmp_path / "python"
+    program.write_text(
+        "#!/bin/sh\nfor file; do :; done; echo {} > $file\n"
+        "mkdir alone || touch together; sleep 0.2; rmdir alone\n"
+        "case $file in *demo*) exit 1;; esac\n"
+    )
+    program.chmod(0o755)
+    (tmp_path / "docs/figures").mkdir(parents=True)
+    # Both are wanted, whatever becomes of the other, as far as possible at once.
+    words = ("-k", "-j2", f"BIN={tmp_path}", "FIGURES=accuracy demo")
+    assert make(project_root, *words, cwd=tmp_path).returncode != 0
+    assert not (tmp_path / "together").exists()
+    assert [path.name for path in (tmp_path / "build/figures").glob("*.json")] == ["accuracy.json"]
+    assert [path.name for path in (tmp_path / "docs/figures").iterdir()] == ["accuracy.json"]
+
+
+@pytest.mark.parametrize("file", ["images/e/e.cam", "docs/figures/down.cam", "detect/circles.py"])
+def test_figures_are_made_again_where_what_they_depend_on_is_newer(
+    project_root: Path, tmp_path: Path, file: str
+) -> None:
+    made = tmp_path / "accuracy.json"
+    made.touch()
+    words = ("-q", f"MADE={tmp_path}", str(made))
+    assert make(project_root, *words).returncode == 0
+    assert make(project_root, "-W", file, *words).returncode == 1
 
 
 def documents_templates(root: Path) -> list[Path]:
@@ -109,11 +155,29 @@ def test_programs_give_the_numbers_of_their_files(
     file, truth = tmp_path / "out.json", "images/m/truth.csv"
     shutil.copy(project_root / truth, tmp_path)
     score = f"groundtruth score {truth} {truth} --json @/score.json"
-    assert main(["programs", score, "--figures", str(file)]) == 0
-    kept = json.loads(file.read_text())
-    assert kept["command"] == f"python -m tools.evaluation programs '{score}'"
-    assert kept["figures"]["score"]["position_mean_m"] == 0.0
+    for flag in (["--figures", str(file)], [f"--figures={file}"]):
+        assert main(["programs", score, *flag]) == 0
+        kept = json.loads(file.read_text())
+        assert kept["command"] == f"python -m tools.evaluation programs '{score}'"
+        assert kept["figures"]["score"]["position_mean_m"] == 0.0
     assert main(["programs", "groundtruth score none.csv none.csv"]) == 1
+
+
+def test_a_wrong_flag_of_a_study_is_quoted(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["programs", "tools.evaluation accuracy --disks 3"]) == 1
+    assert "ended with 2: " in (error := capsys.readouterr().err)
+    assert "--disks" in error
+
+
+@pytest.mark.parametrize("kind", [Benchmark, Soak])
+def test_no_flags_are_not_those_of_the_process(
+    kind: type[Study], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kind, "measured", lambda _: {})
+    monkeypatch.setattr("sys.argv", ["pytest", "--not-a-flag"])
+    assert import_module(kind.__module__).main([]) == 0
+    with pytest.raises(SystemExit):
+        import_module(kind.__module__).main()
 
 
 def test_numbers_alone_are_kept() -> None:

@@ -240,9 +240,8 @@ def this_machine() -> str:
     )  # fmt: skip
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    return study_main(Benchmark, "python -m tools.benchmark", arguments or sys.argv[1:])
+#: Runs the command line, that of the process or what it is given; returns the exit code.
+main = partial(study_main, Benchmark, "python -m tools.benchmark")
 
 
 if __name__ == "__main__":

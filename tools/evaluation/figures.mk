@@ -2,6 +2,7 @@
 #
 # One command makes each file of docs/figures. Files made since the code last changed are kept in build/figures, so `make figures`
 # goes on where it was stopped, and `make figures FIGURES="accuracy demo"` makes some. A file whose data is missing is left as it is.
+# `make -f tools/evaluation/figures.mk commands` prints the command of each.
 # BIN: the programs of the environment. DATA: the evaluation data. RUN_E: a folder with e.cam, map.circles and images/ of run e of
 # the data set, in which nothing is written; SHIPPED: all shipped rows of that run. left-out.json is written by hand: it says by which commands.
 
@@ -11,7 +12,8 @@ RUN_E ?= $(DATA)/dlr/e
 SHIPPED ?= $(DATA)/dlr/map.circles
 PYTHON := OPENBLAS_NUM_THREADS=1 $(BIN)/python
 MADE := build/figures
-CODE := $(shell git ls-files 'camera/*.py' 'detect/*.py' 'detect/*.npz' 'lut/*.py' 'redetect/*.py' 'tools/*.py')
+CODE := $(shell git ls-files 'camera/*.py' 'detect/*.py' 'detect/*.npz' 'lut/*.py' 'redetect/*.py' 'tools/*.py' 'tools/*.mk' \
+    'images/e/*' 'images/m/*' docs/figures/down.cam)
 
 # The studies: half an hour on two busy cores, of which speed, fusion and markers-frames take six minutes each, poses four, tilt-tilted and
 # markers more than two, association, markers-photographs and real-run one to two.
@@ -74,16 +76,22 @@ association-demo = association images/e --circles --lines
 map-speed = map-speed $(SHIPPED)
 speed = --photographs $(DATA)/discs --frames 80 1600 16000 --factors 1 2 3 5 --landmarks 0 10 30 --pictures 8 --rounds 5 --budget-s 1
 
-command = $(if $(filter speed,$*),benchmark,evaluation) $($*)
+command = $(if $(filter speed,$(1)),benchmark,evaluation) $($(1))
 needs = $(firstword $(filter $(DATA)% $(RUN_E)% $(SHIPPED),$(subst ', ,$($*))))
 
-.PHONY: figures
+# One after the other, even with -j: some measure times. What a study that fails has written is not kept.
+.NOTPARALLEL:
+.DELETE_ON_ERROR:
+.PHONY: figures commands
 figures: $(FIGURES:%=$(MADE)/%.json)
 	$(PYTHON) -m tools.evaluation documents
 
+commands:
+	@:$(foreach name,$(FIGURES),$(info $(name): python -m tools.$(call command,$(name))))
+
 $(MADE)/%.json: $(CODE)
 	@mkdir -p $(MADE)
-	@if test -e $(or $(needs),.); then echo "$*: $(subst ','\'',$(command))"; begin=$$(date +%s); \
-	    $(PYTHON) -m tools.$(command) --figures $@ > $(MADE)/$*.log || { cat $(MADE)/$*.log; exit 1; }; \
+	@if test -e $(or $(needs),.); then echo "$*: $(subst ','\'',$(call command,$*))"; begin=$$(date +%s); \
+	    $(PYTHON) -m tools.$(call command,$*) --figures $@ > $(MADE)/$*.log || { cat $(MADE)/$*.log; exit 1; }; \
 	    cp $@ docs/figures/; echo "$*: $$(($$(date +%s) - begin)) s"; \
 	else echo "$*: left as it is: there is no $(needs)"; fi

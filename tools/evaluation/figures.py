@@ -6,6 +6,7 @@ import io
 import json
 import math
 import shlex
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
@@ -60,12 +61,14 @@ class Study:
         return int(found.get(WRONG, 0) > 0)
 
 
-def study_main(kind: type[Study], program: str, arguments: Sequence[str]) -> int:
+def study_main(kind: type[Study], program: str, arguments: Sequence[str] | None = None) -> int:
     """Run the command line of a study, ``python -m tools...``; returns the exit code."""
-    study = tyro.cli(kind, prog=program, args=arguments)
-    at = arguments.index("--figures") if "--figures" in arguments else len(arguments)
-    command = [*program.split(), *arguments[:at], *arguments[at + 2 :]]
-    return exit_code_of(lambda: study.carried_out(command))
+    words = sys.argv[1:] if arguments is None else arguments
+    study = tyro.cli(kind, prog=program, args=words)
+    at = words.index("--figures") if "--figures" in words else len(words)
+    command = [*program.split(), *words[:at], *words[at + 2 :]]
+    kept = [word for word in command if not word.startswith("--figures=")]
+    return exit_code_of(lambda: study.carried_out(kept))
 
 
 def print_figures(figures: Figures) -> None:
@@ -85,7 +88,10 @@ def run_quietly(what: str, work: Callable[[], int]) -> None:
     """Do something that prints and ends with an exit code; a `StudyError` unless that is 0."""
     said = io.StringIO()
     with redirect_stdout(said), redirect_stderr(said):
-        code = work()
+        try:
+            code: object = work()
+        except SystemExit as end:  # of a wrong flag
+            code = end.code
     if code != 0:
         raise StudyError(f"{what} ended with {code}: {' '.join(said.getvalue().split())[-500:]}")
 
@@ -108,6 +114,8 @@ class Programs(Study):
     commands: Positional[tuple[str, ...]]  # Each in quotes: `detect circles RUN -o @/x.circles`.
 
     def measured(self) -> Figures:
+        if not self.commands:
+            raise StudyError("no commands: expected at least one")
         with tempfile.TemporaryDirectory() as folder:
             for command in self.commands:
                 print(command, flush=True)

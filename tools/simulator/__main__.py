@@ -180,14 +180,14 @@ class LaserSession:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    command = tyro.cli(
-        Demo | Run | Rows | MarkerFrames | MarkerSession | MarkerDemo | LaserSession,
-        prog="python -m tools.simulator",
-        description="Rendered runs and sessions with known truth.",
-        args=arguments,
-    )
 
     def perform() -> int:
+        command = tyro.cli(
+            Demo | Run | Rows | MarkerFrames | MarkerSession | MarkerDemo | LaserSession,
+            prog="python -m tools.simulator",
+            description="Rendered runs and sessions with known truth.",
+            args=arguments,
+        )
         begin = time.perf_counter()
         made = command()
         print(f"{command.output}: {made}, {time.perf_counter() - begin:.0f} s")

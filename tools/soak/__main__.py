@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from detect.sources.opening import open_run
@@ -45,9 +46,8 @@ class Soak(Study):
         return {**figures, WRONG: len(result.unmet())}
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    return study_main(Soak, "python -m tools.soak", arguments or sys.argv[1:])
+#: Runs the command line, that of the process or what it is given; returns the exit code.
+main = partial(study_main, Soak, "python -m tools.soak")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from tools.simulator.laser.measuring import (
     true_ranges,
 )
 from tools.simulator.laser.motion import Curve, RobotClock, Route, Stop, measured_path, ptpd_lines
-from tools.simulator.laser.session import plan_session
 from tools.simulator.laser.settings import (
     DrivingLimits,
     Faults,
@@ -300,16 +299,23 @@ def test_clearance_is_the_distance_to_the_nearest_wall_or_its_end() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("kind", "wrong", "message"),
     [
-        ({"visits": 0}, "visits is 0"),
-        ({"rate_hz": float("nan")}, "rate_hz"),
-        ({"passers": -1}, "passers"),
-        ({"max_range_m": 70.0}, "at most 65"),
-        ({"faults": Faults(clock_jump_s=-0.1)}, "clock_jump_s is -0.1"),
-        ({"faults": Faults(wrong_scanner="fixed4")}, "fixed4"),
+        (LaserSettings, {"visits": 0}, "visits is 0"),
+        (LaserSettings, {"rate_hz": float("nan")}, "rate_hz"),
+        (LaserSettings, {"passers": -1}, "passers"),
+        (LaserSettings, {"max_range_m": 70.0}, "at most 65"),
+        (LaserSettings, {"camera_misses": 3.0}, "camera_misses is 3: expected 0 to 1"),
+        (LaserSettings, {"hand_sigma_m": -1.0}, "hand_sigma_m is -1"),
+        (DrivingLimits, {"speed_m_s": -1.0}, "speed_m_s is -1: expected above 0"),
+        (ReadingErrors, {"dropouts": 7.0}, "dropouts is 7"),
+        (WheelErrors, {"sigma_turn": -0.1}, "sigma_turn is -0.1"),
+        (Faults, {"clock_jump_s": -0.1}, "clock_jump_s is -0.1"),
+        (Faults, {"wrong_scanner": "fixed4"}, "fixed4"),
     ],
 )
-def test_impossible_sessions_are_refused(wrong: dict[str, Any], message: str) -> None:
+def test_impossible_sessions_are_refused(
+    kind: type[Any], wrong: dict[str, Any], message: str
+) -> None:
     with pytest.raises(GroundTruthError, match=message):
-        plan_session(LaserSettings(**wrong), 1)
+        kind(**wrong)

@@ -68,7 +68,6 @@ def random_for(seed: int, what: str) -> np.random.Generator:
 
 def plan_session(settings: LaserSettings, seed: int) -> SessionPlan:
     """Plan a session."""
-    settings.check()
     site = make_site(settings.furniture)
     route, visits, references = _drive(settings, seed, site)
     scanners = _fixed_scanners(settings, seed)
