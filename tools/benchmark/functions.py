@@ -48,7 +48,9 @@ def whole_detectors(camera: Camera) -> dict[str, Function]:
 
 
 def all_detectors(camera: Camera) -> dict[str, Function]:
-    """The detectors, their parts by themselves, and all of `detect all` for one image."""
+    """The detectors, their parts by themselves, and most of `detect all` for one image: without
+    the tilt from outlines, and the run's lean.
+    """
     settings = CircleSettings()
     report = cached_disc_table(camera, disc_shape(REPORT))
     default = disc_table(camera, settings)

@@ -22,7 +22,7 @@ from redetect.slam.mapping.run_map import map_run
 from redetect.slam.noise import with_relative_noise
 from redetect.slam.recording import camera_xy_of, first_poses, joined, read_recording
 from redetect.slam.settings import AssociateSettings
-from tools.evaluation.figures import Figures, Study, print_figures
+from tools.evaluation.figures import Figures, Study, demand_some, print_figures
 from tools.evaluation.tables import Table
 
 
@@ -43,13 +43,14 @@ class Association(Study):
     seed: int = 1  # Of the noise.
 
     def measured(self) -> Figures:
+        demand_some(self.runs, "runs")
         table = Table(
             {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
              "precision": ".4f", "recall": ".4f", "rows right": ".4f", "landmarks": "d",
              "true": "d", "wrong merges": "d", "splits": "d", "s": "6.1f"}, keys=5
         )  # fmt: skip
         for path in self.runs:
-            name = path.name if path.is_dir() else f"{path.parent.name}/"
+            name = path.name if path.is_dir() else f"{path.parent.name}/{path.name}"
             recording = read_recording(path, circles=self.circles or not self.lines,
                                        lines=self.lines)  # fmt: skip
             camera_xy = camera_xy_of(recording, path)
@@ -171,6 +172,7 @@ class JoiningPairs(Study):
             score = score_run(both, found)["circles"]["map"]
             off.append(score.pair_precision)
             wrong += score.wrong_merges
+        demand_some(off, f"{self.run}: pairs of {self.frames} frames that can be joined")
         table = Table({"discs in common": "<", "pairs": "d", "joined": "d"})
         table.row(f"{self.least} or more", counts[True], joined_pairs[True])
         table.row("fewer", counts[False], joined_pairs[False])

@@ -16,14 +16,17 @@ from camera.boards.board import Board, charuco_of
 from camera.rotations import rotation_of
 from camera.uncertainty import coarse_pixel_grid
 from redetect.array_types import ByteArray, FloatArray, IntArray
-from redetect.storage import OutputExistsError
-from tools.evaluation.figures import Figures, Study
+from redetect.storage import OutputExistsError, write_bytes
+from tools.evaluation.figures import Figures, Study, StudyError
+from tools.simulator.files import encoded
 
 #: Standard deviations of a board's turns about its axes.
 _TILTS_RAD = np.array([0.45, 0.45, 0.3])
 _PAPER, _INK, _ROOM = 200.0, 40.0, 110.0
 # Dots of a ChArUco board's print per square.
 _DOTS = 120
+#: Largest number of attempts to find a pose, on average.
+_TRIES = 10_000
 _TOGETHER = 8  # rows of sub-pixels whose grey values are computed at once: they fit into a cache
 
 
@@ -122,7 +125,11 @@ def board_poses(
     outer = np.abs(points[:, :2]).max(axis=0) + board.square_m
     frame = np.array([[sx * outer[0], sy * outer[1], 0.0] for sx in (-1, 1) for sy in (-1, 1)])
     poses: list[tuple[FloatArray, FloatArray]] = []
+    tries = 0
     while len(poses) < count:
+        tries += 1
+        if tries > _TRIES * (len(poses) + 1):
+            raise StudyError(f"the whole board was seen in {len(poses)} poses: expected {count}")
         pixel = rng.uniform(margin_px, size - 1 - margin_px)
         distance = rng.uniform(*distances_m)
         direction = camera.unproject(pixel)
@@ -194,22 +201,23 @@ class TutorialPhotographs(Study):
 
     def measured(self) -> Figures:
         camera = read_camera(self.camera)
-        boards = self.output / "boards"
-        if boards.exists():
-            raise OutputExistsError(boards)
+        boards, floor = self.output / "boards", self.output / "floor.png"
+        for path in (boards, floor):
+            if path.exists():
+                raise OutputExistsError(path)
         boards.mkdir(parents=True)
         rays = rays_of(camera, _SAMPLES)
         poses = board_poses(camera, IN_HAND, self.count, self.seed, distances_m=(0.25, 0.5))
         for number, (rotation, translation) in enumerate(poses):
             image = render_board(rays, IN_HAND, rotation, translation, seed=self.seed + number)
-            cv2.imwrite(str(boards / f"{number:02}.png"), image)
+            write_bytes(boards / f"{number:02}.png", encoded(image, ".png"), overwrite=False)
         # It lies like a page before somebody who looks ahead: x to the right, which is -X; z up.
         robot_from_board = np.diag([-1.0, -1.0, 1.0])
         robot_from_camera = np.asarray(camera.robot_from_camera)
         camera_from_robot = robot_from_camera[:, :3].T
         origin = camera_from_robot @ (np.array([*FLOOR_ORIGIN, 0.0]) - robot_from_camera[:, 3])
         image = render_board(rays, ON_FLOOR, camera_from_robot @ robot_from_board, origin)
-        cv2.imwrite(str(self.output / "floor.png"), image)
+        write_bytes(floor, encoded(image, ".png"), overwrite=False)
         print(f"{boards}: {self.count} photographs of a board")
-        print(f"{self.output / 'floor.png'}: it lies {-FLOOR_ORIGIN[1]:g} m ahead")
+        print(f"{floor}: it lies {-FLOOR_ORIGIN[1]:g} m ahead")
         return {}

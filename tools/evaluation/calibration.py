@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -176,11 +177,14 @@ def compare(
     *,
     peers: Sequence[str] = tuple(OPENCV),
     every: int = 1,
+    polynomial: bool | None = None,
 ) -> Comparison:
     """Hold out photographs of a camera, by each of `splits`, of this project's model and peers."""
     views, board, size = read_group(folder, group, every)
     # Both scales are free, as in OpenCV.
-    settings = CalibrationSettings(aspect=None, robust=False, keep_outliers=True)
+    settings = CalibrationSettings(
+        aspect=None, robust=False, keep_outliers=True, polynomial=polynomial
+    )
     result = calibrate(views, board, size, settings)
     # The same corrected points for both: OpenCV has no correction for circles.
     points, lens = result.points, result.lens
@@ -209,8 +213,8 @@ class CameraRendered(Study):
         print("Points' own error, held out, projection (worst, median, predicted) in px")
         table = Table(
             {"board": "<19", "found": "d", "free": "<24", "RMS": ".4f", "points": ".4f",
-             "held out": ".4f", "worst": ".4f", "unrotated": ".4f", "median": ".4f",
-             "predicted": ".4f", "median ": ".4f"}
+             "held out": ".4f", "worst": ".4f", "unrotated": ".4f",
+             "median error": ".4f", "predicted": ".4f", "median predicted": ".4f"}
         )  # fmt: skip
         for name in self.boards:
             board, distances = BOARDS[name]
@@ -237,6 +241,7 @@ class CameraPhotographs(Study):
 
     folder: Positional[Path]  # Folder of photographs with truth.
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras, by prefix of the names.
+    polynomial: Literal["auto", "on", "off"] = "auto"  # As of `camera calibrate`.
 
     def measured(self) -> Figures:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
@@ -245,8 +250,9 @@ class CameraPhotographs(Study):
             {"group": "<9", "views": "d", "points": "d", "held out": "<11", **errors,
              "free here": "<"}
         )  # fmt: skip
+        polynomial = {"auto": None, "on": True, "off": False}[self.polynomial]
         for group in self.groups:
-            r = compare(self.folder, group)
+            r = compare(self.folder, group, polynomial=polynomial)
             for name, found in r.errors.items():
                 table.row(group, r.views, r.points, name, *found.values(), str(r.lens))
         return table.figures

@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,15 +15,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from tyro.conf import Positional
 
-from detect.line_settings import PRESETS as LINE_PRESETS
-from detect.line_settings import LineSettings
-from detect.runs.plan import FramePlan, Job, Priors
-from detect.runs.stream import detect_run
-from detect.settings import CircleSettings, Polarity
-from detect.sources.opening import open_run
-from redetect.landmarks import FrameTilt, read_frames, read_tilts, squared_mahalanobis
+from detect.line_settings import DEFAULT
+from detect.settings import Polarity
+from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.arrays import circle_arrays
-from tools.evaluation.figures import Figures, Study, StudyError, compared, print_figures
+from tools.evaluation.figures import (
+    Figures,
+    Study,
+    StudyError,
+    compared,
+    demand_some,
+    print_figures,
+    run_program,
+)
 from tools.evaluation.tables import Table
 
 Preset = Literal["default", "published", "report"]
@@ -34,23 +38,6 @@ _LINE = re.compile(
     r"(\S+) +images +(\d+) discs +(\d+) recall +([\d.]+) +FP/img +([\d.]+) +err mm med +([\d.]+)"
 )
 _NAMES = ("images", "discs", "recall", "false", "median_mm")
-
-
-def _detect(
-    run: Path, places: dict[str, Path], known: Priors | None = None, **settings: Any
-) -> None:
-    """Detect a run's `circles` or `lines` with settings of theirs; failures go to stderr."""
-    opened = open_run(run)
-    job = Job(opened, FramePlan(opened.camera, **settings), places, known or Priors())
-    for failure in detect_run(job).failures:
-        print(failure, file=sys.stderr)
-
-
-def _detect_lines(run: Path, settings: LineSettings, output: Path) -> dict[str, FrameTilt]:
-    """Write a run's verticals; returns their tilts."""
-    tilts = output.with_suffix(".tilt")
-    _detect(run, {"lines": output, "tilt": tilts}, lines=settings)
-    return read_tilts(tilts)
 
 
 def _scored(script: Path, *arguments: object, folder: str | None = None) -> str:
@@ -76,7 +63,7 @@ class Photographs(Study):
             files = []
             for truth in sorted(self.data.glob("dev/*/truth.json")):
                 files.append(Path(folder) / f"{truth.parent.name}.circles")
-                _detect(truth.parent, {"circles": files[-1]}, circles=CircleSettings())
+                run_program("detect", "circles", truth.parent, "--output", files[-1])
                 (frame,) = read_frames(files[-1])
                 true = [(d["px"], d["py"]) for d in json.loads(truth.read_text())["discs"]]
                 rows = circle_arrays(frame.circles)
@@ -102,7 +89,7 @@ class Buildings(Study):
             files = []
             for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
                 files.append(Path(folder) / f"{run.name}.lines")
-                _detect(run, {"lines": files[-1]}, lines=LINE_PRESETS[self.preset])
+                run_program("detect", "lines", run, "--preset", self.preset, "--output", files[-1])
             scores = Path(folder) / "scores.json"
             said = _scored(self.data / "evaluate.py", "--lines", *files, "--json", scores)
             (within,) = re.findall(r"< ?2 sigma ([.\d]+)", said)
@@ -123,19 +110,21 @@ class Rendered(Study):
     def measured(self) -> Figures:
         figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
-            discs, lines, levelled = (
-                Path(folder) / name for name in ("discs.circles", "lines.lines", "levelled.circles")
+            discs, lines, tilts, levelled = (
+                Path(folder) / name
+                for name in ("discs.circles", "lines.lines", "lines.tilt", "levelled.circles")
             )
-            settings = CircleSettings(polarity=self.polarity)
-            _detect(self.run, {"circles": discs}, circles=settings)
-            tilts = _detect_lines(self.run, LINE_PRESETS[self.preset], lines)
-            _detect(self.run, {"circles": levelled}, Priors(tilts=tilts), circles=settings)
+            circles = "detect", "circles", self.run, "--polarity", self.polarity, "--output"
+            run_program(*circles, discs)
+            run_program("detect", "lines", self.run, "--preset", self.preset, "--output", lines)
+            run_program(*circles, levelled, "--tilt", tilts)
             script = self.run.parent / "evaluate.py"
             for path in (discs, lines, levelled):
                 print(path.name, flush=True)
                 text = _scored(script, self.run.name, path, folder=folder)
                 figures[path.stem] = json.loads(text)
-        return {**figures, "tilt": _tilt_errors(self.run, tilts)}
+            tilt = _tilt_errors(self.run, tilts)
+        return {**figures, "tilt": tilt}
 
 
 @dataclass(frozen=True)
@@ -143,20 +132,21 @@ class Tilt(Study):
     """Detect the tilt of a simulated run, level its discs, and compare both with the truth."""
 
     run: Positional[Path] = Path("images/e")  # Run made by `python -m tools.simulator`.
-    tilt_prior_deg: float = LINE_PRESETS["default"].tilt_prior_deg
+    tilt_prior_deg: float = DEFAULT.tilt_prior_deg
     """Prior standard deviation of the tilt about level, degrees."""
 
     def measured(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
-            lines = replace(LINE_PRESETS["default"], tilt_prior_deg=self.tilt_prior_deg)
-            tilts = _detect_lines(self.run, lines, Path(folder) / "detected.lines")
+            lines, tilts = (Path(folder) / f"detected.{kind}" for kind in ("lines", "tilt"))
+            prior = "--tilt-prior-deg", self.tilt_prior_deg
+            run_program("detect", "lines", self.run, *prior, "--output", lines)
             errors = _tilt_errors(self.run, tilts)
-            settings = CircleSettings(polarity="light", far_limit=0.5)
             medians = dict.fromkeys(("median m", "3-3.5 m", "3.5-4 m"), ".4f")
             table = Table({"tilt": "<7", **medians, "normalised": ".2f"})
-            for label, known in (("without", Priors()), ("with", Priors(tilts=tilts))):
+            settings = "--polarity", "light", "--far-limit", 0.5
+            for label, flags in (("without", ()), ("with", ("--tilt", tilts))):
                 discs = Path(folder) / f"{label}.circles"
-                _detect(self.run, {"circles": discs}, known, circles=settings)
+                run_program("detect", "circles", self.run, *settings, *flags, "--output", discs)
                 result = compared(self.run, discs, "--gate-m", 0.3)
                 far = {b["from_m"]: b["error_median_m"] for b in result["bins"]}
                 known_m = result["error_median_m"], far.get(3.0), far.get(3.5)
@@ -164,9 +154,9 @@ class Tilt(Study):
         return {"tilt": errors, **table.figures}
 
 
-def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> Figures:
+def _tilt_errors(run: Path, path: Path) -> Figures:
     """Tilts against the truth of a rendered or simulated run, on frames with five lines."""
-    truth = json.loads((run / "truth.json").read_text())
+    truth, tilts = json.loads((run / "truth.json").read_text()), read_tilts(path)
     errors, normalised = [], []
     for frame in truth["frames"]:
         tilt = tilts.get(frame["prefix"])
@@ -175,6 +165,7 @@ def _tilt_errors(run: Path, tilts: dict[str, FrameTilt]) -> Figures:
             covariance = [[tilt.cpp, tilt.cpr], [tilt.cpr, tilt.crr]]
             errors.append(np.degrees(error))
             normalised.append(squared_mahalanobis(error, covariance) / 2.0)
+    demand_some(errors, f"{run}: tilts of frames with five lines")
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     figures = {"frames": len(errors), "pitch rms deg": rms[0], "roll rms deg": rms[1],
                "normalised": np.mean(normalised)}  # fmt: skip

@@ -23,7 +23,7 @@ from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
 from redetect.storage import write_bytes
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surroundings, look_alike
-from tools.evaluation.figures import Figures, Study
+from tools.evaluation.figures import Figures, Study, StudyError, demand_some
 from tools.evaluation.tables import Table
 from tools.simulator.files import encoded
 
@@ -47,6 +47,8 @@ _NOISE = 2.5
 _JPEG = 88
 #: A row this near a disc has found it, radii.
 _GATE = 0.6
+#: So many images of one kind, one after the other, may be without a disc.
+_MOST_EMPTY = 5
 #: A rim outside the image may have this much more or less of a share than asked for.
 _SLACK = 0.05
 
@@ -210,9 +212,12 @@ def measure(
     cases += [(kind, 0.0) for kind in (*BLURRED, *LOOK_ALIKES)]
     for number, (kind, share) in enumerate(cases):
         rng = np.random.default_rng([seed, number])
-        tally = Tally()
+        tally, empty = Tally(), 0
         while tally.shown < discs:
             image, places = render_scene(stage, kind, share, rng)
+            empty = 0 if places else empty + 1
+            if empty == _MOST_EMPTY:
+                raise StudyError(f"{kind}: {empty} images without a disc: expected room for some")
             found = detect_circles(image, camera, table, settings)
             count_found(tally, camera, found, places, settings.radius_m)
         yield kind, share, tally
@@ -246,6 +251,7 @@ def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> Byte
     for number, kind in enumerate((*DISTURBANCES, BORDER, *BLURRED, *LOOK_ALIKES)):
         rng = np.random.default_rng([seed, number])
         image, places = render_scene(stage, kind, share, rng)
+        demand_some(places, f"{kind}: discs in the image")
         place = min(places, key=lambda at: abs(float(np.hypot(*at)) - 1.8))
         panels.append(_panel(image, stage.outline(place, 2.5), kind))
     columns = 6

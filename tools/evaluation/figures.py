@@ -8,7 +8,7 @@ import math
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
@@ -37,6 +37,12 @@ _MADE = "<!-- Made of {} and docs/figures by `python -m tools.evaluation documen
 
 class StudyError(ValueError):
     """A study that cannot be carried out."""
+
+
+def demand_some(things: Sized, what: str) -> None:
+    """Raise a `StudyError` if there are none of what a study is about."""
+    if not len(things):
+        raise StudyError(f"{what}: there are none, expected at least one")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +120,7 @@ class Programs(Study):
     commands: Positional[tuple[str, ...]]  # Each in quotes: `detect circles RUN -o @/x.circles`.
 
     def measured(self) -> Figures:
-        if not self.commands:
-            raise StudyError("no commands: expected at least one")
+        demand_some(self.commands, "commands")
         with tempfile.TemporaryDirectory() as folder:
             for command in self.commands:
                 print(command, flush=True)

@@ -24,7 +24,7 @@ from redetect.slam.mapping.solve_gtsam import estimate_of_values, gtsam_problem,
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import Recording, read_recording
 from tools.benchmark.timing import measure_in_turn
-from tools.evaluation.figures import Figures, Study
+from tools.evaluation.figures import Figures, Study, demand_some
 from tools.evaluation.tables import Table
 from tools.simulator.driving import step_covariance
 
@@ -88,6 +88,7 @@ class MapStudy(Study):
     seed: int = 1  # Of the odometry that replaces the wrong one.
 
     def measured(self) -> Figures:
+        demand_some(self.runs, "runs")
         table = Table(
             {"run": "<8", "variant": "<20", "p": "5d", "n": "4d", "m": "6d", "chi-sq.": "9.1f",
              "expected": "d", "factor": "6.3f", "path before / m": ".2f", "after / m": ".2f",

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from tools.evaluation.figures import Figures, Study, compared, run_program
+from tools.evaluation.figures import Figures, Study, compared, demand_some, run_program
 from tools.evaluation.tables import Table
 
 #: How the rows of each line of the table are made.
@@ -37,7 +37,8 @@ class RealRun(Study):
         levelled alike; chi-squared over its expectation of the least-squares map, as calibrated and
         with the camera's mounting as unknown.
         """
-        shipped, camera = self.run / "map.circles", next(self.run.glob("*.cam"))
+        shipped, cameras = self.run / "map.circles", list(self.run.glob("*.cam"))
+        demand_some(cameras, f"{self.run}/*.cam")
         table = Table(
             {"rows": "<30", "number": ",", "IDs found again": ".4f", "mm": "5.1f",
              "factor": ".2f", "with mounting": ".2f"}
@@ -55,7 +56,7 @@ class RealRun(Study):
                 found, factors = compared(self.run, rows, "--only-identified"), []
                 for flag in ((), ("--calibrate",)):
                     mapped = folder / f"map{len(flag)}"
-                    run_program("slam", "map", rows, "--camera", camera, "-o", mapped, *flag)
+                    run_program("slam", "map", rows, "--camera", cameras[0], "-o", mapped, *flag)
                     written = json.loads((mapped / "table.json").read_text())
                     factors.append(written["table"]["factor"])
             table.row(

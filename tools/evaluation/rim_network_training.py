@@ -22,7 +22,14 @@ from scipy.special import expit
 from tyro.conf import Positional
 
 from detect.discs.judgement import DENSE_RADII, SPARSE_RADII
-from detect.discs.rim_network import CERTAIN, HOPELESS, OTHERS, SCALES, Networks, RimNetwork
+from detect.discs.rim_network import (
+    OTHERS,
+    SCALES,
+    Networks,
+    RimNetwork,
+    network_inputs,
+    network_log_odds,
+)
 from redetect.array_types import Float32Array
 from redetect.storage import write_whole
 from tools.evaluation.figures import Figures, Study
@@ -81,18 +88,18 @@ def _distances(grey: FloatArray) -> Float32Array:
     return at.astype(np.float32)
 
 
-def batch_of(grey: FloatArray, pixels_per_radius: FloatArray, features: FloatArray) -> Batch:
-    """`detect.discs.rim_network.network_inputs` of N samples of light discs."""
-    outside = np.isnan(grey)
-    count = np.maximum((~outside).sum(axis=(1, 2), keepdims=True), 1)
-    mean = np.sum(grey, axis=(1, 2), keepdims=True, where=~outside) / count
-    off = np.where(outside, 0.0, grey - mean)
-    deviation = np.sqrt((off**2).sum(axis=(1, 2), keepdims=True) / count + 9.0)
-    size = np.log(pixels_per_radius) - 1.5
-    share_outside = outside.mean(axis=-1, keepdims=True)
-    inputs = np.concatenate([off / deviation, size[..., None], share_outside], axis=-1)
-    scales = np.stack([size.mean(axis=-1), np.log(deviation[:, 0, 0]) - 2.5], axis=-1)
-    return Batch(inputs.astype(np.float32), scales.astype(np.float32), features)
+def _seen(grey: Float32Array, pixels_per_radius: FloatArray) -> tuple[Float32Array, Float32Array]:
+    """`network_inputs` of light discs."""
+    return network_inputs(grey, pixels_per_radius.astype(np.float64), np.ones(len(grey)))
+
+
+def batch_of(grey: Float32Array, pixels_per_radius: FloatArray, features: FloatArray) -> Batch:
+    """What the network sees of N samples of light discs, arranged for training."""
+    samples, directions, _ = grey.shape
+    inputs, scales = _seen(grey, pixels_per_radius)
+    # The first and the last direction are repeated at the ends.
+    circle = inputs.reshape(-1, directions + 2, samples)[:, 1:-1]
+    return Batch(np.ascontiguousarray(circle.transpose(2, 1, 0)), scales, features)
 
 
 def _first_weights(
@@ -302,37 +309,20 @@ def train(samples: Samples, used: NDArray[np.bool_], shape: Shape, seed: int) ->
 def train_prescreening(sparse: Samples, used: NDArray[np.bool_], seed: int) -> RimNetwork:
     """As `train`, for a network above 0 for all but a few of the discs."""
     network = train(sparse, used, SHAPES["prescreening"], seed)
-    discs = log_odds(network, sparse, used & sparse.is_disc)
-    least = np.quantile(discs, _LOST_BY_PRESCREENING).astype(np.float32)
+    discs = used & sparse.is_disc
+    seen = _seen(sparse.grey[discs, 0], sparse.pixels_per_radius[discs, 0])
+    odds = network_log_odds(*seen, sparse.features[discs], network)
+    least = np.quantile(odds, _LOST_BY_PRESCREENING).astype(np.float32)
     return network._replace(out_bias=network.out_bias - least)
 
 
-def train_all(sparse: Samples, rims: Samples, seed: int) -> Networks:
+def train_all(sparse: Samples, rims: Samples, members: int, seed: int) -> Networks:
     """The networks of the detector, by all sparse profiles and rims."""
+    shape = SHAPES["classifier"]._replace(members=members)
     return Networks(
         train_prescreening(sparse, np.ones(len(sparse.is_disc), np.bool_), seed),
-        train(rims, np.ones(len(rims.is_disc), np.bool_), SHAPES["classifier"], seed),
+        train(rims, np.ones(len(rims.is_disc), np.bool_), shape, seed),
     )
-
-
-def log_odds(
-    network: RimNetwork, samples: Samples, chosen: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Log-odds of some samples: `detect.discs.rim_network.network_log_odds` in NumPy."""
-    batch = batch_of(
-        samples.grey[chosen, 0], samples.pixels_per_radius[chosen, 0], samples.features[chosen]
-    )
-    mean = np.zeros(len(batch.inputs))
-    for n, layers in enumerate(zip(*network, strict=True)):
-        w = RimNetwork(*layers)
-        weights = [
-            w.around.reshape(-1, w.around.shape[-1]), w.around_bias,
-            w.again.reshape(-1, w.again.shape[-1]), w.again_bias,
-            w.dense, w.dense_bias, w.out[:, None], np.atleast_1d(w.out_bias),
-        ]  # fmt: skip
-        doubtful = (mean >= HOPELESS) & (mean <= CERTAIN)
-        mean += doubtful * (_Member(weights).log_odds(batch) - mean) / (n + 1)
-    return mean
 
 
 @dataclass(frozen=True)
@@ -340,8 +330,9 @@ class TrainRimNetwork(Study):
     """Train the networks that judge candidates of discs."""
 
     data: Positional[Path] = Path("../shared/data")  # Folder with `rendered`, `york` and `dlr`.
-    every: int = 2  # Every n-th frame of the recorded run is used,
-    frames: int = 1000  # of the first ones.
+    frames: int = 1000  # The first frames of the recorded run, of which some are used.
+    every: int = 2  # Every n-th of them is used.
+    members: int = SHAPES["classifier"].members  # Networks of which the classifier is the mean.
     scenes: int = 1500  # Rendered floors with disturbed discs.
     without: str = ""  # Folder of a rendered building that is not used.
     seed: int = 1  # Of the disturbances and the networks.
@@ -355,7 +346,7 @@ class TrainRimNetwork(Study):
         )
         for kind, of in (("candidates", sparse), ("rims", rims)):
             print(f"{len(of.is_disc)} {kind}, {of.is_disc.sum()} at discs")
-        networks = train_all(sparse, rims, self.seed)
+        networks = train_all(sparse, rims, self.members, self.seed)
         self.output.parent.mkdir(parents=True, exist_ok=True)
         weights: dict[str, Any] = {
             f"{sort}_{name}": values

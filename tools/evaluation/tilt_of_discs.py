@@ -17,7 +17,7 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import read_frames, read_tilts, squared_mahalanobis
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.slam.models import disc_in_robot
-from tools.evaluation.figures import Figures, Study, print_figures
+from tools.evaluation.figures import Figures, Study, demand_some, print_figures
 from tools.evaluation.tables import Table
 
 #: Least standard deviation of positions in the image, pixels along u.
@@ -146,4 +146,8 @@ class TiltOfDiscs(Study):
     def measured(self) -> Figures:
         camera = read_camera(self.camera)
         files = self.rows, self.tilts, self.map, self.path
-        return figures_of(compare_tilts(camera, *files, self.raised_m))
+        tilts = compare_tilts(camera, *files, self.raised_m)
+        demand_some(
+            tilts, f"{self.rows}: frames with a pose, {_LEAST} lines, {_LEAST} discs of the map"
+        )
+        return figures_of(tilts)
