@@ -77,6 +77,7 @@ def figure_file(
     kind: Literal["png", "svg"],
     *,
     framed: bool = False,
+    dpi: int = _DPI,
     new: Callable[..., Figure] = Figure,
 ) -> Iterator[tuple[Figure, io.BytesIO]]:
     """An empty figure of a given width and height (inches) to draw into, and its file afterwards.
@@ -88,7 +89,7 @@ def figure_file(
         # Names of parts are hashes with a fixed salt; text remains text, in the viewer's own font.
         mpl.rcParams.update({"svg.hashsalt": "redetect", "svg.fonttype": "none"})
         mpl.rcParams.update({"axes.spines.top": framed, "axes.spines.right": framed})
-        figure = new(figsize=size, dpi=_DPI, layout="constrained")
+        figure = new(figsize=size, dpi=dpi, layout="constrained")
         if new is Figure:
             FigureCanvasAgg(figure)
         content = io.BytesIO()
@@ -100,4 +101,4 @@ def figure_file(
             figure.set_layout_engine(None)
         # Without date, name and version of the program, for reproducible bytes.
         nameless = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
-        figure.savefig(content, format=kind, dpi=_DPI, metadata=nameless)
+        figure.savefig(content, format=kind, dpi=dpi, metadata=nameless)

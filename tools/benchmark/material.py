@@ -17,6 +17,7 @@ from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import Frame, write_frames
 from tools.evaluation.figures import StudyError
 from tools.simulator.markers.things import photograph_files, photograph_of
+from tools.simulator.pixels import noisy_image, subpixel_grid
 from tools.simulator.single_disc import render_disc
 
 _JPEG_QUALITY = 90
@@ -98,7 +99,7 @@ def scaled_picture(picture: Picture, camera: Camera, seed: int) -> Picture:
     """A picture enlarged to a scaled camera's size, with a sensor's noise."""
     size = (camera.width, camera.height)
     grey = np.asarray(cv2.resize(picture.grey, size, interpolation=cv2.INTER_CUBIC), np.float64)
-    return jpeg_picture(_taken(grey, _SENSOR_NOISE, seed))
+    return jpeg_picture(noisy_image(grey, _SENSOR_NOISE, np.random.default_rng(seed)))
 
 
 def repeated_run(run: Run, folder: Path, frames: int, most_copies: int | None = None) -> Path:
@@ -179,31 +180,22 @@ def floor_with_discs(camera: Camera, places: FloatArray, seed: int) -> ByteArray
     for place in places:
         crop = render_disc(camera, place, _RADIUS_M, _DISC, _FLOOR, _BLUR_PX)
         grey[crop.window] += crop.grey - _FLOOR
-    return _taken(grey, _NOISE, seed)
+    return noisy_image(grey, _NOISE, np.random.default_rng(seed))
 
 
 def wall_with_edges(camera: Camera, count: int, seed: int) -> ByteArray:
     """A wall all around, striped so that the camera sees a number of vertical edges.
     Returns (H, W).
     """
-    fine = (np.arange(_FINE) + 0.5) / _FINE - 0.5
-    u = (np.arange(camera.width)[:, None] + fine).ravel()
-    v = (np.arange(camera.height)[:, None] + fine).ravel()
-    direction = camera.directions_robot(np.stack(np.meshgrid(u, v), axis=-1))
+    direction = camera.directions_robot(subpixel_grid(camera, _FINE, _FINE))
     bearing = np.arctan2(direction[..., 0], -direction[..., 1])
-    middle = bearing[len(v) // 2]
+    middle = bearing[len(bearing) // 2]
     half = 0.5 * _WALL_SHARE * (float(np.max(middle)) - float(np.min(middle)))
     centre = 0.5 * (float(np.max(middle)) + float(np.min(middle)))
     edges = centre + half * (2.0 * (np.arange(count) + 0.5) / max(count, 1) - 1.0)
     light = np.searchsorted(edges, bearing) % 2 == 1
     share = light.reshape(camera.height, _FINE, camera.width, _FINE).mean(axis=(1, 3))
-    return _taken(_DARK + (_LIGHT - _DARK) * share, _NOISE, seed)
-
-
-def _taken(grey: FloatArray, noise: float, seed: int) -> ByteArray:
-    """Grey values with the noise of a sensor, rounded."""
-    noisy = grey + np.random.default_rng(seed).normal(0.0, noise, grey.shape)
-    return np.asarray(np.clip(np.rint(noisy), 0, 255), dtype=np.uint8)
+    return noisy_image(_DARK + (_LIGHT - _DARK) * share, _NOISE, np.random.default_rng(seed))
 
 
 def contents_of(paths: Sequence[Path]) -> list[ByteArray]:

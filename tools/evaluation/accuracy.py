@@ -21,6 +21,7 @@ from redetect.array_types import ByteArray, FloatArray
 from redetect.landmarks import squared_mahalanobis
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
+from tools.simulator.pixels import image_of
 from tools.simulator.single_disc import render_disc
 
 _BLURS_PX = (0.3, 0.7, 1.2)
@@ -74,7 +75,7 @@ def _render(
     blur = (blur_px, blur_px * camera.scale_y / camera.scale_x)
     crop = render_disc(camera, true_xy, radius_m, _LIGHT, _DARK, blur)
     grey[crop.window] = crop.grey + rng.normal(0.0, _NOISE, crop.grey.shape)
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return image_of(grey)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from redetect.array_types import ByteArray, FloatArray, IntArray
 from redetect.storage import OutputExistsError, write_bytes
 from tools.evaluation.figures import Figures, Study, StudyError
 from tools.simulator.files import encoded
+from tools.simulator.pixels import noisy_image, subpixel_grid
 
 #: Standard deviations of a board's turns about its axes.
 _TILTS_RAD = np.array([0.45, 0.45, 0.3])
@@ -41,10 +42,7 @@ class Rays:
 
 def rays_of(camera: Camera, samples: int = 4) -> Rays:
     """The rays of a camera's sub-pixels, `samples` times `samples` to a pixel."""
-    inner = (np.arange(samples) + 0.5) / samples - 0.5
-    u = (np.arange(camera.width)[:, None] + inner).ravel()
-    v = (np.arange(camera.height)[:, None] + inner).ravel()
-    return Rays(camera.undistort(np.stack(np.meshgrid(u, v), axis=-1)), samples, camera)
+    return Rays(camera.undistort(subpixel_grid(camera, samples, samples)), samples, camera)
 
 
 def render_board(
@@ -57,7 +55,7 @@ def render_board(
     noise: float = 2.0,
     seed: int = 0,
 ) -> ByteArray:
-    """A picture of a board. `rotation`, `translation` (3, 3); returns (H, W)."""
+    """A picture of a board. `rotation` (3, 3); `translation` (3,); returns (H, W)."""
     fine: FloatArray = np.empty(rays.xy.shape[:2])
     for rows in (slice(k, k + _TOGETHER) for k in range(0, len(fine), _TOGETHER)):
         fine[rows] = _greys(rays.xy[rows], board, rotation, translation)
@@ -66,8 +64,7 @@ def render_board(
     n = rays.samples
     height, width = fine.shape[0] // n, fine.shape[1] // n
     image = fine.reshape(height, n, width, n).mean(axis=(1, 3))
-    image = image + np.random.default_rng(seed).normal(scale=noise, size=image.shape)
-    return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
+    return noisy_image(image, noise, np.random.default_rng(seed))
 
 
 def _greys(xy: FloatArray, board: Board, rotation: FloatArray, place: FloatArray) -> FloatArray:

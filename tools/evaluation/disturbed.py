@@ -26,6 +26,7 @@ from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, REACH, Surr
 from tools.evaluation.figures import Figures, Study, StudyError, demand_some
 from tools.evaluation.tables import Table
 from tools.simulator.files import encoded
+from tools.simulator.pixels import noisy_image, subpixel_grid
 
 FLOORS = ("carpet", "tiles", "parquet", "lino")
 #: Families without a share of the rim, and what blurs the image: motion along u and optics, pixels.
@@ -88,10 +89,7 @@ class Stage:
         farthest_m: float = _FARTHEST_M,
     ) -> None:  # fmt: skip
         self.camera, self.radius_m, self.farthest_m = camera, radius_m, farthest_m
-        across, down = _FINE
-        u = (np.arange(camera.width * across) + 0.5) / across - 0.5
-        v = (np.arange(camera.height * down) + 0.5) / down - 0.5
-        self.floor_xy = camera.floor_from_pixel(np.stack(np.meshgrid(u, v), axis=-1))
+        self.floor_xy = camera.floor_from_pixel(subpixel_grid(camera, *_FINE))
         self.floors = {kind: _texture(kind, self.floor_xy, rng) for kind in FLOORS}
 
     def outline(self, place: FloatArray, radii: float = 1.0) -> FloatArray:
@@ -129,8 +127,8 @@ class Stage:
             fine = cv2.blur(fine, (2 * (round(motion * across) // 2) + 1, 1))
         size = self.camera.width, self.camera.height
         pixels = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
-        noisy = np.clip(np.rint(pixels + rng.normal(0.0, _NOISE, pixels.shape)), 0, 255)
-        _, jpeg = cv2.imencode(".jpg", noisy.astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
+        noisy = noisy_image(np.asarray(pixels, np.float64), _NOISE, rng)
+        _, jpeg = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
         return np.asarray(cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE), np.uint8)
 
 

@@ -32,10 +32,10 @@ from redetect.groundtruth.trajectories.streams import read_planar_poses
 from redetect.landmarks import read_frames, wrap_angle
 from redetect.landmarks.map_file import read_path
 from redetect.plane import apply
+from redetect.reporting.page import figure_file
 from tools.detector_maps import line_response, quality_of_centres
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.maps import read_truth
-from tools.evaluation.tables import picture
 
 _INK, _EDGE, _RINGS, _LINE = "#444444", "#e67e22", "#2ecc71", "#e67e22"
 _OWN, _OTHER = "#1f4e9c", "#e67e22"
@@ -349,7 +349,9 @@ class Pictures(Study):
     def _save(
         self, name: str, size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int
     ) -> None:
-        (self.output / f"{name}.png").write_bytes(picture(size_inches, draw, dpi))
+        with figure_file(size_inches, "png", framed=True, dpi=dpi) as (figure, content):
+            draw(figure)
+        (self.output / f"{name}.png").write_bytes(content.getvalue())
 
 
 def _photographs(figure: Any, folder: Path) -> None:

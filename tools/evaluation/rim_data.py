@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from camera import Camera, read_camera
 from camera.kernels import camera_numbers
@@ -41,6 +40,7 @@ from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.landmarks import read_frames
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced, with_disc
 from tools.evaluation.disturbed import BLURRED, BORDER, Stage, render_scene
+from tools.simulator.pixels import noisy_image, subpixel_grid
 
 _SETTINGS = CircleSettings()
 #: Of a disc, metres.
@@ -96,7 +96,6 @@ class Samples(NamedTuple):
     pixels_per_radius: Float32Array  # (N, V, K) What the network sees, from V places nearby.
     is_disc: BoolArray  # (N,)
     weight: FloatArray  # (N,)
-    source: NDArray[np.str_]  # (N,)
 
 
 #: Discs of the recorded run that are not mapped, and what may be one, found by looking at images.
@@ -114,7 +113,7 @@ class Truth(NamedTuple):
     others: FloatArray | None = None  # where nothing is a disc; None: wherever else
 
 
-_Row = tuple[FloatArray, FloatArray, FloatArray, bool, float, str]
+_Row = tuple[FloatArray, FloatArray, FloatArray, bool, float]
 
 
 class _Gathering:
@@ -125,14 +124,14 @@ class _Gathering:
 
     def add(
         self, image: ByteArray, camera: Camera, truth: Truth, weight: tuple[float, float],
-        source: str, dark_others: float = 1.0, kept: float = 1.0,
+        dark_others: float = 1.0, kept: float = 1.0,
     ) -> None:  # fmt: skip
         """Look at an image; a share of what is no disc is kept, and all of `truth.others`."""
         kept = kept if truth.others is None else 1.0
         table = cached_vote_table(camera, vote_shape(_SETTINGS))
         scene = scene_of(image, camera, table, _SETTINGS)
 
-        def known(places: FloatArray, sign: FloatArray) -> Iterator[tuple[int, bool, float, str]]:
+        def known(places: FloatArray, sign: FloatArray) -> Iterator[tuple[int, bool, float]]:
             for k, uv in enumerate(camera.project_floor(places)):
                 discs = truth.light if sign[k] > 0.0 else truth.dark
                 is_disc = _nearest(uv, discs) < 0.6
@@ -141,7 +140,7 @@ class _Gathering:
                     elsewhere = _nearest(uv, truth.others) < 0.6
                 if is_disc or (elsewhere and self._rng.random() < kept):
                     less = dark_others if sign[k] < 0.0 else 1.0
-                    yield k, is_disc, weight[0] if is_disc else less * weight[1] / kept, source
+                    yield k, is_disc, weight[0] if is_disc else less * weight[1] / kept
 
         candidates = candidates_of(scene, table, _SETTINGS)
         grey, scale = sparse_profiles(image, scene.camera_numbers, candidates.floor_xy, _RADIUS)
@@ -178,10 +177,10 @@ def _as_light(grey: Float32Array, sign: FloatArray | float) -> Float32Array:
 
 
 def _samples_of(rows: list[_Row]) -> Samples:
-    features, grey, scale, is_disc, weight, source = zip(*rows, strict=True)
+    features, grey, scale, is_disc, weight = zip(*rows, strict=True)
     return Samples(
         np.array(features), np.array(grey, np.float32), np.array(scale, np.float32),
-        np.array(is_disc), np.array(weight), np.array(source),
+        np.array(is_disc), np.array(weight),
     )  # fmt: skip
 
 
@@ -270,7 +269,7 @@ def _scenes(
             clear = heights >= 2.0 * _LEAST_HALF_PX
             clear &= np.array([_contrast(image, stage.camera, at) for at in places]) > 6.0
             truth = Truth(at[clear], unsure=at[~clear])
-        gathering.add(image, stage.camera, truth, _SCENE, "scenes", _DARK_OTHERS, _KEPT)
+        gathering.add(image, stage.camera, truth, _SCENE, _DARK_OTHERS, _KEPT)
 
 
 def _photographed(
@@ -301,7 +300,7 @@ def _boards(
         truth = Truth(dark=at)
         if k % 2:
             image, truth = np.asarray(255 - image, np.uint8), Truth(light=at)
-        gathering.add(image, camera, truth, _BOARD, "boards", kept=_KEPT)
+        gathering.add(image, camera, truth, _BOARD, kept=_KEPT)
 
 
 def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
@@ -313,26 +312,26 @@ def _building(gathering: _Gathering, rng: np.random.Generator, _: int, folder: P
         seen = camera.floor_from_pixel(np.array([[c["u"], c["v"]] for c in frame["circles"]]))
         sure = np.array([c["mandatory"] for c in frame["circles"]], np.bool_)
         truth = Truth(_images(camera, seen[sure]), unsure=_images(camera, seen[~sure]))
-        gathering.add(image, camera, truth, _BUILDING, folder.name, _DARK_OTHERS)
-        _add_disturbed(gathering, image, camera, seen[sure], rng, f"{folder.name} disturbed")
-        _add_painted(gathering, image, camera, seen, rng, f"{folder.name} painted")
+        gathering.add(image, camera, truth, _BUILDING, _DARK_OTHERS)
+        _add_disturbed(gathering, image, camera, seen[sure], rng)
+        _add_painted(gathering, image, camera, seen, rng)
 
 
 def _photograph(gathering: _Gathering, rng: np.random.Generator, _: int, folder: Path) -> None:
     """Look at a photograph of a building, as it is and with discs on its floor."""
     camera = read_camera(folder / f"{folder.name}.cam")
     photograph = _read(folder / "images" / f"{folder.name}.jpg")
-    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, "photographs", _DARK_OTHERS)
+    gathering.add(photograph, camera, Truth(), _PHOTOGRAPH, _DARK_OTHERS)
     for _ in range(_PHOTOGRAPH_ROUNDS):
         grey = 255.0 * (photograph / 255.0) ** rng.uniform(0.7, 1.5)
         blurred = cv2.GaussianBlur(grey, (0, 0), rng.uniform(0.3, 1.2))
         image = np.asarray(np.rint(blurred), np.uint8)
-        _add_painted(gathering, image, camera, np.zeros((0, 2)), rng, "photographs")
+        _add_painted(gathering, image, camera, np.zeros((0, 2)), rng)
 
 
 def _add_painted(
     gathering: _Gathering, image: ByteArray, camera: Camera, known: FloatArray,
-    rng: np.random.Generator, source: str,
+    rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Look at an image with more discs on the floor than are `known` (N, 2), also disturbed."""
     floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
@@ -348,8 +347,8 @@ def _add_painted(
             break
     at = np.array(places).reshape(-1, 2)
     truth = Truth(_images(camera, at), unsure=_images(camera, known))
-    gathering.add(image, camera, truth, _PHOTOGRAPH, source, _DARK_OTHERS)
-    _add_disturbed(gathering, image, camera, at, rng, f"{source} disturbed")
+    gathering.add(image, camera, truth, _PHOTOGRAPH, _DARK_OTHERS)
+    _add_disturbed(gathering, image, camera, at, rng)
 
 
 def _real(
@@ -364,9 +363,9 @@ def _real(
         light = np.array([_contrast(image, camera, xy) for xy in shipped]) > 0.0
         of_light, of_dark = (_images(camera, shipped[of]) for of in (light, ~light))
         truth = Truth(of_light, of_dark, mapped)
-        gathering.add(image, camera, truth, _REAL, "real", _DARK_OTHERS)
+        gathering.add(image, camera, truth, _REAL, _DARK_OTHERS)
         if number % 6 == 0:
-            _add_disturbed(gathering, image, camera, shipped[light], rng, "real disturbed")
+            _add_disturbed(gathering, image, camera, shipped[light], rng)
 
 
 def other_camera(rng: np.random.Generator) -> Camera:
@@ -397,8 +396,8 @@ def render_board(
     middle = (width - 1) / 2.0, (height - 1) / 2.0
     camera = Camera(width, height, scale, scale, *middle, (0.0,) * 5, pose)
     fine = 3
-    u, v = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in (width, height))
-    floor = camera.floor_from_pixel(np.stack(np.meshgrid(u, v), axis=-1))
+    pixels = subpixel_grid(camera, fine, fine)
+    floor = camera.floor_from_pixel(pixels)
     turn = rng.uniform(-np.pi, np.pi)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     at = np.nan_to_num(floor @ matrix, nan=1e6) + size / 2.0
@@ -420,12 +419,11 @@ def render_board(
     ink = paper * rng.uniform(0.1, 0.8)
     grey = np.where(on_board, np.where(off < _RADIUS, ink, paper), behind)
     slope = rng.uniform(-0.3, 0.3, 2)
-    light = 1.0 + slope[0] * u[None, :] / width + slope[1] * v[:, None] / height
+    light = 1.0 + slope[0] * pixels[..., 0] / width + slope[1] * pixels[..., 1] / height
     sigma = fine * rng.uniform(0.4, 2.5)
     seen = cv2.GaussianBlur((grey * light).astype(np.float32), (0, 0), sigma)
-    pixels = cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA)
-    noisy = pixels + rng.normal(0.0, rng.uniform(0.5, 5.0), pixels.shape)
-    image = np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
+    averaged = np.asarray(cv2.resize(seen, (width, height), interpolation=cv2.INTER_AREA))
+    image = noisy_image(averaged, rng.uniform(0.5, 5.0), rng)
     number = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(float)
     if shifted:
         number[..., 0] += 0.5 * (number[..., 1] % 2)
@@ -435,7 +433,7 @@ def render_board(
 
 def _add_disturbed(
     gathering: _Gathering, image: ByteArray, camera: Camera, places: FloatArray,
-    rng: np.random.Generator, source: str,
+    rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Look at an image of which light discs (N, 2) are disturbed or replaced, a few at a time."""
     floor_xy = cached_vote_table(camera, vote_shape(_SETTINGS)).floor_xy
@@ -445,12 +443,12 @@ def _add_disturbed(
         kind = str(rng.choice(list(DISTURBANCES)))
         changed = disturbed(image, floor_xy, at, _RADIUS, kind, rng)
         disc = Truth(place, others=_NOWHERE)
-        gathering.add(changed, camera, disc, _DISTURBED, source)
+        gathering.add(changed, camera, disc, _DISTURBED)
         other = replaced(image, floor_xy, at, _RADIUS, str(rng.choice(LOOK_ALIKES)), rng)
         if rng.random() < 0.5:
             kind = str(rng.choice(list(DISTURBANCES)))
             other = disturbed(other, floor_xy, at, _RADIUS, kind, rng)
-        gathering.add(other, camera, Truth(others=place), _DISTURBED, source)
+        gathering.add(other, camera, Truth(others=place), _DISTURBED)
 
 
 def _mapped(run: Path, camera: Camera) -> Iterator[tuple[str, FloatArray, FloatArray]]:

@@ -1,10 +1,9 @@
-"""Output of all studies: tables in Markdown, pictures."""
+"""Output of all studies: tables in Markdown."""
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 
@@ -39,18 +38,3 @@ class Table:
             for cell, width, form in zip(cells, self._widths, self._formats)
         )
         print(f"| {' | '.join(aligned)} |", flush=True)
-
-
-def picture(size_inches: tuple[float, float], draw: Callable[[Any], None], dpi: int) -> bytes:
-    """A PNG of a matplotlib figure; the same figure always gives the same bytes."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    stream = io.BytesIO()
-    with mpl.rc_context(mpl.rcParamsDefault):
-        figure = Figure(figsize=size_inches, layout="constrained")
-        FigureCanvasAgg(figure)
-        draw(figure)
-        figure.savefig(stream, format="png", dpi=dpi, metadata={"Software": None})
-    return stream.getvalue()

@@ -20,7 +20,6 @@ from tools.simulator.scene import (
     Flooring,
     Look,
     Texture,
-    flooring,
     raster_shape,
     raster_slice,
 )
@@ -126,14 +125,14 @@ def lay_floors(
     rooms: list[Room], rng: np.random.Generator
 ) -> tuple[NDArray[np.int8], FloatArray, ByteArray]:
     floorings = np.array([
-        flooring(Flooring.LINOLEUM, float(rng.uniform(0.24, 0.34)), 0.10, 1.0, 2.0),
-        flooring(Flooring.PAVING, 0.30, 0.12, 0.05, 0.5),
-        flooring(Flooring.GRASS, 0.16, 0.5, 0.0),
-        flooring(Flooring.CARPET, 0.14, 0.25, 0.0),
-        flooring(Flooring.PARQUET, 0.32, 0.15, 0.7, 0.07),
-        flooring(Flooring.LINOLEUM, 0.22, 0.12, 0.8),
-        flooring(Flooring.TILES, 0.40, 0.10, 1.2, 0.3),
-        flooring(Flooring.CARPET, 0.24, 0.2, 0.0),
+        [Flooring.LINOLEUM, float(rng.uniform(0.24, 0.34)), 0.10, 1.0, 2.0],
+        [Flooring.PAVING, 0.30, 0.12, 0.05, 0.5],
+        [Flooring.GRASS, 0.16, 0.5, 0.0, 0.0],
+        [Flooring.CARPET, 0.14, 0.25, 0.0, 0.0],
+        [Flooring.PARQUET, 0.32, 0.15, 0.7, 0.07],
+        [Flooring.LINOLEUM, 0.22, 0.12, 0.8, 0.0],
+        [Flooring.TILES, 0.40, 0.10, 1.2, 0.3],
+        [Flooring.CARPET, 0.24, 0.2, 0.0, 0.0],
     ])  # fmt: skip
     kind = np.full(raster_shape(EXTENT), _FLOOR_LAWN, dtype=np.int8)
     kind[raster_slice(EXTENT, WIDTH_M, 2.0, YARD_X + 2.5, DEPTH_M - 2.0)] = _FLOOR_YARD

@@ -23,16 +23,12 @@ def planar_transform(x_m: float, y_m: float, theta_rad: float) -> FloatArray:
     return se3.transform([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], [x_m, y_m, 0.0])
 
 
-def level_from_tilted(tilt_rad: ArrayLike) -> FloatArray:
-    """(4, 4) rotation of a tilted robot about its origin on the floor. `tilt_rad` (2,)."""
-    p, q = np.asarray(tilt_rad, dtype=np.float64)
-    return se3.transform(Rotation.from_rotvec([p, q, 0.0]).as_matrix(), np.zeros(3))
-
-
 def tilted_camera(camera: Camera, tilt_rad: ArrayLike) -> Camera:
-    """The camera of a tilted robot, its pose relative to the level robot frame."""
-    pose = np.vstack([np.array(camera.robot_from_camera), [0.0, 0.0, 0.0, 1.0]])
-    return with_pose(camera, (level_from_tilted(tilt_rad) @ pose)[:3])
+    """The camera of a robot tilted about its origin on the floor, relative to the level robot.
+    `tilt_rad` (2,).
+    """
+    level_from_tilted = Rotation.from_rotvec([*np.asarray(tilt_rad), 0.0]).as_matrix()
+    return with_pose(camera, level_from_tilted @ np.array(camera.robot_from_camera))
 
 
 _DENSE_M = 0.01
@@ -72,7 +68,7 @@ def drive(route: ArrayLike, steps: int, style: DriveStyle, rng: np.random.Genera
 def robot_tilt(frames: int, style: DriveStyle, rng: np.random.Generator) -> FloatArray:
     """(frames, 2) tilt (p, q) of a moving robot (rad), smooth from frame to frame.
 
-    See `tools.simulator.driving.level_from_tilted` for the sign and axes.
+    See `tools.simulator.driving.tilted_camera` for the sign and axes.
     """
     noise = np.stack([smooth_noise(frames, style.tilt_frames, rng) for _ in range(2)], axis=-1)
     return np.asarray(np.radians(style.tilt_deg * noise + np.array(style.constant_tilt_deg)))

@@ -146,7 +146,7 @@ _FOLIAGE, _METAL = int(Texture.FOLIAGE), int(Texture.METAL)
 _LINOLEUM, _CARPET, _TILES = int(Flooring.LINOLEUM), int(Flooring.CARPET), int(Flooring.TILES)
 _PARQUET, _PAVING = int(Flooring.PARQUET), int(Flooring.PAVING)
 _DISC, _RING, _ELLIPSE, _PLATE = int(Mark.DISC), int(Mark.RING), int(Mark.ELLIPSE), int(Mark.PLATE)
-_RECTANGLE, _LIGHT_SPOT, _PRINTED = int(Mark.RECTANGLE), int(Mark.LIGHT_SPOT), int(Mark.PRINTED)
+_LIGHT_SPOT, _PRINTED = int(Mark.LIGHT_SPOT), int(Mark.PRINTED)
 
 #: What a ray met where that is not a parallelogram (those count from 0).
 FLOOR, CEILING, SKY = -1, -2, -3

@@ -15,6 +15,7 @@ from camera import Camera
 from camera.uncertainty import IDENTITY
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from tools.simulator.driving import planar_transform
+from tools.simulator.pixels import image_of
 from tools.simulator.ray_kernels import SKY, light_along
 from tools.simulator.scene import Scene
 
@@ -183,7 +184,7 @@ def grey_values(radiance: Float32Array, sensor: Sensor, rng: np.random.Generator
     noisy = np.minimum(grey, 255.0) + sigma * rng.standard_normal(grey.shape)
     # Past saturation noise no longer shows.
     noisy = np.where(grey > 262.0, 255.0, noisy)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return image_of(noisy)
 
 
 def _through_lens(radiance: Float32Array, sensor: Sensor) -> FloatArray:

@@ -404,13 +404,6 @@ def raster_slice(
     )
 
 
-def flooring(
-    kind: Flooring, albedo: float, contrast: float, gloss: float, pitch: float = 0.0
-) -> list[float]:
-    """Row of a floor covering; `pitch` is the side of tiles or the width of planks (m)."""
-    return [kind, albedo, contrast, gloss, pitch]
-
-
 def _records(rows: Any, kind: np.dtype[np.void]) -> Any:
     columns = len(kind.names or ())
     return np.array(rows, dtype=np.float64).reshape(-1, columns).view(kind).reshape(-1)

@@ -57,7 +57,6 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     output, temporary, caches = (folder / name for name in ("results", "temporary", "tables"))
     for path in (output, temporary, caches):
         path.mkdir()
-    mark = f"REDETECT_SOAK={folder}"
     added = {"REDETECT_SOAK": str(folder), "TMPDIR": str(temporary), "REDETECT_CACHE": str(caches)}
     command = [sys.executable, "-m", "detect", "all", str(run), "-o", str(output), "--force"]
     first: dict[str, bytes] = {}
@@ -76,7 +75,7 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
         different += found != first
     return ShortRuns(
         runs=runs,
-        processes=len(marked(mark)),
+        processes=len(marked("REDETECT_SOAK", str(folder))),
         shared=len(_left_for_good(_shared() - shared)),
         temporary=len(_names(temporary)),
         hidden=sum(name.startswith(".") for name in _names(output)),
@@ -85,9 +84,8 @@ def repeat_short_runs(source: Path, folder: Path, runs: int, jobs: int) -> Short
     )
 
 
-def marked(variable: str) -> list[int]:
-    """Processes with a ``NAME=value`` in their environment, except this one."""
-    name, _, value = variable.partition("=")
+def marked(name: str, value: str) -> list[int]:
+    """Processes with a variable of this value in their environment, except this one."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):

@@ -27,7 +27,7 @@ HEAD = "pose,t,point,fiducial,distance_m\n"
 
 
 def test_points_come_back(tmp_path: Path) -> None:
-    write_survey(tmp_path / "fiducials.json", SURVEY, {"note": "text"})
+    write_survey(tmp_path / "fiducials.json", SURVEY)
     read = read_survey(tmp_path / "fiducials.json")
     assert read.sigma_m == 0.005
     for a, b in (

@@ -49,7 +49,7 @@ def test_dark_discs_are_seen_as_light_ones(published_camera: Camera) -> None:
     dark = 255 - with_disc(floor, floor_xy, place, 0.1, np.random.default_rng(3))
     gathering = rim_data._Gathering(np.random.default_rng(4))
     truth = rim_data.Truth(dark=rim_data._images(camera, place))
-    gathering.add(np.asarray(dark, np.uint8), camera, truth, (1.0, 1.0), "here")
+    gathering.add(np.asarray(dark, np.uint8), camera, truth, (1.0, 1.0))
     for rows in (gathering.sparse, gathering.rims):
         [disc] = [grey for _, grey, _, is_disc, *_ in rows if is_disc]
         assert np.nanmin(disc) >= 0.0

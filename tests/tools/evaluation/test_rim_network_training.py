@@ -23,7 +23,7 @@ def samples_of(count: int, seed: int) -> Samples:
     return Samples(
         rng.normal(size=(count, 3)), grey.astype(np.float32),
         rng.uniform(4.0, 9.0, (count, 2, DIRECTIONS)).astype(np.float32),
-        is_disc, np.ones(count), np.full(count, "here"),
+        is_disc, np.ones(count),
     )  # fmt: skip
 
 

@@ -331,9 +331,10 @@ def test_near_patterns_are_in_no_dictionary() -> None:
     rng = np.random.default_rng(1)
     for name in dictionary_names():
         dictionary = marker_dictionary(name)
-        pattern, distance = near_pattern(dictionary, rng)
+        pattern = near_pattern(dictionary, rng)
         assert pattern.shape == dictionary.patterns.shape[1:]
-        assert distance == pattern_distance(dictionary, pattern) > 0
+        distance = pattern_distance(dictionary, pattern)
+        assert distance > 0
         if len(dictionary) <= 512 and dictionary.patterns.any(axis=0).sum() >= 36:
             assert distance >= 3
     dictionary = marker_dictionary("rawseeds")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,11 @@ from tools.simulator.markers.samples import (
     SampleSettings,
     sample_cameras,
     sample_frame,
-    sample_frames,
 )
 from tools.simulator.markers.surface import Texture, marker_texture, texture_distance
 from tools.simulator.markers.things import THINGS, near_marker, thing
 from tools.simulator.markers.truth import marker_corners, mean_side_px, slant_deg
+from tools.simulator.parallel import in_order
 
 SETTINGS = SampleSettings(width=320, height=240, width_px=(12.0, 90.0))
 
@@ -39,8 +40,8 @@ def test_a_frame_depends_on_seed_and_number_alone() -> None:
 
 @pytest.mark.long
 def test_other_processes_render_the_same() -> None:
-    here = list(sample_frames(SETTINGS, 2, range(3)))
-    there = list(sample_frames(SETTINGS, 2, range(3), jobs=2))
+    render = partial(sample_frame, SETTINGS, 2)
+    here, there = (list(in_order(render, range(3), jobs)) for jobs in (1, 2))
     for one, other in zip(here, there):
         np.testing.assert_array_equal(one.image, other.image)
         assert one.as_json() == other.as_json()

@@ -18,7 +18,6 @@ from tools.simulator.scene import (
     Look,
     Mark,
     Scene,
-    flooring,
     make_scene,
     raster_shape,
 )
@@ -33,7 +32,7 @@ def _scene(building: Construction) -> Scene:
     shape = raster_shape(EXTENT)
     scene = make_scene(
         building, EXTENT, np.zeros(shape, dtype=np.int8),
-        np.array([flooring(Flooring.LINOLEUM, GREY, 0.0, 0.0)]),
+        np.array([[Flooring.LINOLEUM, GREY, 0.0, 0.0, 0.0]]),
         np.zeros(shape, dtype=np.uint8), sky=GREY, lit=False,
     )  # fmt: skip
     side = np.zeros((*shape, 3))

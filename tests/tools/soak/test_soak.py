@@ -66,14 +66,14 @@ def test_processes_are_found_and_measured() -> None:
             assert len(found) == 2
             assert found[0].resident_bytes > 40 << 20
             assert found[0].descriptors >= 33
-            assert sorted(marked(f"REDETECT_MARK={mark}")) == sorted(s.pid for s in found)
+            assert sorted(marked("REDETECT_MARK", mark)) == sorted(s.pid for s in found)
         finally:
             for state in reversed(found):
                 os.kill(state.pid, 9)
     end = time.monotonic() + PATIENCE_S  # one that is nobody's child any more ends when it is let
-    while marked(f"REDETECT_MARK={mark}") and time.monotonic() < end:
+    while marked("REDETECT_MARK", mark) and time.monotonic() < end:
         time.sleep(0.01)
-    assert marked(f"REDETECT_MARK={mark}") == []
+    assert marked("REDETECT_MARK", mark) == []
 
 
 def test_demands() -> None:

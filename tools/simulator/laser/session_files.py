@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
@@ -174,7 +174,7 @@ def write_session(
             write_scans(place / f"{scanner.name}.scans.npz", scans, overwrite=overwrite)
     write_planar_poses(folder / "odometry.csv", odometry_stream(plan), overwrite=overwrite)
     write_planar_poses(folder / "camera.csv", camera_stream(plan), overwrite=overwrite)
-    write_survey(folder / "fiducials.json", survey_of(plan), {"note": NOTE}, overwrite=overwrite)
+    write_survey(folder / "fiducials.json", survey_of(plan), overwrite=overwrite)
     write_distances(folder / "distances.csv", measured_distances(plan), overwrite=overwrite)
     _write_tape(plan, folder, overwrite)
     reports = np.arange(plan.route.start_s, plan.route.end_s, 1.0 / settings.ptpd_hz)
@@ -226,7 +226,7 @@ def _write_site(plan: SessionPlan, folder: Path, overwrite: bool) -> None:
     sigmas = settings.mount_sigma_m, settings.mount_sigma_deg
     mounted = _by_hand(plan.robot.scanners, *sigmas, plan.random("mounts"))
     robot = replace(plan.robot, scanners=tuple(mounted))
-    write_robot(folder / "robot.json", robot, note, overwrite=overwrite)
+    write_robot(folder / "robot.json", robot, overwrite=overwrite)
     sigmas = settings.hand_sigma_m, settings.hand_sigma_deg
     fixed = _by_hand(plan.scanners, *sigmas, plan.random("hand"))
     fixed = displaced(fixed, settings.faults.wrong_scanner, settings.faults.by)
@@ -328,17 +328,15 @@ def write_scans(path: Path, scans: Scans, *, overwrite: bool = False) -> None:
         np.savez_compressed(stream, times_s=scans.times_s, ranges_mm=scans.ranges_mm)
 
 
-def write_robot(
-    path: Path, robot: Robot, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
-) -> None:
-    """Write a ``robot.json``, and other entries."""
+def write_robot(path: Path, robot: Robot, *, overwrite: bool = False) -> None:
+    """Write a ``robot.json``."""
     content = {
         "version": 1,
         "outline": robot.outline.tolist(),
         "largest_speed_m_s": robot.largest_speed_m_s,
         "largest_turn_rad_s": robot.largest_turn_rad_s,
         "scanners": [scanner_entry(scanner) for scanner in robot.scanners],
-        **(extra or {}),
+        "note": NOTE,
     }
     write_json(path, content, overwrite=overwrite)
 
@@ -361,16 +359,14 @@ def write_drawing(path: Path, walls: FloatArray, *, overwrite: bool = False) -> 
     write_lines(path, [head, *entities], overwrite=overwrite)
 
 
-def write_survey(
-    path: Path, survey: Survey, extra: Mapping[str, Any] | None = None, *, overwrite: bool = False
-) -> None:
-    """Write a ``fiducials.json``, and other entries."""
+def write_survey(path: Path, survey: Survey, *, overwrite: bool = False) -> None:
+    """Write a ``fiducials.json``."""
     content = {
         "version": 1,
         "fiducials": {name: point.tolist() for name, point in survey.fiducials.items()},
         "robot_points": {name: point.tolist() for name, point in survey.robot_points.items()},
         "sigma_m": survey.sigma_m,
-        **(extra or {}),
+        "note": NOTE,
     }
     write_json(path, content, overwrite=overwrite)
 

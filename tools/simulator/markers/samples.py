@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -34,7 +34,6 @@ from tools.simulator.markers.surface import (
     Texture,
     box_against,
     box_sides,
-    cross,
     marker_surface,
     plain,
 )
@@ -94,19 +93,19 @@ def random_pose(
     ray = camera.unproject(pixel)
     ray /= np.linalg.norm(ray)
     toward = -ray
-    across = cross(toward, np.array([0.0, 1.0, 0.0]))
+    across = np.cross(toward, np.array([0.0, 1.0, 0.0]))
     across /= np.linalg.norm(across)
-    upward = cross(toward, across)
+    upward = np.cross(toward, across)
     direction = rng.uniform(0.0, 2.0 * np.pi)
     sideways = np.cos(direction) * across + np.sin(direction) * upward
     slant = np.radians(slant_deg)
     normal = np.cos(slant) * toward + np.sin(slant) * sideways
     turn = rng.uniform(0.0, 2.0 * np.pi)
-    other = cross(normal, toward if slant > 0.1 else across)
+    other = np.cross(normal, toward if slant > 0.1 else across)
     other /= np.linalg.norm(other)
-    x = np.cos(turn) * other + np.sin(turn) * cross(normal, other)
+    x = np.cos(turn) * other + np.sin(turn) * np.cross(normal, other)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, cross(normal, x), normal
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, np.cross(normal, x), normal
     distance = camera.scale_x * width_m / width_px
     for _ in range(4):
         pose[:3, 3] = distance * ray
@@ -396,7 +395,7 @@ def write_samples(
         write_camera(camera, folder / f"camera{number}.cam", overwrite=overwrite)
     names = {format_camera(camera): f"camera{k}.cam" for k, camera in enumerate(cameras)}
     rows: list[dict[str, Any]] = []
-    for frame in sample_frames(settings, seed, range(count), jobs):
+    for frame in in_order(partial(sample_frame, settings, seed), range(count), jobs):
         prefix = f"s{seed}.{frame.index:05d}"
         png = encoded(frame.image, ".png")
         write_bytes(folder / "images" / f"{prefix}.png", png, overwrite=overwrite)
@@ -405,10 +404,3 @@ def write_samples(
     head = {"settings": {**asdict(settings), "photographs": None}}
     write_truth(folder / "truth.json", head, {"frames": rows}, overwrite=overwrite)
     return sum(len(row["markers"]) for row in rows)
-
-
-def sample_frames(
-    settings: SampleSettings, seed: int, indices: Sequence[int], jobs: int = 1
-) -> Iterator[SampleFrame]:
-    """Frames of a seed in order, rendered by one or more processes; the same either way."""
-    return in_order(partial(sample_frame, settings, seed), indices, jobs)

@@ -69,18 +69,11 @@ def square_corners(width_m: float, height_m: float | None = None) -> FloatArray:
     return np.array([[-x, y, 0.0], [x, y, 0.0], [x, -y, 0.0], [-x, -y, 0.0]])
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product of two single vectors, many times as quick as NumPy's."""
-    a0, a1, a2 = a.tolist()
-    b0, b1, b2 = b.tolist()
-    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
-
-
 def pose_of(x_axis: ArrayLike, y_axis: ArrayLike, origin: ArrayLike) -> FloatArray:
     """parent_from_surface of a surface whose x and y axes are given as unit vectors."""
     x, y = np.asarray(x_axis, dtype=np.float64), np.asarray(y_axis, dtype=np.float64)
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, y, cross(x, y)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = x, y, np.cross(x, y)
     pose[:3, 3] = origin
     return pose
 
@@ -96,7 +89,7 @@ def box_sides(
     result = []
     for side, texture in textures.items():
         x_axis, y_axis = np.array(_SIDES[side][0]), np.array(_SIDES[side][1])
-        outward = cross(x_axis, y_axis)
+        outward = np.cross(x_axis, y_axis)
         local = pose_of(x_axis, y_axis, centre + outward * half)
         across = 2.0 * float(np.abs(x_axis) @ half)
         upward = 2.0 * float(np.abs(y_axis) @ half)
@@ -197,16 +190,14 @@ def _cells_apart(dictionary: MarkerDictionary, cells: Float32Array) -> float:
     return float(min(np.abs(known - t).sum(axis=1).min() for t in turned))
 
 
-def near_pattern(dictionary: MarkerDictionary, rng: np.random.Generator) -> tuple[BoolArray, int]:
-    """A pattern laid out as the dictionary's, but of no marker in it.
+def near_pattern(dictionary: MarkerDictionary, rng: np.random.Generator) -> BoolArray:
+    """(G, G) A pattern laid out as the dictionary's, but of no marker in it.
 
     Half of the patterns are random, half are markers some of whose cells were changed.
-
-    Returns `pattern` (G, G).
     """
-    used = dictionary.patterns.any(axis=0)
+    used = np.asarray(dictionary.patterns.any(axis=0))
     changed = rng.random() < 0.5
-    best: tuple[BoolArray, int] | None = None
+    best, most = used, -1.0
     for _ in range(_TRIES):
         if changed:
             pattern = dictionary.patterns[rng.integers(len(dictionary))].copy()
@@ -216,10 +207,8 @@ def near_pattern(dictionary: MarkerDictionary, rng: np.random.Generator) -> tupl
         else:
             pattern = (rng.random(used.shape) < rng.uniform(0.3, 0.7)) & used
         distance = pattern_distance(dictionary, pattern)
-        if best is None or distance > best[1]:
-            best = pattern, distance
-        if distance >= LEAST_DIFFERENCE:
+        if distance > most:
+            best, most = pattern, distance
+        if most >= LEAST_DIFFERENCE:
             break
-    if best is None:
-        raise RuntimeError("no pattern was tried")
     return best

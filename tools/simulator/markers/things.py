@@ -153,8 +153,7 @@ def hole_grid(rng: np.random.Generator) -> Texture:
 
 def near_marker(rng: np.random.Generator, dictionary: MarkerDictionary) -> Texture:
     """A black square laid out as a marker of the dictionary, but of no marker in it."""
-    pattern, _ = near_pattern(dictionary, rng)
-    return pattern_texture(dictionary, pattern, int(rng.integers(1, 3)))
+    return pattern_texture(dictionary, near_pattern(dictionary, rng), int(rng.integers(1, 3)))
 
 
 def board(rng: np.random.Generator) -> Texture:
