@@ -173,7 +173,7 @@ def test_a_wrong_flag_of_a_study_is_quoted(capsys: pytest.CaptureFixture[str]) -
 def test_no_flags_are_not_those_of_the_process(
     kind: type[Study], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kind, "measured", lambda _: {})
+    monkeypatch.setattr(kind, "measure", lambda _: {})
     monkeypatch.setattr("sys.argv", ["pytest", "--not-a-flag"])
     assert import_module(kind.__module__).main([]) == 0
     with pytest.raises(SystemExit):

@@ -75,7 +75,7 @@ class Benchmark(Study):
     jobs: tuple[int, ...] = (1, 2)  # Numbers of jobs, for the growing runs.
     seed: int = 0  # Of noise and positions.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         # All are measured on one core; only the jobs of whole runs may use more.
         cv2.setNumThreads(1)
         numba.set_num_threads(1)

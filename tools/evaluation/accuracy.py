@@ -86,7 +86,7 @@ class AccuracyStudy(Study):
     discs: int = 400  # Discs per blur.
     seed: int = 1  # Of positions and noise.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         camera = read_camera(self.camera)
         table = Table(
             {"blur px": ".1f", "distance m": "<10", "discs": "d", "rms u px": "9.4f",

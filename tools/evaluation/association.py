@@ -42,7 +42,7 @@ class Association(Study):
     sigma_scale: float = 1.4  # Factor on the discs' standard deviations in all gates.
     seed: int = 1  # Of the noise.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         demand_some(self.runs, "runs")
         table = Table(
             {"run": "<12", "noise": "g", "method": "<8", "kind": "<8", "level": "<6",
@@ -81,7 +81,7 @@ class WakingUp(Study):
     path: Path  # `path.csv` of the same run in that map.
     every: int = 50  # Number of frames between the places.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         recording, discs = read_recording(self.run), read_map(self.map).discs.xy
         poses = read_path(self.path).poses
         off, turned, taken, squared = [], [], [], []
@@ -114,7 +114,7 @@ class Joining(Study):
     run: Positional[Path]  # Run folder or `.circles` file with IDs.
     at: tuple[int, ...] = ()  # First frames of the further parts; by default the middle.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         whole = read_recording(self.run)
         starts = [0, *(self.at or (len(whole) // 2,))]
         parts = [whole.part(a, b) for a, b in zip(starts, [*starts[1:], len(whole)])]
@@ -154,7 +154,7 @@ class JoiningPairs(Study):
     frames: int = 300  # Frames per piece.
     least: int = 5  # Least number of common discs of pieces that show the same place.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         whole = read_recording(self.run)
         starts = range(0, len(whole) - self.frames + 1, self.frames)
         pieces = [whole.part(start, start + self.frames) for start in starts]

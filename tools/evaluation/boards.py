@@ -196,7 +196,7 @@ class TutorialPhotographs(Study):
     count: int = 14  # Number of photographs of the hand-held board.
     seed: int = 3  # Of the board's positions and the noise.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         camera = read_camera(self.camera)
         boards, floor = self.output / "boards", self.output / "floor.png"
         for path in (boards, floor):

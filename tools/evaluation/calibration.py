@@ -208,7 +208,7 @@ class CameraRendered(Study):
     views: int = 24  # Number of pictures.
     seed: int = 7  # Of everything random.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         camera = read_camera(self.camera)
         print("Points' own error, held out, projection (worst, median, predicted) in px")
         table = Table(
@@ -243,7 +243,7 @@ class CameraPhotographs(Study):
     groups: tuple[str, ...] = ("asym", "sym", "rct", "robvis")  # Cameras, by prefix of the names.
     polynomial: Literal["auto", "on", "off"] = "auto"  # As of `camera calibrate`.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         print("RMS px; OpenCV: rational, the same without p1 p2 (radial)")
         errors = dict.fromkeys(("ours", "rational", "radial"), "8.4f")
         table = Table(

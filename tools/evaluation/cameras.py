@@ -14,7 +14,7 @@ from detect.circles import detect_circles, vote_shape
 from detect.settings import CircleSettings
 from lut import build_vote_table
 from lut.votes import radius_px
-from tools.evaluation.disturbed import Stage, Tally, count_found, render_scene
+from tools.evaluation.disturbed import FloorScene, Tally, count_found, render_scene
 from tools.evaluation.figures import Figures, Study
 from tools.evaluation.tables import Table
 
@@ -47,7 +47,7 @@ class Cameras(Study):
     scenes: int = 4  # Images of each camera, with up to four discs.
     seed: int = 1  # Of everything random.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         tallies = {low: Tally() for low in _CLASSES_PX[:-1]}
         every = Tally()
         for number in range(self.cameras):
@@ -55,10 +55,10 @@ class Cameras(Study):
             camera = random_camera(rng)
             radius_m = float(np.clip(rng.uniform(0.06, 0.16) * camera.centre[2], 0.03, 0.2))
             settings = replace(CircleSettings(radius_m=radius_m), tilt_sigma_deg=0.0)
-            stage = Stage(camera, radius_m, rng)
+            scene = FloorScene(camera, radius_m, rng)
             votes = build_vote_table(camera, vote_shape(settings))
             for _ in range(self.scenes):
-                image, places = render_scene(stage, "", 0.0, rng)
+                image, places = render_scene(scene, "", 0.0, rng)
                 found = detect_circles(image, camera, votes, settings)
                 count_found(every, camera, found, places, radius_m)
                 jacobians = camera.floor_jacobian(camera.project_floor(places))

@@ -57,7 +57,7 @@ class Photographs(Study):
 
     data: Positional[Path] = Path("../shared/data/discs")  # Folder with `evaluate.py` and `dev`.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         normalised: list[float] = []
         with tempfile.TemporaryDirectory() as folder:
             files = []
@@ -84,7 +84,7 @@ class Buildings(Study):
     data: Positional[Path] = Path("../shared/data/york")  # Folder with `evaluate.py` and `dev`.
     preset: Preset = "default"  # Of the line detector.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
             files = []
             for run in sorted(path.parent for path in self.data.glob("dev/*/truth.json")):
@@ -107,7 +107,7 @@ class Rendered(Study):
     preset: Preset = "default"  # Of the line detector.
     polarity: Polarity = "light"  # Given to the disc detector.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         figures: dict[str, Any] = {}
         with tempfile.TemporaryDirectory() as folder:
             discs, lines, tilts, levelled = (
@@ -135,7 +135,7 @@ class Tilt(Study):
     tilt_prior_deg: float = DEFAULT.tilt_prior_deg
     """Prior standard deviation of the tilt about level, degrees."""
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         with tempfile.TemporaryDirectory() as folder:
             lines, tilts = (Path(folder) / f"detected.{kind}" for kind in ("lines", "tilt"))
             prior = "--tilt-prior-deg", self.tilt_prior_deg

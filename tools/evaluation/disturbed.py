@@ -81,7 +81,7 @@ class Tally:
         return float(np.mean(self.normalised)) if self.normalised else np.nan
 
 
-class Stage:
+class FloorScene:
     """A camera over its floors, on the fine grid, and how far away discs may be."""
 
     def __init__(
@@ -157,22 +157,22 @@ def _texture(kind: str, floor_xy: FloatArray, rng: np.random.Generator) -> Float
     return np.asarray(60.0 + 5.0 * mottled)
 
 
-def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[FloatArray]:
+def _places(scene: FloorScene, outside: float, rng: np.random.Generator) -> list[FloatArray]:
     """Places of discs apart from each other, with a share of the rim outside the image."""
     places: list[FloatArray] = []
-    width, height = stage.camera.width, stage.camera.height
+    width, height = scene.camera.width, scene.camera.height
     for _ in range(4000):
         pixel = rng.uniform([-40.0, 0.0], [width + 40.0, height + 40.0])
-        ahead = stage.camera.floor_from_pixel(pixel)
-        distance = rng.uniform(_NEAREST_M, stage.farthest_m)
+        ahead = scene.camera.floor_from_pixel(pixel)
+        distance = rng.uniform(_NEAREST_M, scene.farthest_m)
         place = ahead * distance / np.hypot(*ahead)
         if not np.isfinite(place).all():
             continue
         if outside > 0.0:
-            fits = abs(1.0 - stage.seen_share(place) - outside) < _SLACK
-            fits = fits and stage.seen_share(place, 0.0) == 1.0
+            fits = abs(1.0 - scene.seen_share(place) - outside) < _SLACK
+            fits = fits and scene.seen_share(place, 0.0) == 1.0
         else:
-            fits = stage.seen_share(place, 1.6) == 1.0
+            fits = scene.seen_share(place, 1.6) == 1.0
         if fits and all(np.hypot(*(place - other)) > _APART_M for other in places):
             places.append(place)
             if len(places) == _PER_SCENE:
@@ -181,30 +181,30 @@ def _places(stage: Stage, outside: float, rng: np.random.Generator) -> list[Floa
 
 
 def render_scene(
-    stage: Stage, kind: str, share: float, rng: np.random.Generator
+    scene: FloorScene, kind: str, share: float, rng: np.random.Generator
 ) -> tuple[ByteArray, list[FloatArray]]:
     """(H, W) image of a floor with discs of one family of disturbances, or look-alikes."""
-    grey = stage.floors[str(rng.choice(list(stage.floors)))].copy()
-    places = _places(stage, share if kind == BORDER else 0.0, rng)
+    grey = scene.floors[str(rng.choice(list(scene.floors)))].copy()
+    places = _places(scene, share if kind == BORDER else 0.0, rng)
     for place in places:
-        window = stage.window(place)
-        offset = (stage.floor_xy[window] - place) / stage.radius_m
+        window = scene.window(place)
+        offset = (scene.floor_xy[window] - place) / scene.radius_m
         light = rng.uniform(170.0, 235.0)
         grey[window] = np.where(np.hypot(*np.moveaxis(offset, -1, 0)) < 1.0, light, grey[window])
-        away = place - stage.camera.centre[:2]
+        away = place - scene.camera.centre[:2]
         about = Surroundings.of(grey[window], offset, float(np.arctan2(away[1], away[0])))
         if kind in LOOK_ALIKES:
             grey[window] = look_alike(about, kind, rng)
         elif kind in DISTURBANCES and share > 0.0:
             grey[window] = np.clip(DISTURBANCES[kind](about, share, rng), 0.0, 255.0)
-    return stage.exposed(grey, BLURRED.get(kind, _OPTICS), rng), places
+    return scene.exposed(grey, BLURRED.get(kind, _OPTICS), rng), places
 
 
-def measure(
+def measure_families(
     camera: Camera, settings: CircleSettings, *, discs: int, shares: Sequence[float], seed: int
 ) -> Iterator[tuple[str, float, Tally]]:
     """Detect the discs of scenes of every family and share, and the look-alikes."""
-    stage = Stage(camera, settings.radius_m, np.random.default_rng(seed))
+    scene = FloorScene(camera, settings.radius_m, np.random.default_rng(seed))
     table = disc_table(camera, settings)
     cases = [(kind, share) for kind in (*DISTURBANCES, BORDER) for share in shares]
     cases += [(kind, 0.0) for kind in (*BLURRED, *LOOK_ALIKES)]
@@ -212,7 +212,7 @@ def measure(
         rng = np.random.default_rng([seed, number])
         tally, empty = Tally(), 0
         while tally.shown < discs:
-            image, places = render_scene(stage, kind, share, rng)
+            image, places = render_scene(scene, kind, share, rng)
             empty = 0 if places else empty + 1
             if empty == _MOST_EMPTY:
                 raise StudyError(f"{kind}: {empty} images without a disc: expected room for some")
@@ -244,14 +244,14 @@ def count_found(
 
 def picture_of(camera: Camera, radius_m: float, share: float, seed: int) -> ByteArray:
     """One disc of every family and one of every look-alike, side by side with their names."""
-    stage = Stage(camera, radius_m, np.random.default_rng(seed))
+    scene = FloorScene(camera, radius_m, np.random.default_rng(seed))
     panels = []
     for number, kind in enumerate((*DISTURBANCES, BORDER, *BLURRED, *LOOK_ALIKES)):
         rng = np.random.default_rng([seed, number])
-        image, places = render_scene(stage, kind, share, rng)
+        image, places = render_scene(scene, kind, share, rng)
         demand_some(places, f"{kind}: discs in the image")
         place = min(places, key=lambda at: abs(float(np.hypot(*at)) - 1.8))
-        panels.append(_panel(image, stage.outline(place, 2.5), kind))
+        panels.append(_panel(image, scene.outline(place, 2.5), kind))
     columns = 6
     panels += [np.full_like(panels[0], 255)] * (-len(panels) % columns)
     rows = [np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)]
@@ -281,7 +281,7 @@ class Disturbed(Study):
     seed: int = 2  # Of scenes and noise; the training of the network begins with 1.
     picture: Path | None = None  # Only draw one disc of each family, without detection.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         camera = read_camera(self.camera)
         settings = CircleSettings(polarity=self.polarity, tilt_sigma_deg=0.0)
         if self.picture is not None:
@@ -292,7 +292,9 @@ class Disturbed(Study):
             {"family": "<18", "share %": ".0f", "shown": "d", "found": ".3f", "rms px": ".2f",
              "normalised": ".2f", "elsewhere": "d"}, keys=2
         )  # fmt: skip
-        results = measure(camera, settings, discs=self.discs, shares=self.shares, seed=self.seed)
+        results = measure_families(
+            camera, settings, discs=self.discs, shares=self.shares, seed=self.seed
+        )
         for kind, share, t in results:
             table.row(kind, 100.0 * share, t.shown, t.recall, t.rms_px, t.normalised_error,
                       t.elsewhere)  # fmt: skip

@@ -51,13 +51,13 @@ class Study:
 
     figures: Path | None = None  # Also write the figures into this file, as JSON.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         """Measure, and print what comes out; returns the figures by name."""
         raise NotImplementedError
 
-    def carried_out(self, command: Sequence[str]) -> int:
+    def carry_out(self, command: Sequence[str]) -> int:
         """Measure, and write figures (9 digits) with the command line; returns the exit code."""
-        found = self.measured()
+        found = self.measure()
         if self.figures is not None:
             head = {"command": shlex.join(command), "version": __version__}
             text = json_text(found)
@@ -74,7 +74,7 @@ def study_main(kind: type[Study], program: str, arguments: Sequence[str] | None 
     at = words.index("--figures") if "--figures" in words else len(words)
     command = [*program.split(), *words[:at], *words[at + 2 :]]
     kept = [word for word in command if not word.startswith("--figures=")]
-    return exit_code_of(lambda: study.carried_out(kept))
+    return exit_code_of(lambda: study.carry_out(kept))
 
 
 def print_figures(figures: Figures) -> None:
@@ -119,7 +119,7 @@ class Programs(Study):
 
     commands: Positional[tuple[str, ...]]  # Each in quotes: `detect circles RUN -o @/x.circles`.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         demand_some(self.commands, "commands")
         with tempfile.TemporaryDirectory() as folder:
             for command in self.commands:
@@ -160,7 +160,7 @@ def _formatted(value: float | None, form: str) -> str:
 class Documents(Study):
     """Insert the figures of docs/figures into the documents; run it from a checkout."""
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         pages = documents(Path())
         for page, text in pages.items():
             write_bytes(page, text.encode(), overwrite=True)

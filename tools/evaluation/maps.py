@@ -87,7 +87,7 @@ class MapStudy(Study):
     runs: Positional[tuple[Path, ...]]  # Run folders.
     seed: int = 1  # Of the odometry that replaces the wrong one.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         demand_some(self.runs, "runs")
         table = Table(
             {"run": "<8", "variant": "<20", "p": "5d", "n": "4d", "m": "6d", "chi-sq.": "9.1f",
@@ -128,7 +128,7 @@ class MapSpeed(Study):
     run: Positional[Path]  # Run folder or .circles file.
     repeats: int = 3  # Number of rounds, each with every solver, in one process.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         graph = graph_of_recording(read_recording(self.run))
         start = first_sight(graph)
 

@@ -176,7 +176,7 @@ class Markers(Study):
     seed: int = 1  # Of all frames.
     jobs: int = 1  # Number of processes.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         wrong: list[str] = []
         figures: dict[str, Any] = {}
         measured = SampleSettings(dictionaries=(self.dictionary,), samples=_MEASURED_SAMPLES)

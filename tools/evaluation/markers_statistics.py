@@ -159,7 +159,7 @@ def scored_frame(frame: SampleFrame, found: dict[str, Found]) -> ScoredFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class ScoredMarkers:
     """All markers of many frames, and the result of each detector."""
 
     frames: int
@@ -167,7 +167,7 @@ class Table:
     outcomes: dict[str, Outcome]  # By detector, of all frames together.
 
 
-def table_of(frames: Sequence[ScoredFrame]) -> Table:
+def table_of(frames: Sequence[ScoredFrame]) -> ScoredMarkers:
     """All frames in one."""
 
     def joined(outcomes: list[Outcome]) -> Outcome:
@@ -179,7 +179,7 @@ def table_of(frames: Sequence[ScoredFrame]) -> Table:
 
     rows = np.concatenate([frame.rows for frame in frames])
     outcomes = {n: joined([frame.outcomes[n] for frame in frames]) for n in frames[0].outcomes}
-    return Table(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
+    return ScoredMarkers(len(frames), dict(zip(COLUMNS, rows.T)), outcomes)
 
 
 #: Title of each quantity, and the limits of its bins.
@@ -194,7 +194,7 @@ BINS: dict[str, tuple[str, tuple[float, ...]]] = {
 _FEWEST = 5
 
 
-def bins_of(table: Table) -> dict[str, BoolArray]:
+def bins_of(table: ScoredMarkers) -> dict[str, BoolArray]:
     """(M,) which markers are clearly in view, and which of them are in each bin of a quantity."""
     clear = table.columns["clear"] > 0.0
     bins = {"all": clear}
@@ -223,7 +223,7 @@ def _errors(outcome: Outcome, found: BoolArray) -> tuple[float, float, float, fl
     )
 
 
-def counts_lines(table: Table) -> list[str]:
+def counts_lines(table: ScoredMarkers) -> list[str]:
     """Numbers of misidentified, false and repeated detections of each detector."""
     markers = len(table.columns["clear"])
     clear = int(table.columns["clear"].sum())
@@ -236,7 +236,7 @@ def counts_lines(table: Table) -> list[str]:
     return lines
 
 
-def print_bins(table: Table, bins: dict[str, BoolArray]) -> dict[str, Any]:
+def print_bins(table: ScoredMarkers, bins: dict[str, BoolArray]) -> dict[str, Any]:
     """Print detection rate and corner errors (pixels) by bins, and where a peer is ahead.
 
     Errors over the markers that each detector found itself; then our median and the peer's over

@@ -326,7 +326,7 @@ class Pictures(Study):
     rows: Path | None = None  # A simulated run, associated and mapped.
     session: Path | None = None  # A simulated session, evaluated.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         self.output.mkdir(parents=True, exist_ok=True)
         run, markers = Path("images/e"), Path("images/m/a")
         self._save("discs", (8, 9.4), lambda f: draw_discs(f, run, 4), 72)

@@ -32,7 +32,7 @@ class RealRun(Study):
     run: Positional[Path] = Path("../shared/data/dlr/e")
     """Run folder with images, calibration and `map.circles`."""
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         """Rows; the share of shipped identifiers found again; the median difference on the floor,
         levelled alike; chi-squared over its expectation of the least-squares map, as calibrated and
         with the camera's mounting as unknown.

@@ -39,7 +39,7 @@ from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.landmarks import read_frames
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced, with_disc
-from tools.evaluation.disturbed import BLURRED, BORDER, Stage, render_scene
+from tools.evaluation.disturbed import BLURRED, BORDER, FloorScene, render_scene
 from tools.simulator.pixels import noisy_image, subpixel_grid
 
 _SETTINGS = CircleSettings()
@@ -55,12 +55,12 @@ _AT_ONCE = 50
 #: How often discs of a frame are disturbed, and how many each time.
 _ROUNDS, _PER_ROUND = 6, 3
 #: How often floors and cameras change, and the disturbed shares.
-_SCENES_PER_STAGE, _SHARES = 50, (0.1, 0.5)
+_IMAGES_PER_SCENE, _SHARES = 50, (0.1, 0.5)
 _FARTHEST_M = (4.0, 7.0)  #: Of discs on rendered floors, by turns.
 #: How often discs are painted into a photograph (into an image of a rendered building: once), how
 #: many, and how far apart.
 _PHOTOGRAPH_ROUNDS, _PAINTED, _APART_M = 8, 6, 0.5
-#: Photographs that are floors of each stage, and how long an image is there.
+#: Photographs that are floors of each scene, and how long an image is there.
 _PHOTOGRAPHED_FLOORS, _FLOOR_M = 4, (1.5, 5.0)
 #: Share of what is no disc on rendered floors and about boards that is used: there is plenty.
 _KEPT = 0.35
@@ -223,12 +223,12 @@ def gather(
     recorded = [frame for frame in recorded[frames] if frame[0].is_file()]
     parts: list[tuple[Any, ...]] = [
         *(
-            (_scenes, camera, kinds, photographs, _SCENES_PER_STAGE)
-            for _ in range(scenes // _SCENES_PER_STAGE)
+            (_scenes, camera, kinds, photographs, _IMAGES_PER_SCENE)
+            for _ in range(scenes // _IMAGES_PER_SCENE)
         ),
         *(
-            (_boards, photographs, _SCENES_PER_STAGE // 5)
-            for _ in range(scenes // _SCENES_PER_STAGE)
+            (_boards, photographs, _IMAGES_PER_SCENE // 5)
+            for _ in range(scenes // _IMAGES_PER_SCENE)
         ),
         *((_photograph, folder) for folder in sorted((data / "york").glob("dev/*/"))),
         *((_building, folder) for folder in buildings),
@@ -255,21 +255,21 @@ def _scenes(
 ) -> None:  # fmt: skip
     """Look at rendered floors with discs or look-alikes (`tools.evaluation.disturbed`)."""
     farthest_m = _FARTHEST_M[number // 2 % 2]
-    stage = Stage(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, farthest_m)
+    scene = FloorScene(camera if number % 2 == 0 else other_camera(rng), _RADIUS, rng, farthest_m)
     for path in rng.choice(np.array(photographs), _PHOTOGRAPHED_FLOORS):
-        stage.floors[path.stem] = _photographed(_read(path), stage.floor_xy, rng)
+        scene.floors[path.stem] = _photographed(_read(path), scene.floor_xy, rng)
     for _ in range(count):
         kind = str(rng.choice(kinds))
-        image, places = render_scene(stage, kind, rng.uniform(*_SHARES), rng)
-        at = _images(stage.camera, np.array(places))
+        image, places = render_scene(scene, kind, rng.uniform(*_SHARES), rng)
+        at = _images(scene.camera, np.array(places))
         if kind in LOOK_ALIKES:
             truth = Truth(others=at)
         else:
-            heights = np.array([np.ptp(stage.outline(place)[:, 1]) for place in places])
+            heights = np.array([np.ptp(scene.outline(place)[:, 1]) for place in places])
             clear = heights >= 2.0 * _LEAST_HALF_PX
-            clear &= np.array([_contrast(image, stage.camera, at) for at in places]) > 6.0
+            clear &= np.array([_contrast(image, scene.camera, at) for at in places]) > 6.0
             truth = Truth(at[clear], unsure=at[~clear])
-        gathering.add(image, stage.camera, truth, _SCENE, _DARK_OTHERS, _KEPT)
+        gathering.add(image, scene.camera, truth, _SCENE, _DARK_OTHERS, _KEPT)
 
 
 def _photographed(
@@ -295,7 +295,7 @@ def _boards(
     """Look at boards, every second one with light discs."""
     for k in range(count):
         path = photographs[rng.integers(len(photographs))]
-        image, camera, places = render_board(_read(path), rng)
+        image, camera, places = render_disc_board(_read(path), rng)
         at = _images(camera, places)
         truth = Truth(dark=at)
         if k % 2:
@@ -378,7 +378,7 @@ def other_camera(rng: np.random.Generator) -> Camera:
     return Camera(width, height, scale, scale, *middle, (0.0,) * 5, pose)
 
 
-def render_board(
+def render_disc_board(
     photograph: ByteArray, rng: np.random.Generator
 ) -> tuple[ByteArray, Camera, FloatArray]:
     """A board of many dark discs before a part of a photograph; its camera and (N, 2) places.

@@ -340,7 +340,7 @@ class TrainRimNetwork(Study):
     """Where the weights go, which replace `detect/discs/rim_network.npz`."""
     force: bool = False  # Replace that file.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         sparse, rims = gather(
             self.data, slice(0, self.frames, self.every), self.scenes, self.seed, self.without
         )

@@ -50,8 +50,8 @@ _LASER_COLUMNS = {
 class _Sessions(Study):
     """Simulated sessions."""
 
-    seeds: int = 20  # Seeds first, first + 1, ...
-    first: int = 1
+    seeds: int = 20  # Number of sessions, each with a seed of its own.
+    first: int = 1  # The first of the seeds, which follow each other.
 
     def table_of(
         self, columns: Mapping[str, str], measure: Callable[[Path, int], dict[str, float]]
@@ -79,11 +79,11 @@ class LaserSessions(_Sessions):
     fault: Literal["none", "crossing", "moved", "rectangle"] = "none"
     """`crossing`: somebody passes right beside the robot; `moved`: a scanner is knocked by 50 mm
     after the empty area was scanned; `rectangle`: the outline does not show the front."""
-    visits: int = 2
-    visit_s: float = 60.0
+    visits: int = 2  # Visits to the covered room.
+    visit_s: float = 60.0  # About how long each of them lasts.
     average: int = 6  # Sets of scans per pose.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         table, rows = self.table_of(_LASER_COLUMNS, self._measured)
         table.row("mean", *np.mean(rows, axis=0))
         if len(rows) > 1:
@@ -199,9 +199,9 @@ class FusionStudy(_Sessions):
     """What goes wrong: the robot's `clock` is set by 0.3 s, the `camera` or the `laser` is lost for
     a while, a `scanner` is knocked after the empty area was scanned, somebody is `crossing` right
     beside the robot."""
-    visits: int = 3
+    visits: int = 3  # Visits to the covered room.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         settings = LaserSettings(visits=self.visits, faults=_FAULTS[self.fault])
 
         def measured(session: Path, seed: int) -> dict[str, float]:

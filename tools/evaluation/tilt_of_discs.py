@@ -143,7 +143,7 @@ class TiltOfDiscs(Study):
     path: Path  # Its `path.csv`.
     raised_m: float = 0.0  # Height of the camera above the calibrated one.
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         camera = read_camera(self.camera)
         files = self.rows, self.tilts, self.map, self.path
         tilts = compare_tilts(camera, *files, self.raised_m)

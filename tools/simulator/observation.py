@@ -119,7 +119,7 @@ def see_discs(
     disc_xy: FloatArray,
     radius_m: float,
 ) -> list[SeenDisc]:
-    """Which discs are in view from a pose. `pose` (3,); `disc_ids`, `disc_xy` (M,)."""
+    """Which discs are in view from a pose. `pose` (3,); `disc_ids` (M,); `disc_xy` (M, 2)."""
     robot_xy = disc_in_robot(pose, disc_xy)
     pixels = true.project_floor(robot_xy)
     inside = _in_image(true, pixels)

@@ -161,7 +161,7 @@ class Sensor:
     shot_noise_grey: float = 1.5
     """Standard deviation of the further noise at white, grey values; grows as the square root."""
     exposure: float = 0.03  # Time of exposure as a share of the time between frames.
-    jpeg_quality: int = 80
+    jpeg_quality: int = 80  # Of the images, 0 to 100.
 
 
 def grey_values(radiance: Float32Array, sensor: Sensor, rng: np.random.Generator) -> ByteArray:

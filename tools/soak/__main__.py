@@ -30,7 +30,7 @@ class Soak(Study):
     scratch: Path | None = None
     """Folder for the run and its results, which are removed; on the source's file system."""
 
-    def measured(self) -> Figures:
+    def measure(self) -> Figures:
         result: ShortRuns | SoakResult
         with tempfile.TemporaryDirectory(dir=self.scratch, prefix="soak-") as name:
             folder = Path(name)

@@ -20,7 +20,7 @@ from tools.evaluation.figures import StudyError
 #: and files are renamed.
 _FIRST, _LAST = (0.01, 0.11), (0.89, 0.99)
 #: The processes are examined each time such a share of the run is done, whatever its duration.
-_LOOK_EVERY = 0.004
+_SAMPLE_EVERY = 0.004
 _POLL_EVERY_S = 0.02
 _DECODINGS = 5
 _MIB = 1 << 20
@@ -52,7 +52,7 @@ def family(pid: int) -> list[ProcessState]:
     return found
 
 
-class _Look(NamedTuple):
+class _Sample(NamedTuple):
     time_s: float
     frames: int
     processor_s: float  # Of all processes.
@@ -111,22 +111,22 @@ def soak(run: Path, output: Path, frames: int, jobs: int) -> SoakResult:
     ) as process:
         try:
             image = min((run / "images").iterdir()).read_bytes()
-            least = int(_LOOK_EVERY * frames)
-            looks = _looks_at(process, output / ".detected.journal", image, least)
+            least = int(_SAMPLE_EVERY * frames)
+            samples = _samples_of(process, output / ".detected.journal", image, least)
             _, said = process.communicate()
         except BaseException:
             process.kill()
             raise
     if process.returncode != 0:
         raise StudyError(f"detect ended with {process.returncode}: {said.strip()[-500:]}")
-    return _result(looks, frames, jobs, time.monotonic() - begin_s)
+    return _result(samples, frames, jobs, time.monotonic() - begin_s)
 
 
-def _looks_at(
+def _samples_of(
     process: subprocess.Popen[str], journal: Path, image: bytes, least: int
-) -> list[_Look]:
+) -> list[_Sample]:
     """Sample the processes whenever enough further frames are in the journal."""
-    looks: list[_Look] = []
+    samples: list[_Sample] = []
     lines, place = -1, 0  # the first line is not a frame
     while process.poll() is None:
         content = b""
@@ -135,17 +135,17 @@ def _looks_at(
             content = stream.read()
         lines += content.count(b"\n")
         place += len(content)
-        if lines - (looks[-1].frames if looks else 0) > least and (own := family(process.pid)):
+        if lines - (samples[-1].frames if samples else 0) > least and (own := family(process.pid)):
             resident = [state.resident_bytes / _MIB for state in own]
-            looks.append(
-                _Look(
+            samples.append(
+                _Sample(
                     time.monotonic(), lines, sum(state.processor_s for state in own), resident[0],
                     max(resident[1:], default=0.0), sum(state.descriptors for state in own),
                     len(own), _decoding_s(image),
                 )
             )  # fmt: skip
         time.sleep(_POLL_EVERY_S)
-    return looks
+    return samples
 
 
 def _decoding_s(image: bytes) -> float:
@@ -159,11 +159,11 @@ def _decoding_s(image: bytes) -> float:
     return float(np.median(times_s[1:]))
 
 
-def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> SoakResult:
-    done = np.array([look.frames for look in looks], float)
-    if len(looks) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
+def _result(samples: list[_Sample], frames: int, jobs: int, duration_s: float) -> SoakResult:
+    done = np.array([sample.frames for sample in samples], float)
+    if len(samples) < 40 or np.count_nonzero(done <= _FIRST[1] * frames) < 4:
         raise StudyError(f"{frames} frames: too few to be sampled, expected more")
-    columns = _Look(*np.array(looks, float).T)
+    columns = _Sample(*np.array(samples, float).T)
 
     def per_frame(values: Any, share: tuple[float, float]) -> float:
         begin, end = np.interp([share[0] * frames, share[1] * frames], done, values)
@@ -187,12 +187,12 @@ def _result(looks: list[_Look], frames: int, jobs: int, duration_s: float) -> So
         ),
         decoding_ms=(1e3 * decoding[0], 1e3 * decoding[1]),
         decodings_per_frame=(computed[0] / decoding[0], computed[1] / decoding[1]),
-        resident_mib=tuple(looks[moment].resident_mib for moment in moments),
-        worker_mib=tuple(looks[moment].worker_mib for moment in moments),
+        resident_mib=tuple(samples[moment].resident_mib for moment in moments),
+        worker_mib=tuple(samples[moment].worker_mib for moment in moments),
         # The least around a moment, since an image may be read just then.
         descriptors=tuple(
-            min(look.descriptors for look in looks[max(moment - 4, 0) : moment + 5])
+            min(sample.descriptors for sample in samples[max(moment - 4, 0) : moment + 5])
             for moment in moments
         ),
-        processes=max(look.processes for look in looks),
+        processes=max(sample.processes for sample in samples),
     )

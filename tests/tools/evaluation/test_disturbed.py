@@ -17,14 +17,14 @@ from tools.evaluation.disturbances import (
     look_alike,
     with_disc,
 )
-from tools.evaluation.disturbed import BLURRED, BORDER, Stage, measure, render_scene
+from tools.evaluation.disturbed import BLURRED, BORDER, FloorScene, measure_families, render_scene
 
 SETTINGS = CircleSettings(polarity="light", tilt_sigma_deg=0.0)
 
 
 @pytest.fixture(scope="module")
-def stage(published_camera: Camera) -> Stage:
-    return Stage(published_camera, 0.1, np.random.default_rng(1))
+def scene(published_camera: Camera) -> FloorScene:
+    return FloorScene(published_camera, 0.1, np.random.default_rng(1))
 
 
 def bare_disc() -> Surroundings:
@@ -58,27 +58,27 @@ def test_a_look_alike_leaves_nothing_of_the_disc(kind: str) -> None:
         look_alike(about, "no such thing", np.random.default_rng(3))
 
 
-def test_scenes_are_the_same_again_and_discs_where_they_are_stated(stage: Stage) -> None:
-    image, places = render_scene(stage, "tape", 0.0, np.random.default_rng(5))
-    again, _ = render_scene(stage, "tape", 0.0, np.random.default_rng(5))
+def test_scenes_are_the_same_again_and_discs_where_they_are_stated(scene: FloorScene) -> None:
+    image, places = render_scene(scene, "tape", 0.0, np.random.default_rng(5))
+    again, _ = render_scene(scene, "tape", 0.0, np.random.default_rng(5))
     assert len(places) > 0
     np.testing.assert_array_equal(image, again)
     for place in places:
-        u, v = np.rint(stage.camera.project_floor(place)).astype(int)
-        rim = np.rint(stage.outline(place, 1.5)).astype(int)
+        u, v = np.rint(scene.camera.project_floor(place)).astype(int)
+        rim = np.rint(scene.outline(place, 1.5)).astype(int)
         assert image[v, u] > image[rim[:, 1], rim[:, 0]].max() + 20
 
 
-def test_a_disc_is_cut_by_the_border_as_asked(stage: Stage) -> None:
+def test_a_disc_is_cut_by_the_border_as_asked(scene: FloorScene) -> None:
     for seed in range(3):
-        _, places = render_scene(stage, BORDER, 0.3, np.random.default_rng(seed))
+        _, places = render_scene(scene, BORDER, 0.3, np.random.default_rng(seed))
         for place in places:
-            assert 1.0 - stage.seen_share(place) == pytest.approx(0.3, abs=0.06)
+            assert 1.0 - scene.seen_share(place) == pytest.approx(0.3, abs=0.06)
 
 
-def test_a_disc_that_is_painted_into_an_image_is_found_there(stage: Stage) -> None:
-    camera, rng = stage.camera, np.random.default_rng(4)
-    image = stage.exposed(stage.floors["tiles"], (0.0, 0.7), rng)
+def test_a_disc_that_is_painted_into_an_image_is_found_there(scene: FloorScene) -> None:
+    camera, rng = scene.camera, np.random.default_rng(4)
+    image = scene.exposed(scene.floors["tiles"], (0.0, 0.7), rng)
     places = np.array([(-0.4, -1.5), (0.5, -2.0), (0.0, -3.0)])
     floor_xy = floor_positions(camera).astype(np.float32)
     for place in places:
@@ -92,7 +92,7 @@ def test_a_disc_that_is_painted_into_an_image_is_found_there(stage: Stage) -> No
 @pytest.mark.long
 def test_the_figures_of_every_family(published_camera: Camera) -> None:
     """A few discs each; the documentation's table has a hundred."""
-    results = list(measure(published_camera, SETTINGS, discs=4, shares=(0.2,), seed=1))
+    results = list(measure_families(published_camera, SETTINGS, discs=4, shares=(0.2,), seed=1))
     kinds = [kind for kind, _, _ in results]
     assert kinds == [*DISTURBANCES, BORDER, *BLURRED, *LOOK_ALIKES]
     discs = [tally for kind, _, tally in results if kind not in LOOK_ALIKES]

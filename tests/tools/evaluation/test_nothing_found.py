@@ -11,7 +11,7 @@ from detect.settings import CircleSettings
 from tools.evaluation.__main__ import main
 from tools.evaluation.boards import IN_HAND, board_poses
 from tools.evaluation.detection import _tilt_errors
-from tools.evaluation.disturbed import measure
+from tools.evaluation.disturbed import measure_families
 from tools.evaluation.figures import StudyError
 
 #: It looks down at a spot of the floor that is smaller than a disc.
@@ -58,7 +58,7 @@ def test_a_camera_that_never_sees_a_board_or_a_disc(monkeypatch: pytest.MonkeyPa
     with pytest.raises(StudyError, match="in 0 poses: expected 2"):
         board_poses(NARROW, IN_HAND, 2, 1, distances_m=(0.25, 0.5))
     with pytest.raises(StudyError, match="images without a disc"):
-        list(measure(NARROW, CircleSettings(), discs=1, shares=(0.2,), seed=1))
+        list(measure_families(NARROW, CircleSettings(), discs=1, shares=(0.2,), seed=1))
 
 
 @pytest.mark.parametrize("there", ["boards", "floor.png"])

@@ -92,7 +92,7 @@ def displaced(
     return [replace(s, pose=s.pose + by) if s.name == name else s for s in scanners]
 
 
-def sick(name: str, pose: FloatArray, settings: LaserSettings) -> Scanner:
+def sick_scanner(name: str, pose: FloatArray, settings: LaserSettings) -> Scanner:
     """A scanner of 181 beams over half a turn at an exact pose."""
     return Scanner(
         name, pose, np.zeros((3, 3)), -np.pi / 2, np.pi / 180, 181, settings.max_range_m,
@@ -106,7 +106,7 @@ def _robot(settings: LaserSettings) -> Robot:
     corners = [(back, half), (back, -half), (front - cut, -half), (front, cut - half),
                (front, half - cut), (front - cut, half)]  # fmt: skip
     mounts = (("front", (0.36, 0.0, 0.0)), ("rear", (-0.46, 0.0, np.pi)))
-    onboard = tuple(sick(name, np.array(pose), settings) for name, pose in mounts)
+    onboard = tuple(sick_scanner(name, np.array(pose), settings) for name, pose in mounts)
     limits = settings.driving
     # Without a cut there are two corners less.
     outline = np.array(list(dict.fromkeys(corners)))
@@ -124,7 +124,7 @@ def _fixed_scanners(settings: LaserSettings, seed: int) -> tuple[Scanner, ...]:
             [x - along * np.sin(angle), y + along * np.cos(angle),
              angle + np.deg2rad(rng.uniform(-4.0, 4.0))]
         )  # fmt: skip
-        scanners.append(sick(f"fixed{i}", pose, settings))
+        scanners.append(sick_scanner(f"fixed{i}", pose, settings))
     return tuple(scanners)
 
 

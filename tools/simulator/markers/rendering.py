@@ -154,8 +154,8 @@ class Imaging:
     """How light becomes grey values."""
 
     blur_px: float = 0.7  # Standard deviation of the optics' Gaussian blur, pixels.
-    black_level: float = 10.0  # Float32Array value of no light at all.
-    gain: float = 220.0  # Float32Array levels per reflectance in full light.
+    black_level: float = 10.0  # Grey value of no light at all.
+    gain: float = 220.0  # Grey levels per reflectance in full light.
     noise_grey: float = 2.0  # Standard deviation of the noise, grey levels.
 
     @property
