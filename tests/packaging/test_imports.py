@@ -87,6 +87,11 @@ def test_only_commands_and_their_programs_import_commands(project_root: Path) ->
                 assert "\ndef perform" not in module.read_text("utf-8"), module
 
 
+def test_tools_need_no_tests(project_root: Path) -> None:
+    for module in (project_root / "tools").rglob("*.py"):
+        assert not [name for name in imported(module) if name.split(".")[0] == "tests"], module
+
+
 def test_no_two_packages_import_each_other(allowed: dict[str, set[str]]) -> None:
     assert len(allowed) >= 11
     for package, others in allowed.items():

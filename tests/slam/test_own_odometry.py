@@ -17,7 +17,7 @@ from redetect.landmarks.map_file import read_path
 from redetect.plane import between, chain_steps
 from redetect.slam.cli import main as slam
 from redetect.slam.models import OdometryNoise
-from tests.detect.recordings import Ros, Said
+from tools.ros_bags import Ros, Said
 
 FRAMES = 40
 TIMES = 1000.0 + 0.5 * np.arange(FRAMES)

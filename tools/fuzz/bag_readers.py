@@ -12,10 +12,10 @@ import numpy as np
 from camera import CameraError
 from detect.errors import DetectError
 from detect.sources.bag import Bag
-from tests.detect.recordings import BagKind, Ros, Said
 from tools.fuzz.bag_cells import bag_with_edits
 from tools.fuzz.detect_readers import steps_of
 from tools.fuzz.reader import Reader
+from tools.ros_bags import BagKind, Ros, Said
 
 _WORDS = (
     b"sensor_msgs/msg/Image", b"sensor_msgs/msg/CompressedImage", b"nav_msgs/msg/Odometry",

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from camera import Camera, write_camera
 from tests.detect.forked_runs import started
-from tests.detect.recordings import Ros, Said, images_of, write_video
+from tests.detect.recordings import images_of, write_video
 from tools.benchmark.material import scaled_camera
+from tools.ros_bags import Ros, Said
 
 Images = Sequence[NDArray[np.uint8]]
 

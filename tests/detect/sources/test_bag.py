@@ -29,8 +29,8 @@ from redetect.landmarks import Frame, Step, format_frame, read_frames, read_step
 from redetect.landmarks.frame_files import read_times
 from redetect.plane import rotation
 from tests.detect.commands import Captured, rows_in
-from tests.detect.recordings import BAG_KINDS, BagKind, Ros, Said
 from tests.pictures import read_grey
+from tools.ros_bags import BAG_KINDS, BagKind, Ros, Said
 
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 START_S = 1_700_000_000.0

@@ -19,7 +19,8 @@ from camera.formats.yaml_files import ROS_NAMES
 from detect.errors import DetectError
 from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
-from tests.detect.recordings import BagKind, Ros, Said, images_of
+from tests.detect.recordings import images_of
+from tools.ros_bags import BagKind, Ros, Said
 
 OPTICAL = "front_optical"
 

@@ -15,7 +15,7 @@ from detect.options import SourceOptions
 from detect.sources.interface import read_image
 from detect.sources.opening import open_source
 from tests.detect.commands import Captured
-from tests.detect.recordings import Ros, Said
+from tools.ros_bags import Ros, Said
 
 
 def ramp(brightest: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint16]]:
