@@ -246,7 +246,7 @@ def _draw_landmarks(
     x, y = some.xy[shown].T
     axes.scatter(
         x, y, size**2, marker=marker, color=colour, lw=0.8 if marker == "x" else 0.0,
-        alpha=opaque[shown],  # type: ignore[arg-type]  # the stub lacks arrays
+        alpha=opaque[shown] if shown.any() else None,  # type: ignore[arg-type]  # arrays, too
         label=label, zorder=5,
     )  # fmt: skip
     known = shown & np.any(some.covariance != 0.0, axis=(1, 2))

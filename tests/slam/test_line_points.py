@@ -116,6 +116,15 @@ def test_headings_that_are_off_are_found() -> None:
     )
 
 
+def test_a_row_of_a_vertical_each_and_none_without() -> None:
+    recording, path = seen(np.array([[-1.0, -9.0], [2.0, -10.0], [4.0, -11.0]]), 6, 30, clutter=0)
+    shown = np.array([ids[0] for ids in recording.lines.ids])
+    found, _ = lines_by_points(
+        recording, path, np.zeros(0, np.int64), shown - 1, camera_xy=CAMERA_XY
+    )
+    np.testing.assert_array_equal(found[:, None] == found, shown[:, None] == shown)
+
+
 def test_rows_without_a_point_keep_the_label_they_had() -> None:
     recording, path = seen(np.array([[500.0, -5000.0]]), 5, frames=14, clutter=0)
     before = np.repeat(np.arange(7), [2, 3, 1, 2, 4, 1, 1])[: len(recording.lines)]

@@ -113,6 +113,12 @@ def test_a_vertical_far_outside_does_not_shrink_the_picture(tmp_path: Path) -> N
     assert shares[0] > 300
 
 
+def test_verticals_may_all_be_outside() -> None:
+    path = some_path(9)
+    far = LandmarkMap(landmarks(path.poses[:, :2]), landmarks(np.array([[900.0, 0.0]])))
+    assert draw_map(far, path)
+
+
 def test_a_path_of_one_pose_is_drawn() -> None:
     path = Path2D(("start",), np.zeros((1, 3)))
     nothing = LandmarkMap(no_landmarks(), no_landmarks())

@@ -80,7 +80,7 @@ def solve_path(
     circle_labels: IntArray,
     line_labels: IntArray,
     path: FloatArray,
-    line_xy: FloatArray | None = None,
+    line_xy: ArrayLike = (),
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
     sigma_scale: float = 1.0,
@@ -88,13 +88,11 @@ def solve_path(
     """Least squares over all poses and landmarks, from a path (N + 1, 3) on.
 
     Labels count from 0 without gaps. Lines have their initial positions `line_xy` (L, 2) as priors;
-    rows of lines with NaN are ignored, without `line_xy` all rows of lines. `sigma_scale` is a
-    factor on the discs' standard deviations.
+    rows of lines without one, or with NaN, are ignored. `sigma_scale` is a factor on the discs'
+    standard deviations.
     """
     circles, lines = recording.circles, recording.lines
-    places = np.full((int(line_labels.max(initial=-1)) + 1, 2), np.nan)
-    if line_xy is not None:
-        places[:] = line_xy
+    places = np.array(line_xy, dtype=np.float64).reshape(-1, 2)
     known = np.isfinite(places[:, 0])
     labelled = replace(
         recording,
