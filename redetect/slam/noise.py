@@ -10,14 +10,16 @@ from dataclasses import replace
 import numpy as np
 
 from redetect import landmarks
-from redetect.slam.recording import Recording
+from redetect.landmarks.records import numbers_of_step
+from redetect.slam.recording import ASSUMED, Recording
 from redetect.slam.settings import AddedNoise
 
 
 def noisy_rows(rows: Iterable[landmarks.Row], noise: AddedNoise) -> Iterator[landmarks.Row]:
     """Rows of a landmark file with noise added; without noise they are unchanged.
 
-    Covariances become the sum of both; a comment at the head states what was added.
+    Covariances become the sum of both, with the assumed one for a step that states none; a comment
+    at the head states what was added.
     """
     of_steps = np.random.default_rng([noise.seed, 0])
     of_landmarks = np.random.default_rng([noise.seed, 1])
@@ -38,14 +40,17 @@ def _noisy(
     """A row with noise; unchanged if its kind gets none."""
     if isinstance(record, landmarks.Step) and (noise.step_sigma or noise.turn_sigma):
         x, y, turn = rng.standard_normal(3).tolist()
+        *step, cxx, cxy, cyy, cxphi, cyphi, cphiphi = numbers_of_step(record)
+        if not any((cxx, cxy, cyy, cxphi, cyphi, cphiphi)):
+            cxx, cyy, cphiphi = np.diag(ASSUMED.covariance(np.array([step]))[0]).tolist()
         return replace(
             record,
             dx=record.dx + noise.step_sigma * x,
             dy=record.dy + noise.step_sigma * y,
             dphi=record.dphi + noise.turn_sigma * turn,
-            cxx=record.cxx + noise.step_sigma**2,
-            cyy=record.cyy + noise.step_sigma**2,
-            cphiphi=record.cphiphi + noise.turn_sigma**2,
+            cxx=cxx + noise.step_sigma**2,
+            cyy=cyy + noise.step_sigma**2,
+            cphiphi=cphiphi + noise.turn_sigma**2,
         )
     if isinstance(record, landmarks.CircleLandmark) and noise.sigma:
         x, y = rng.standard_normal(2).tolist()

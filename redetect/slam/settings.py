@@ -73,5 +73,6 @@ class AddedNoise(Bounded, error=SlamError):
         return (
             f"Noise was added, standard deviations: discs {self.sigma:g} m, bearings "
             f"{self.bearing_sigma:g} rad, dx and dy {self.step_sigma:g} m, dphi "
-            f"{self.turn_sigma:g} rad; seed {self.seed}. The covariances are raised to match."
+            f"{self.turn_sigma:g} rad; seed {self.seed}. The covariances are raised to match, of "
+            "steps without one from the assumed noise of odometry."
         )

@@ -11,10 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from redetect.landmarks import CircleLandmark, LineLandmark, Row, Step, read_frames, read_rows
+from redetect.landmarks import (
+    CircleLandmark,
+    Frame,
+    LineLandmark,
+    Row,
+    Step,
+    read_frames,
+    read_rows,
+)
 from redetect.slam.cli import main
 from redetect.slam.errors import SlamError
 from redetect.slam.noise import noisy_rows
+from redetect.slam.recording import ASSUMED, recording_of_frames
 from redetect.slam.settings import AddedNoise
 
 STEP = Step("a.0", 0.01, -0.2, 0.05, 2e-5, 1e-7, 3e-5, 4e-5, 5e-8, 3e-4)
@@ -61,6 +70,17 @@ def test_covariances_are_the_sum_of_both_and_the_rest_stays() -> None:
     assert line.sigma == pytest.approx(math.sqrt(0.002**2 + 0.01**2))
     assert (line.xtop, line.ytop, line.xbottom, line.ybottom) == (0.1, -0.5, 0.12, 0.3)
     assert (line.beta, line.quality, line.ids) == (LINE.beta, LINE.quality, LINE.ids)
+
+
+@pytest.mark.parametrize("noise", [AddedNoise(turn_sigma=0.05), AddedNoise(step_sigma=1e-4)])
+def test_noise_of_a_step_without_covariance_is_added_to_the_assumed_one(noise: AddedNoise) -> None:
+    _, row = noisy_rows([Row(Step("a.0", 0.0, -2.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))], noise)
+    step = row.record
+    assert isinstance(step, Step)
+    assumed = ASSUMED.covariance(np.array([[0.0, -2.0, 0.1]]))[0]
+    added = np.diag(np.square([noise.step_sigma, noise.step_sigma, noise.turn_sigma]))
+    (found,) = recording_of_frames([Frame(step)], "run").step_covariance
+    np.testing.assert_allclose(found, assumed + added)
 
 
 def test_normalised_error_of_the_noisy_rows_is_one_where_it_was_one() -> None:
