@@ -18,7 +18,6 @@ from matplotlib import pyplot
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 from redetect import plane
 from redetect.array_types import FloatArray, IntArray
@@ -26,7 +25,8 @@ from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_a
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
 from redetect.reporting.page import figure_file
 from redetect.slam.errors import SlamError
-from redetect.slam.recording import PICTURES
+from redetect.storage import IMAGE_SUFFIXES
+from redetect.storage.images import read_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -273,8 +273,8 @@ class Crop(NamedTuple):
 def picture_of_frame(folder: Path, prefix: str) -> Path | None:
     """The image of a frame in a folder or its subfolder ``images``; None if there is none."""
     for place in (folder, folder / "images"):
-        for name in (prefix, *(f"{prefix}{suffix}" for suffix in sorted(PICTURES))):
-            if Path(name).suffix.lower() in PICTURES and (place / name).is_file():
+        for name in (prefix, *(f"{prefix}{suffix}" for suffix in IMAGE_SUFFIXES)):
+            if Path(name).suffix.lower() in IMAGE_SUFFIXES and (place / name).is_file():
                 return place / name
     return None
 
@@ -289,7 +289,8 @@ def draw_crops(crops: Sequence[Crop], title: str) -> bytes:
             some.set_axis_off()
         for some, crop in zip(axes.flat, crops):
             u, v = crop.pixel
-            some.imshow(imread(crop.file), cmap="gray", aspect="auto")
+            image = read_grey(crop.file, SlamError)
+            some.imshow(image, cmap="gray", vmin=0, vmax=255, aspect="auto")
             some.plot([u - 14, u + 14], [v, v], "+", color=_DISC, markersize=5)
             some.set(xlim=(u - _CROP_PX, u + _CROP_PX), ylim=(v + _CROP_PX / 2, v - _CROP_PX / 2))
             some.set_title(crop.name, fontsize=8)

@@ -33,8 +33,6 @@ MOST_STEP_SIGMA_RAD = float(np.pi)
 #: Standard deviations of the step from one run to another.
 LOST_SIGMA_M, LOST_SIGMA_RAD = 1000.0, 10.0
 
-#: Suffixes of images.
-PICTURES = {*IMAGE_SUFFIXES, ".gif"}
 # Share of the variance of discs' tilts that is assumed to be common to all frames.
 _COMMON_SHARE = 0.5
 # Indices of the covariance's numbers in a STEP row.
@@ -215,7 +213,7 @@ def _demand_landmarks(path: Path) -> None:
     expected = "expected a run folder, or a .circles or .lines file"
     if not path.exists():
         raise SlamError(f"{path}: no such landmark file or folder: {expected}")
-    if path.suffix.lower() in PICTURES:
+    if path.suffix.lower() in IMAGE_SUFFIXES:
         raise SlamError(
             f"{path}: is a picture: {expected}: `detect circles` and `detect lines` find the "
             "landmarks in pictures"

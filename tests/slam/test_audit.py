@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from camera import Camera
 from redetect.array_types import FloatArray, IntArray
 from redetect.landmarks import read_frames
 from redetect.plane import apply
@@ -18,6 +19,7 @@ from redetect.slam.mapping.audit import audit_run
 from redetect.slam.models import disc_in_robot
 from redetect.slam.recording import LineRows, Recording, read_recording
 from tests.slam.small_run import SmallRun, small_run
+from tests.slam.test_map_solution import written_when_mounted
 
 
 def discs_only(seed: int, discs: int = 14) -> SmallRun:
@@ -109,6 +111,20 @@ def test_rows_of_a_moving_thing_are_no_landmark() -> None:
     assert {group.kind for group in audit.groups} == {"drop"}
 
 
+def test_the_cameras_place_is_no_error_of_the_rows(published_camera: Camera) -> None:
+    run = small_run(7, noise=0.0, steps=240, weave_rad=0.2)
+    mounting = np.column_stack([published_camera.rotation, published_camera.centre])
+    mounting[1, 3] += 0.5
+    discs = replace(run.recording, lines=LineRows.of())
+    written = written_when_mounted(discs, published_camera, mounting)
+    ids = written.circles.ids.copy()
+    ids[second_lap(run, 4)[:5]] = 9
+    spoilt = replace(written, circles=replace(written.circles, ids=ids))
+    (group,) = audit_run(spoilt, published_camera, calibrate=True).groups
+    assert group.new_id == 4
+    assert group.mended_chi_squared < 2.0
+
+
 def test_a_lost_step_is_not_expected_to_have_an_error() -> None:
     run = discs_only(1).recording
     spread = run.step_covariance.copy()
@@ -186,6 +202,19 @@ def test_what_no_landmark_explains_loses_its_identifier(project_root: Path, tmp_
     assert after[k].split() == b"LANDMARK_C 1.5 -0.9 0.9 0.0017 0 0.0017 -1".split()
     assert after[:k] + after[k + 1 :] == lines[:k] + lines[k + 1 :]
     assert len(list(read_frames(output))) == len(list(read_frames(file)))
+
+
+def test_a_row_behind_the_camera_has_no_picture(
+    project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, file = project_root / "images" / "e", tmp_path / "map.circles"
+    lines = (run / "map.circles").read_bytes().splitlines(keepends=True)
+    k = next(i for i, line in enumerate(lines) if line.split()[-1:] == [b"4"])
+    lines[k] = b"LANDMARK_C 1.5 3.0 0.9 0.0017 0 0.0017 -1 4\n"
+    file.write_bytes(b"".join(lines))
+    camera = ["--camera", str(run / "e.cam"), "--images", str(run)]
+    assert main(["audit", str(file), *camera, "--pictures", str(tmp_path / "pictures")]) == 0
+    assert "pictures of 0 of 1 groups" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

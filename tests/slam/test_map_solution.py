@@ -151,7 +151,7 @@ def test_a_loss_withstands_wrong_identifiers(loss: str) -> None:
     assert off[loss] < off["none"] / 2
 
 
-def _written_when_mounted(
+def written_when_mounted(
     recording: Recording, calibrated: Camera, mounting: FloatArray
 ) -> Recording:
     """The rows that a camera writes that is mounted otherwise than its file says."""
@@ -169,7 +169,7 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
         [turn @ published_camera.rotation, published_camera.centre + true[3:]]
     )
     run = small_run(7, noise=0.0, steps=90, weave_rad=0.2)
-    spoilt = _written_when_mounted(_only_discs(run), published_camera, mounting)
+    spoilt = written_when_mounted(_only_discs(run), published_camera, mounting)
     # So certain that what is believed of the camera's place does not matter.
     certain = replace(spoilt.circles, covariance=1e-6 * spoilt.circles.covariance)
     spoilt = replace(spoilt, circles=certain, step_covariance=1e-6 * spoilt.step_covariance)
@@ -196,7 +196,7 @@ def test_errors_of_a_mounting_are_as_its_covariance_says(published_camera: Camer
         mounting = np.column_stack([turn, published_camera.centre + true[3:]])
         # Errors are those of the rows as they are written.
         exact = _only_discs(small_run(seed, noise=0.0, steps=90, weave_rad=0.2))
-        written = _written_when_mounted(exact, published_camera, mounting)
+        written = written_when_mounted(exact, published_camera, mounting)
         rows = replace(run.circles, xy=written.circles.xy + run.circles.xy - exact.circles.xy)
         run = replace(run, circles=rows)
         mapped = map_run(run, published_camera, Weighting(calibrate=True))

@@ -13,7 +13,14 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D, no_landmarks
 from redetect.plane import ellipses
 from redetect.slam.errors import SlamError
-from redetect.slam.pictures import NEES_BAND, draw_errors, draw_map, pose_errors
+from redetect.slam.pictures import (
+    NEES_BAND,
+    Crop,
+    draw_crops,
+    draw_errors,
+    draw_map,
+    pose_errors,
+)
 
 DISC_BGR = (0x1E, 0x50, 0xC8)
 
@@ -128,6 +135,12 @@ def test_a_path_of_one_pose_is_drawn() -> None:
         image = cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR)
         assert image is not None
         assert image.shape[0] > 300
+
+
+def test_what_is_no_image_has_no_crop(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"<html>")
+    with pytest.raises(SlamError, match=r"a\.png: cannot be decoded"):
+        draw_crops([Crop(tmp_path / "a.png", (1.0, 1.0), "a")], "a group")
 
 
 def test_no_window_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -112,11 +112,10 @@ def _draw(options: Options, camera: Camera, audit: Audit, source: Path) -> None:
         for row in group.rows:
             k, disc = seen[row]
             file = picture_of_frame(images, frames[k].step.prefix)
-            if file is not None:
-                # Levelled positions are mapped back to where the camera saw them.
-                vector = [*(frames[k].levelled_by or (0.0, 0.0)), 0.0]
-                turn = Rotation.from_rotvec(vector).as_matrix()
-                u, v = camera.project_robot(np.array([disc.px, disc.py, 0.0]) @ turn)
+            # Levelled positions are mapped back to where the camera saw them.
+            turn = Rotation.from_rotvec([*(frames[k].levelled_by or (0.0, 0.0)), 0.0]).as_matrix()
+            u, v = camera.project_robot(np.array([disc.px, disc.py, 0.0]) @ turn)
+            if file is not None and np.isfinite(u):
                 crops.append(Crop(file, (float(u), float(v)), f"{k}"))
         if crops:
             options.pictures.mkdir(parents=True, exist_ok=True)

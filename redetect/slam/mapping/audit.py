@@ -164,10 +164,11 @@ def _misfit(
     # The camera's mounting is assumed to be known.
     problem = linearise(graph, estimate, fit.weighting)
     first, known = 3 * len(graph.steps), fit.information.shape[0]
-    by_known, by_new = np.split(problem.jacobian[first:].toarray(), [known], axis=1)
+    own = slice(first, first + 2 * len(rows))
+    by_known, by_new = np.split(problem.jacobian[own].toarray(), [known], axis=1)
     spread = np.eye(len(by_known)) + by_known @ fit.information.solve(by_known.T.copy())
     root = np.linalg.cholesky(spread)
-    error = np.linalg.solve(root, problem.residual[first:])
+    error = np.linalg.solve(root, problem.residual[own])
     if at is not None:
         by_new = np.linalg.solve(root, by_new)
         error = error - by_new @ np.linalg.lstsq(by_new, error)[0]
