@@ -151,6 +151,14 @@ def test_ids_in_the_file_are_not_looked_at_and_the_result_is_the_same_every_time
     assert one.circle_labels.tolist() == associate_run(recording).circle_labels.tolist()
 
 
+def test_a_lost_first_step_does_not_matter() -> None:
+    recording = drive(circuit(0.2), scattered(7, 40, 0.4), NO_LINES, seed=8)
+    covariance = recording.step_covariance.copy()
+    covariance[0] = np.diag([1e6, 1e6, 1e2])
+    lost = associate_run(replace(recording, step_covariance=covariance))
+    assert lost.circle_labels.tolist() == associate_run(recording).circle_labels.tolist()
+
+
 def test_lines_do_not_change_what_becomes_of_the_discs() -> None:
     discs = scattered(7, 40, 0.4)
     recording = drive(circuit(0.2), discs, scattered(16, 60, 0.02), seed=8)

@@ -65,6 +65,28 @@ def test_a_trajectory_there_and_back(tmp_path: Path, capsys: Capture) -> None:
         np.testing.assert_allclose(read_path(again).poses[:, 2], poses[:, 2], atol=1e-14)
 
 
+def test_frames_of_one_name_have_one_time(tmp_path: Path, capsys: Capture) -> None:
+    write_path(tmp_path / "path.csv", Path2D(("start", "a", "b", "a"), np.zeros((4, 3))))
+    (tmp_path / "e.times").write_text("a 5\nb 6\n")
+    arguments = ["export", str(tmp_path / "path.csv"), "--to", "tum", "-o", str(tmp_path / "e.tum")]
+    refused(arguments, "e.times: the frames' times do not ascend", capsys)
+
+
+@pytest.mark.parametrize(
+    ("file", "output", "expected"),
+    [
+        ("e.tum", "t.circles", ".csv"),
+        ("Landmark_Groundtruth.dat", "m.circles", ".csv"),
+        ("aa3_dr.mat", "r.csv", ".circles"),
+        ("e.g2o", "e.txt", ".circles or .csv"),
+    ],
+)
+def test_results_of_another_suffix_are_refused(
+    file: str, output: str, expected: str, capsys: Capture
+) -> None:
+    refused(["import", file, "-o", output], f"{output}: expected a {expected} file", capsys)
+
+
 def test_tables(tmp_path: Path, capsys: Capture) -> None:
     out = tmp_path / "tables"
     arguments = ["export", str(DEMO), "--to", "csv", "-o", str(out)]
@@ -156,7 +178,9 @@ def test_a_trajectory_with_times(tmp_path: Path, capsys: Capture) -> None:
     refused([*named, str(run / "a.times")], f"no time of {prefixes[-1]}: expected", capsys)
     swapped = [rows[0].split()[0] + " 2e9\n", *rows[1:]]
     (run / "b.times").write_text("".join(swapped))
-    refused([*named, str(run / "b.times")], "b.times: the frames' times go back", capsys)
+    refused([*named, str(run / "b.times")], "b.times: the frames' times do not ascend", capsys)
+    (run / "b.times").write_text("".join([f"{prefixes[0]} {times[1]:.6f}\n", *rows[1:]]))
+    refused([*named, str(run / "b.times")], "b.times: the frames' times do not ascend", capsys)
     (tmp_path / "c.times").write_text(rows[0] + "e.0001 x\n")
     refused([*named, str(tmp_path / "c.times")], "c.times:2: 'e.0001 x': expected", capsys)
     (tmp_path / "c.times").write_text("e.0001\n")

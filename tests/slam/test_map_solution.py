@@ -321,6 +321,11 @@ def test_a_disconnected_run_is_refused() -> None:
         map_run(replace(lost, circles=replace(lost.circles, ids=ids)), name="r")
 
 
+def test_a_run_that_begins_with_a_lost_step_is_refused() -> None:
+    with pytest.raises(SlamError, match=r"step 1 \(s\.0000\).*lost before the first landmark"):
+        map_run(_lost_at(small_run(9), 0))
+
+
 def test_parts_may_be_joined_by_way_of_a_third() -> None:
     run = small_run(9)
     mapped = map_run(_lost_at(_run_lost_twice(run), 45))

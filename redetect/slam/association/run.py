@@ -198,7 +198,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     first one, and close loops in the whole.
     """
     recording, frames = run.recording, run.frames
-    starts = [0, *recording.lost.tolist()]
+    starts = sorted({0, *recording.lost.tolist()})
     parts: list[_Closed] = []
     submaps: list[list[loops.Submap]] = []
     places: list[FloatArray] = []

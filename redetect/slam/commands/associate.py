@@ -64,8 +64,9 @@ def perform(options: Associate) -> int:
         except UnregisteredError as error:
             k = int(np.searchsorted(first_poses(runs), error.frame + 1, side="right")) - 1
             raise SlamError(f"{options.runs[k]}: {error}") from None
+        finally:
+            _progress("")
         seconds = time.perf_counter() - began
-        _progress("")
         scores = score_run(recording, found)
         figures = {"seconds": round(seconds, 2), "loop_matches": len(found.matches)}
         tries.append({"noise": factor, **figures, "scores": scores})

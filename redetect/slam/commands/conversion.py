@@ -70,8 +70,8 @@ def _times_of(command: Export, path: Path2D) -> dict[str, float] | None:
         missing = [name for name in names if name not in times]
         if not missing:
             found = {name: times[name] for name in names}
-            if np.any(np.diff(list(found.values())) < 0.0):
-                raise SlamError(f"{file}: the frames' times go back: expected them in order")
+            if np.any(np.diff([times[name] for name in names]) <= 0.0):
+                raise SlamError(f"{file}: the frames' times do not ascend: expected one for each")
             return found
         if command.times:
             raise SlamError(f"{file}: no time of {missing[0]}: expected those of all frames")
@@ -113,6 +113,9 @@ def perform_import(command: Import) -> int:
         if name not in _flags_used(command) and getattr(command, name) != getattr(Import, name):
             flag = "no-calibrated" if name == "calibrated" else name.replace("_", "-")
             raise SlamError(f"--{flag}: has no effect on {command.file.name}")
+    suffixes = _suffixes_of_results(command.file)
+    if command.output.suffix not in suffixes:
+        raise SlamError(f"{command.output}: expected a {' or '.join(suffixes)} file to write")
     if command.file.suffix in (".dat", ".mat"):
         _import_data_set(command)
     elif command.file.suffix != ".g2o":
@@ -123,6 +126,15 @@ def perform_import(command: Import) -> int:
         graph = read_g2o(command.file)
         _write_path(command, Path2D(("start", *graph.recording.prefixes), graph.poses))
     return 0
+
+
+def _suffixes_of_results(file: Path) -> tuple[str, ...]:
+    """Those of a run, and of a path or map, if a file contains such."""
+    if file.name == data_sets.DRIVE:
+        return (".circles",)
+    if file.name == data_sets.LANDMARKS or file.suffix not in (".dat", ".mat", ".g2o"):
+        return (".csv",)
+    return (".circles", ".csv")
 
 
 def _flags_used(command: Import) -> tuple[str, ...]:

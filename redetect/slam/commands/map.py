@@ -43,8 +43,8 @@ def perform(command: Map) -> int:
     joint_name = map_file.covariance_file(Path(map_file.MAP_NAME)).name
     names = [map_file.MAP_NAME, *map_file.path_names(len(command.runs)), TABLE_NAME]
     names.append(files.MAP_PICTURE)
-    names += [CAMERA_NAME] * command.calibrate
-    demand_free([output / name for name in (*names, joint_name)], overwrite=command.force)
+    names += [joint_name] + [CAMERA_NAME] * command.calibrate
+    demand_free([output / name for name in names], overwrite=command.force)
     runs = files.recordings_of(command)
     recording = joined(runs)
     begin = time.perf_counter()
@@ -61,6 +61,7 @@ def perform(command: Map) -> int:
     for line in _report(mapped, check, seconds):
         print(line)
     if final.joint_covariance is None:
+        names.remove(joint_name)
         print(
             f"more than {run_map.MOST_LANDMARKS_TOGETHER} landmarks: no {joint_name}, so that "
             "`slam localize` assumes independent errors"

@@ -324,9 +324,14 @@ def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name:
         if counts[k].sum() < _FEWEST_SHARED:
             first = min(waiting)
             step = int(lost[first - 1])
+            at = f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): odometry "
+            if step == 0:
+                raise SlamError(
+                    f"{at}is lost before the first landmark: expected a smaller covariance, or "
+                    "zeros for one that is not known"
+                )
             raise SlamError(
-                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): odometry "
-                "is lost or another run begins there, and the parts before and after share "
+                f"{at}is lost or another run begins there, and the parts before and after share "
                 f"{counts[first].sum()} landmarks: expected at least {_FEWEST_SHARED}"
             )
         waiting.remove(k)
