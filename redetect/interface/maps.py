@@ -7,14 +7,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar, Unpack, get_type_hints
+from typing import Any, TypedDict, Unpack, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
 from redetect import __version__
-from redetect.bounds import demand_fields
 from redetect.json_text import json_text
 from redetect.landmarks import map_file
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
@@ -34,7 +33,6 @@ from redetect.storage import OutputExistsError
 from redetect.tables import Table, covariance_columns
 
 PathLike = str | os.PathLike[str]
-Command = TypeVar("Command", Map, Localize)
 _OF_THE_COMMAND = {"output", "force", "interactive", "reference"}
 
 
@@ -197,9 +195,7 @@ def map_landmarks(
     redetect.landmarks.LandmarkFileError
         If a file is malformed.
     """
-    command = _checked(
-        Map(run=_run(run), circles=circles, lines=lines, **_flags(options, MapOptions))
-    )
+    command = Map(**_flags(run, circles, lines, options, MapOptions))
     runs = read_runs(command)
     mapped = map_run_by_flags(command, joined(runs))
     landmarks, path = mapped.landmarks, mapped.path
@@ -246,8 +242,7 @@ def localize(
     """
     in_memory = isinstance(landmarks, RunMap)
     in_file = path_of("the map" if in_memory else landmarks, "a RunMap, or its map.csv", SlamError)
-    flags = _flags(options, LocalizeOptions)
-    command = _checked(Localize(run=_run(run), map=in_file, circles=circles, lines=lines, **flags))
+    command = Localize(map=in_file, **_flags(run, circles, lines, options, LocalizeOptions))
     # Otherwise the map is assumed to be exact.
     known = command.association == "known"
     if isinstance(landmarks, RunMap):
@@ -261,8 +256,12 @@ def localize(
     return Localization(result.path, result, places)
 
 
-def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
+def _flags(
+    run: PathLike, circles: bool, lines: bool, options: Mapping[str, Any], kind: type
+) -> dict[str, Any]:
     """Options as the command has them; a SlamError if there are none of that name."""
+    if not circles and not lines:
+        raise SlamError("circles and lines are False: expected at least one of them")
     flags, known = dict(options), get_type_hints(kind)
     if without_effect := flags.keys() & _OF_THE_COMMAND:
         raise SlamError(f"{', '.join(sorted(without_effect))}: of the command only")
@@ -282,17 +281,9 @@ def _flags(options: Mapping[str, Any], kind: type) -> dict[str, Any]:
         more = flags["more"]
         alone = isinstance(more, str | os.PathLike) or not isinstance(more, Iterable)
         flags["more"] = tuple(map(_run, [more] if alone else more))
-    return flags
+    return {"run": _run(run), "circles": circles, "lines": lines, **flags}
 
 
 def _run(name: PathLike) -> Path:
     expected = "a run folder or a file of rows; `redetect.landmarks.write_frames` writes detections"
     return path_of(name, expected, SlamError)
-
-
-def _checked(command: Command) -> Command:
-    """The command; a SlamError if its landmarks or words are none of those there are."""
-    if not command.circles and not command.lines:
-        raise SlamError("circles and lines are False: expected at least one of them")
-    demand_fields(command, SlamError)
-    return command

@@ -12,6 +12,7 @@ from redetect.bounds import (
     ABOVE_0,
     NOT_NEGATIVE,
     PROBABILITY,
+    Bounded,
     MaybeFloat,
     MaybePath,
     MaybeStr,
@@ -34,7 +35,7 @@ from redetect.slam.settings import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFlags:
+class RunFlags(Bounded, error=SlamError):
     """Options of all commands that read the landmarks of a run."""
 
     run: Positional[Path]  # Run folder, or a .circles or .lines file.
@@ -230,7 +231,7 @@ class Export(RunFlags):
 
 
 @dataclass(frozen=True)
-class Import:
+class Import(Bounded, error=SlamError):
     """Convert files of other tools and data sets to this project's formats.
 
     Example: slam import /tmp/e.g2o -o /tmp/e-again.circles

@@ -19,6 +19,9 @@ Association = Literal["known", "nearest", "joint"]
 Solver = Literal["separable", "gtsam"]
 RowErrors = Literal["corrected", "recorded"]
 DEFAULT_GATE_PROBABILITY = 0.999
+#: Ratio of chi-squared to its expectation above which covariances are too small, identifiers wrong,
+#: or the start of least squares was.
+MOST_FACTOR = 2.5
 
 
 @dataclass(frozen=True)

@@ -220,16 +220,19 @@ def test_a_row_behind_the_camera_has_no_picture(
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--gate", "0"], "gate is 0: expected above 0"),
-        (["--gate", "1e300"], "gate is 1e+300: expected above 0, at most 1e+24"),
-        (["--lines"], "expected discs"),
+        (["--gate", "0"], "--gate is 0: expected above 0"),
+        (["--gate", "1e300"], "--gate is 1e+300: expected above 0, at most 1e+24"),
     ],
 )
 def test_impossible_settings_are_refused(
     project_root: Path, flags: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["audit", str(project_root / "images" / "e"), *flags]) == 1
+    run = str(project_root / "images" / "e")
+    with pytest.raises(SystemExit, match="2"):
+        main(["audit", run, *flags])
     assert said in capsys.readouterr().err
+    assert main(["audit", run, "--lines"]) == 1
+    assert "expected discs" in capsys.readouterr().err
 
 
 def test_a_gate_that_no_row_passes_is_refused() -> None:

@@ -199,15 +199,28 @@ def test_runs_that_can_not_be_mapped(
     assert not list(tmp_path.glob("slam/*/*"))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--start-sigma", "0", "-1", "0"], "--start-sigma is -1: expected"),
+        (["--start", "0", "nan", "0"], "--start is nan: expected -1e+12 to 1e+12"),
+        (["--gate-probability", "1"], "--gate-probability is 1: expected"),
+    ],
+)
+def test_impossible_settings_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["localize", "a.circles", "--map", "map.csv", *arguments])
+    assert message in capsys.readouterr().err
+
+
 AWAY = ["--start", "50", "50", "0"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--start-sigma", "0", "-1", "0"], "start_sigma"),
-        (["--start", "0", "nan", "0"], "start is nan: expected -1e+12 to 1e+12"),
-        (["--gate-probability", "1"], "gate_probability"),
         (["--reference", "short.csv"], "short.csv: 2 poses: expected 7"),
         (["--map", "other.csv"], "expected identifiers of the same run, or --association joint"),
         (["--map", "other.csv", "--association", "joint", *AWAY], "expected some near one, seen"),

@@ -13,7 +13,6 @@ import numpy as np
 
 from redetect import __version__
 from redetect.array_types import IntArray
-from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, LineLandmark, Row, read_rows, write_rows
 from redetect.messages import is_quiet
 from redetect.slam.association.loop_closing import unrecognised_return
@@ -39,7 +38,6 @@ Labels = dict[type[CircleLandmark] | type[LineLandmark], IntArray]
 
 def perform(options: Associate) -> int:
     """Execute the command; returns the exit code."""
-    demand_fields(options, SlamError)
     settings = options.settings
     files_of_runs = [landmark_files(run, **options.rows) for run in options.runs]
     sources = [(k, file) for k, own in enumerate(files_of_runs) for file in own]

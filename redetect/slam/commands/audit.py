@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from redetect import __version__
-from redetect.bounds import demand_fields
 from redetect.landmarks import CircleLandmark, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import recording_of
@@ -29,7 +28,6 @@ _COLUMNS = (
 
 def perform(options: Options) -> int:
     """Execute the command; returns the exit code."""
-    demand_fields(options, SlamError)
     (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")
     listed = target.with_suffix(".csv")

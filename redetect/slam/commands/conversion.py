@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from redetect import __version__
-from redetect.bounds import demand_fields
 from redetect.landmarks import write_frames
 from redetect.landmarks.axes import MEANING
 from redetect.landmarks.frame_files import read_times
@@ -108,7 +107,6 @@ def perform_import(command: Import) -> int:
             f"{command.file}: is a landmark file: expected a .g2o graph or a trajectory; "
             "`slam export` writes them"
         )
-    demand_fields(command, SlamError)
     for name in _DATA_SET_FLAGS:
         if name not in _flags_used(command) and getattr(command, name) != getattr(Import, name):
             flag = "no-calibrated" if name == "calibrated" else name.replace("_", "-")

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from redetect import __version__
-from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
@@ -21,13 +20,12 @@ from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import demand_windows, draw_errors, draw_map
 from redetect.slam.recording import Recording, camera_xy_of
 from redetect.slam.scoring import map_distance, path_distance
+from redetect.slam.settings import MOST_FACTOR
 from redetect.storage import demand_free, write_bytes
 
 ERROR_PICTURE = "errors.png"
 # The pose is lost if less than this share of the rows of this number of frames with discs match.
 _LOST_SHARE, _LOST_FRAMES = 0.3, 20
-# Factor of innovations with known identifiers above which some are wrong, or covariances too small.
-_MOST_FACTOR = 2.5
 
 #: Results of a filter: the run, the map, and further lines for the terminal.
 _Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
@@ -35,7 +33,6 @@ _Result = tuple[FilterRun, map_file.LandmarkMap, list[str]]
 
 def perform(command: Localize | Ekf) -> int:
     """Execute the command; returns the exit code."""
-    demand_fields(command, SlamError)
     if command.interactive:
         demand_windows()
     name = type(command).__name__.lower()
@@ -62,7 +59,7 @@ def perform(command: Localize | Ekf) -> int:
     if command.association != "known":
         hint = " (--lost finds the start)" if placed else ""
         said += [line + hint for line in lost_lines(run, recording)]
-    elif run.count.innovation_squared > _MOST_FACTOR * run.count.innovation_numbers:
+    elif run.count.innovation_squared > MOST_FACTOR * run.count.innovation_numbers:
         start = "is --start where the run begins? " if placed else ""
         said.append(
             f"errors are much larger than stated: {start}`slam audit` finds wrong identifiers"

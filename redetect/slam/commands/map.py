@@ -12,10 +12,8 @@ import numpy as np
 
 from camera import write_camera
 from redetect import __version__
-from redetect.bounds import demand_fields
 from redetect.landmarks import map_file
 from redetect.slam.commands import files
-from redetect.slam.errors import SlamError
 from redetect.slam.mapping import run_map
 from redetect.slam.mapping.odometry_check import OdometryCheck, check_odometry
 from redetect.slam.mapping.run_map import MappedRun, Mounting, map_run_by_flags, table_lines
@@ -23,6 +21,7 @@ from redetect.slam.mounting import mounted_camera
 from redetect.slam.options import Map
 from redetect.slam.pictures import demand_windows, draw_map
 from redetect.slam.recording import first_poses, joined
+from redetect.slam.settings import MOST_FACTOR
 from redetect.storage import demand_free, write_bytes
 
 TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
@@ -30,13 +29,10 @@ TABLE_NAME, CAMERA_NAME = "table.json", "mounted.cam"
 # Systematic errors of odometry are reported if they exceed this many standard deviations, and these
 # changes of lengths (%), turns (rad/m) and lags (intervals between frames).
 _SIGNIFICANT, _LEAST_PERCENT, _LEAST_TURN, _LEAST_LAG = 5.0, 2.0, 0.01, 0.1
-# Factor of odometry or of rows alone above which their covariances are too small.
-_MOST_FACTOR = 2.5
 
 
 def perform(command: Map) -> int:
     """Execute the command; returns 0 if it succeeds."""
-    demand_fields(command, SlamError)
     if command.interactive:
         demand_windows()
     output = command.output or files.default_output(command.run)
@@ -124,14 +120,14 @@ def doubts_of(check: OdometryCheck, mapped: MappedRun) -> list[str]:
             f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
             f"are wrong, most at {mapped.prefixes[check.worst_step + 1]}"
         )
-    if check.rows_factor > _MOST_FACTOR:
+    if check.rows_factor > MOST_FACTOR:
         without = ", and --loss geman-mcclure maps without them"
         lines.append(
             f"errors of rows are {math.sqrt(check.rows_factor):.1f} times as large as their "
             "covariances state: `slam audit` finds wrong identifiers"
             f"{without if mapped.weighting.loss != 'geman-mcclure' else ''}"
         )
-    elif check.odometry_factor > _MOST_FACTOR:
+    elif check.odometry_factor > MOST_FACTOR:
         lines.append(
             f"errors of odometry are {math.sqrt(check.odometry_factor):.1f} times as large as its "
             "covariances state: those of the map are larger than stated, too"

@@ -36,14 +36,12 @@ from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.mounting import check_rows_fit_camera, mounting_change
 from redetect.slam.options import Map
 from redetect.slam.recording import Recording, camera_of_run
-from redetect.slam.settings import Solver
+from redetect.slam.settings import MOST_FACTOR, Solver
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
 # Tolerance before the final optimisation.
 _COARSE = 1e-3
-# A larger ratio of chi-squared to its expectation may be due to a wrong start.
-_PLAUSIBLE_FACTOR = 2.5
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
 _GRADUATION = tuple(2.0 ** (k / 2) for k in range(8, 0, -1))
 
@@ -283,7 +281,7 @@ def _fitted_to_discs(
     except SlamError as raised:
         error = raised
     expected = max(2 * (len(graph.disc_pose) - len(graph.disc_ids)), 1)
-    if minima and minima[0].costs[-1] <= _PLAUSIBLE_FACTOR * expected:
+    if minima and minima[0].costs[-1] <= MOST_FACTOR * expected:
         return minima[0]
     with suppress(SlamError):
         poses = filtered_poses(recording, begin.poses[0])
