@@ -70,7 +70,7 @@ def in_turned_axes(covariance: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
 
 def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `move` by the pose (J1) and by the step (J2).
+    """Jacobians of `move` with respect to the pose (J1) and to the step (J2).
 
     Takes `pose, step` (..., 3); returns `by_pose, by_step` (..., 3, 3).
     """
@@ -83,7 +83,7 @@ def move_jacobians(pose: ArrayLike, step: ArrayLike) -> tuple[FloatArray, FloatA
 
 
 def between_jacobians(first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `between` by the first (J3) and by the second pose (J4).
+    """Jacobians of `between` with respect to the first (J3) and to the second pose (J4).
 
     Takes `first, second` (..., 3); returns `by_first, by_second` (..., 3, 3).
     """
@@ -108,7 +108,7 @@ def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
 
 
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `disc_in_robot` by the pose (J5) and by the disc's centre (J6).
+    """Jacobians of `disc_in_robot` with respect to the pose (J5) and to the disc's centre (J6).
 
     Returns `by_pose` (..., 2, 3), `by_disc` (..., 2, 2).
     """
@@ -120,7 +120,7 @@ def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, Flo
 
 
 def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> FloatArray:
-    """(n, 2, 2) derivatives of apparent floor positions (n, 2) by a small tilt of the robot."""
+    """(n, 2, 2) derivatives of apparent floor positions (n, 2) with respect to a small tilt."""
     x, y = disc_xy.T
     rows = (x * y / height_m, -height_m - x**2 / height_m)
     others = (height_m + y**2 / height_m, -x * y / height_m)
@@ -128,7 +128,7 @@ def tilt_jacobian(disc_xy: FloatArray, height_m: float = CAMERA_HEIGHT_M) -> Flo
 
 
 def common_tilt_jacobian(disc_xy: FloatArray) -> FloatArray:
-    """Derivative of apparent floor positions by a small tilt about the robot's origin.
+    """Derivative of apparent floor positions with respect to a tilt about the robot's origin.
 
     As `tilt_jacobian`, but for a tilt that stays: the place below the robot is its origin.
     """
@@ -148,7 +148,7 @@ def bearing_of_vertical(pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLik
 def bearing_jacobians(
     pose: ArrayLike, line_xy: ArrayLike, camera_xy: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Jacobians of `bearing_of_vertical` by the pose and by the line's position (chain rule).
+    """Jacobians of `bearing_of_vertical` with respect to the pose and to the line's position.
 
     Returns `by_pose` (..., 3), `by_line` (..., 2).
     """

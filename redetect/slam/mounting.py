@@ -24,8 +24,8 @@ def rows_through_mounting(
 
     Takes `floor_xy` (n, 2) of the rows, and robot_from_camera as mounted (3, 4). Returns
     `floor_xy` (n, 2) in the robot frame (m), NaN if a ray does not go down, and `by_mounting`
-    (n, 2, 6): derivatives by a rotation vector in the robot frame, applied to the mounting from the
-    left, and by the camera's position.
+    (n, 2, 6): derivatives with respect to a rotation vector in the robot frame, applied to the
+    mounting from the left, and to the camera's position.
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
@@ -57,7 +57,7 @@ def rows_as_recorded(
     The lens cancels: the ray of a disc meets the floor as from the camera's calibrated pose.
 
     Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
-    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter by the numbers that
+    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter with respect to what
     `rows_through_mounting` names.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))

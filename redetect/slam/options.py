@@ -111,7 +111,7 @@ class Audit(RunFlags):
     """
 
     calibrate: bool = False  # Also estimate the camera's mounting.
-    # Squared error of a row, in units of its covariance, from which it contradicts the rest.
+    # Squared Mahalanobis distance of a row from which it contradicts the rest.
     gate: Positive = 100.0
     # `mend`: rows get the identifier of the landmark that they show, -1 if none explains them;
     # `drop`: their lines are removed.
@@ -166,7 +166,7 @@ class Localize(FilterFlags):
 
 @dataclass(frozen=True, kw_only=True)
 class Ekf(FilterFlags):
-    """Map and localise at once with an extended Kalman filter (EKF-SLAM, landmarks by their IDs).
+    """Map and localise at once with an extended Kalman filter (EKF-SLAM).
 
     Example: slam ekf images/e --reference /tmp/e-map/path.csv
     """

@@ -15,7 +15,7 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.plane import chain_steps
 from redetect.slam.cli import main
-from redetect.slam.formats.data_sets import read_robot, trees_of
+from redetect.slam.formats.data_sets import read_utias, trees_of
 from redetect.slam.formats.ranges import discs_of_ranges
 from redetect.slam.recording import read_recording
 
@@ -86,14 +86,14 @@ def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_response_of_a_robot_to_its_commands_is_found(
     utias: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording, found, _ = read_robot(utias / "Robot1_Odometry.dat")
+    recording, found, _ = read_utias(utias / "Robot1_Odometry.dat")
     assert found is not None
     assert abs(found.lag_s - LAG_S) < 0.02
     assert abs(found.speed - SPEED) < 0.01
     assert abs(found.turn - TURN) < 0.01
     assert abs(found.depth - DEPTH) < 0.004
     true = read_path(utias / "true.csv").poses
-    raw, *learned = read_robot(utias / "Robot1_Odometry.dat", calibrated=False)
+    raw, *learned = read_utias(utias / "Robot1_Odometry.dat", calibrated=False)
     assert learned == [None, None]
     distance, depth = (np.hypot(*run.circles.xy.T) for run in (recording, raw))
     bearing = np.arctan2(raw.circles.xy[:, 0], -raw.circles.xy[:, 1])
@@ -118,7 +118,7 @@ def test_without_known_landmarks_depths_are_too_long_by_the_usual_factor(
     for file in utias.glob("*.dat"):
         if "Landmark" not in file.name:
             shutil.copy(file, tmp_path)
-    _, found, _ = read_robot(tmp_path / "Robot1_Odometry.dat")
+    _, found, _ = read_utias(tmp_path / "Robot1_Odometry.dat")
     assert found is not None
     assert abs(found.depth - 1.033) < 0.005
     assert abs(found.speed / found.depth - SPEED / DEPTH) < 0.03
@@ -131,7 +131,7 @@ def test_a_robot_that_shows_nothing_of_its_response_has_the_usual_one(tmp_path: 
         ("Barcodes", "6 100\n"),
     ):
         (tmp_path / f"{name}.dat").write_text(rows)
-    found = read_robot(tmp_path / "Robot1_Odometry.dat")[1]
+    found = read_utias(tmp_path / "Robot1_Odometry.dat")[1]
     assert found is not None
     np.testing.assert_allclose(found, (0.25, 1.0, 1.0, 1.033), atol=0.06)
 
@@ -221,7 +221,7 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         (
             "Robot1_Odometry",
             "5 1 0\n3 1 0\n6 1 0\n",
-            "Odometry.dat: 3.000 is after 5.000: expected order",
+            "Odometry.dat: 3.000 follows 5.000: expected ascending times",
         ),
         (
             "Robot1_Odometry",
@@ -247,7 +247,7 @@ def test_malformed_files_are_refused(utias: Path, capsys: pytest.CaptureFixture[
         (
             "Robot1_Groundtruth",
             "5 1 0 0\n3 1 0 0\n",
-            "truth.dat: 3.000 is after 5.000: expected order",
+            "truth.dat: 3.000 follows 5.000: expected ascending times",
         ),
         (
             "Robot1_Groundtruth",
@@ -369,8 +369,8 @@ def test_victoria_park_is_mapped_from_odometry(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"time": [0, 2, 1]}, "aa3_dr.mat: 1.000 is after 2.000: expected order"),
-        ({"TLsr": [1, 0]}, "aa3_lsr2.mat: 0.000 is after 1.000: expected order"),
+        ({"time": [0, 2, 1]}, "aa3_dr.mat: 1.000 follows 2.000: expected ascending times"),
+        ({"TLsr": [1, 0]}, "aa3_lsr2.mat: 0.000 follows 1.000: expected ascending times"),
         ({"TLsr": [9, 9]}, "times 0.000 to 2.000, aa3_lsr2.mat: 9.000 to 9.000"),
         ({"speed": [np.nan, 1, 1]}, "aa3_dr.mat: speed: expected numbers within"),
         ({"steering": [0, 0, 1.4]}, "aa3_dr.mat: steering: expected angles within +-1.2 rad"),

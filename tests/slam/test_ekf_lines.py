@@ -51,7 +51,7 @@ def test_derivatives_of_bearings_by_rays() -> None:
     numeric = np.stack([(seen(at + e) - seen(at - e)) / 2e-6 for e in 1e-6 * np.eye(11)], axis=-1)
     ekf.state[:] = at
     found = ekf.predicted([], list(ekf.line_slots.values()))
-    np.testing.assert_array_equal(found.numbers, np.arange(11))
+    np.testing.assert_array_equal(found.components, np.arange(11))
     np.testing.assert_allclose(found.jacobian, numeric, atol=1e-8)
 
 

@@ -66,9 +66,9 @@ def test_the_noise_of_ranges_bearings_and_steps_is_learned(
     assert noise.ranges == pytest.approx(ranges, rel=0.1)
     assert noise.bearings == pytest.approx(bearings, rel=0.1)
     assert noise.steps == pytest.approx(steps, rel=0.15)
-    assert noise.ranges_alike < 0.1
-    assert noise.bearings_alike < 0.1
-    assert noise.wrong == 0
+    assert noise.range_correlation < 0.1
+    assert noise.bearing_correlation < 0.1
+    assert noise.outliers == 0
 
 
 def test_vague_ranges_do_not_shrink_the_map() -> None:
@@ -76,7 +76,7 @@ def test_vague_ranges_do_not_shrink_the_map() -> None:
     run, seen, poses, places = _run(np.random.default_rng(8), 0.5, 1.0, 1.0)
     near = disc_in_robot(poses[seen.frame + 1], places[seen.ids - 6])
     run = replace(run, step_covariance=100.0 * ASSUMED.covariance(run.steps))
-    vague, right = Noise(ranges=20.0, ranges_alike=1.0), np.ones(len(seen.ids), dtype=np.bool_)
+    vague, right = Noise(ranges=20.0, range_correlation=1.0), np.ones(len(seen.ids), dtype=np.bool_)
     for at, least, most in ((None, 0.8, 0.95), (near, 0.99, 1.01)):
         found = map_run(with_noise(run, seen, _stated(seen), vague, right, at)).estimate.disc_xy
         sizes = [np.mean(np.hypot(*(xy[:, None] - xy).T)) for xy in (found, places)]
@@ -87,8 +87,8 @@ def test_errors_of_a_landmark_that_are_alike_are_found() -> None:
     """Ten sightings of a landmark with one error are worth hardly more than one."""
     run, seen, *_ = _run(np.random.default_rng(2), 1.0, 1.0, 1.0, alike=0.8)
     found, noise = estimate_noise(run, seen, _stated(seen))
-    assert noise.ranges_alike == pytest.approx(0.8, abs=0.2)
-    assert noise.bearings_alike < 0.1
+    assert noise.range_correlation == pytest.approx(0.8, abs=0.2)
+    assert noise.bearing_correlation < 0.1
     xy = found.circles.xy
     radial = np.einsum("ni,nij,nj->n", xy, found.circles.covariance, xy) / np.sum(xy**2, axis=1)
     assert np.median(radial) > 3.0 * STATED[0] ** 2
@@ -101,7 +101,7 @@ def test_poses_in_a_map_have_the_errors_that_are_stated_despite_misread_landmark
     ids = np.where(misread, 6 + (seen.ids - 6 + rng.integers(1, 12, len(misread))) % 12, seen.ids)
     found, noise = estimate_noise(run, seen._replace(ids=ids), _stated(seen))
     lost = found.circles.ids == UNKNOWN_ID
-    assert noise.wrong == np.count_nonzero(lost)
+    assert noise.outliers == np.count_nonzero(lost)
     assert np.mean(lost[misread]) > 0.8
     assert np.mean(lost[~misread]) < 0.001
     spread = np.tile(1e-8 * np.eye(2), (LANDMARKS, 1, 1))

@@ -189,7 +189,7 @@ def test_without_noise_the_path_is_the_true_one() -> None:
     np.testing.assert_allclose(run.path.poses, truth, atol=1e-9)
     assert run.path.prefixes[:2] == ("start", "b.0")
     assert run.count.innovation_squared == pytest.approx(0.0, abs=1e-12)
-    assert run.count.innovation_numbers == 2 * len(recording.circles) + len(recording.lines)
+    assert run.count.degrees_of_freedom == 2 * len(recording.circles) + len(recording.lines)
 
 
 def test_a_wrong_start_is_forgotten_when_it_is_said_to_be_uncertain() -> None:

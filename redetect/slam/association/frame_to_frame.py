@@ -2,8 +2,8 @@
 
 These are the state of an EKF-SLAM (`redetect.slam.filters.ekf_slam`) that forgets landmarks out of
 sight. Its innovations include the correlation that joint compatibility needs. Accumulated drift
-does not affect them: landmarks share that error, and Jacobians by the heading are evaluated at
-first estimates, so that it cancels.
+does not affect them: landmarks share that error, and Jacobians with respect to the heading are
+evaluated at first estimates, so that it cancels.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
 
 
 @kernel()
-def _best_run(
+def _best_stretch(
     point: FloatArray, frame: int, rays: Rays, free: BoolArray, worth: FloatArray, reach: float
 ) -> tuple[float, IntArray]:
     """The contiguous stretch of frames with the most evidence for a vertical at a point.
@@ -196,14 +196,14 @@ def take_points(
     # Scores only decrease as rows are assigned: a point still first when rescored is the best.
     waiting = [(0.0, 0) for _ in range(0)]
     for k in range(len(points)):
-        score, _ = _best_run(points[k], frames[k], rays, free, worth, reach)
+        score, _ = _best_stretch(points[k], frames[k], rays, free, worth, reach)
         if score >= _LEAST_SCORE:
             waiting.append((-score, k))
     heapq.heapify(waiting)
     while len(waiting) > 0:
         k = heapq.heappop(waiting)[1]
         point = points[k]
-        score, used = _best_run(point, frames[k], rays, free, worth, reach)
+        score, used = _best_stretch(point, frames[k], rays, free, worth, reach)
         if score < _LEAST_SCORE:
             continue
         if len(waiting) > 0 and score < -waiting[0][0]:
@@ -211,7 +211,7 @@ def take_points(
             continue
         for _ in range(3):
             better = _meeting_point(rays, used, point)
-            improved, others = _best_run(better, frames[k], rays, free, worth, reach)
+            improved, others = _best_stretch(better, frames[k], rays, free, worth, reach)
             if improved <= score:
                 break
             point, score, used = better, improved, others

@@ -127,14 +127,14 @@ def _agreement(
 
 @kernel()
 def _best_motion(
-    moved: FloatArray, equal: _EqualPairs, search: Search, besides: FloatArray
+    moved: FloatArray, equal: _EqualPairs, search: Search, excluding: FloatArray
 ) -> tuple[float, float, float, int, int]:
     """The motion under which most landmarks of one constellation fall on those of another.
 
     Both are relative to the centre of the first. Every pair of its landmarks with every pair of the
     second of the same length gives a motion. Returns rotation and shift, the number of agreeing
-    landmarks, and that of motions tried, without those near `besides`: a rotation and a shift (3,),
-    NaN for none.
+    landmarks, and that of motions tried, without those near `excluding`: a rotation and a shift
+    (3,), NaN for none.
     """
     best_turn, best_x, best_y = 0.0, 0.0, 0.0
     best_count, best_squared, tried = search.least_agreeing - 1, 0.0, 0
@@ -156,8 +156,8 @@ def _best_motion(
             shift_y = 0.5 * (fixed[c, 1] + fixed[d, 1]) - (sin * x + cos * y)
             if math.hypot(shift_x, shift_y) > search.most_shift_m:
                 continue
-            off = math.hypot(shift_x - besides[1], shift_y - besides[2])
-            near = math.cos(turn - besides[0]) > math.cos(_OTHER_TURN_RAD)
+            off = math.hypot(shift_x - excluding[1], shift_y - excluding[2])
+            near = math.cos(turn - excluding[0]) > math.cos(_OTHER_TURN_RAD)
             if near and off < _OTHER_SHIFT_M:
                 continue
             tried += 1
@@ -301,15 +301,15 @@ class Motion(NamedTuple):
 
 
 def motion_onto(
-    moved: FloatArray, fixed: FloatArray, search: Search, besides: FloatArray | None = None
+    moved: FloatArray, fixed: FloatArray, search: Search, excluding: FloatArray | None = None
 ) -> Motion:
     """The motion under which most landmarks (n, 2) fall on those of another constellation; with
-    `besides` (3,), the best one that is not near this pose.
+    `excluding` (3,), the best one that is not near this pose.
     """
     centre = moved.sum(axis=0) / max(len(moved), 1)
     known = np.full(3, np.nan)
-    if besides is not None:
-        known = np.array([besides[2], *(apply(besides, centre) - centre)])
+    if excluding is not None:
+        known = np.array([excluding[2], *(apply(excluding, centre) - centre)])
     moved = moved - centre
     equal = _pairs_of_equal_length(moved, fixed - centre)
     turn, x, y, agreeing, tried = _best_motion(moved, equal, search, known)

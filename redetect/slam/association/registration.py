@@ -26,7 +26,7 @@ from redetect.slam.association import loops
 from redetect.slam.recording import Recording
 
 #: Fewest frames that are tried, growth of their number, and most frames.
-_FEWEST_FRAMES, _MORE, _MOST_FRAMES = 5, 1.5, 400
+_FEWEST_FRAMES, _GROWTH, _MOST_FRAMES = 5, 1.5, 400
 #: Rows closer together than this belong to one disc (m).
 ONE_DISC_M = 0.25
 #: Largest share of the agreeing discs with which another place may fit.
@@ -69,7 +69,7 @@ def localise_globally(recording: Recording, disc_xy: FloatArray) -> GlobalPose |
                 return GlobalPose(pose, covariance, frames, len(discs), len(pairs))
         if frames == most:
             return None
-        frames, before = min(math.ceil(_MORE * frames), most), len(discs)
+        frames, before = min(math.ceil(_GROWTH * frames), most), len(discs)
 
 
 def _merged(xy: FloatArray) -> FloatArray:
@@ -112,7 +112,7 @@ def located(
     if alarms > math.log10(false_alarms):
         return None
     # Also one on the same discs: pairs in a corridor look alike from both ends, and a period on.
-    rival = loops.motion_onto(discs, disc_xy, ANYWHERE, besides=pose)
+    rival = loops.motion_onto(discs, disc_xy, ANYWHERE, excluding=pose)
     return None if rival.agreeing > _RIVAL_SHARE * len(pairs) else (pose, pairs)
 
 

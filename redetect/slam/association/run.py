@@ -52,7 +52,7 @@ Progress = Callable[[str], None]
 # Edges of one door frame may be 0.1 m apart.
 _LINE_REACH_M = 0.05
 # Covariance of a step that leads nowhere (m^2, rad^2).
-_HARDLY_ANY = 1e-6 * np.eye(3)
+_NEGLIGIBLE_COVARIANCE = 1e-6 * np.eye(3)
 # Discs with rows in the same frames are distinct, unless these are at most this share of the frames
 # of either. Lines always are, since they are often confused from frame to frame.
 _MOST_TOGETHER = 0.1
@@ -63,7 +63,7 @@ _MOST_COST = 100.0
 _MOST_PARTS = 16
 # Submaps are longer, at most of this many frames, if they have fewer discs that are seen often
 # (median) than are enough to recognise a place.
-_LONGEST, _ENOUGH, _SEEN_OFTEN = 200, 12.0, 3
+_LONGEST, _FEWEST_DISCS_OF_A_PLACE, _SEEN_OFTEN = 200, 12.0, 3
 # Most rounds of closing loops.
 _MOST_ROUNDS = 6
 
@@ -205,7 +205,7 @@ def _closed_by_parts(run: _Run, labels: IntArray) -> _Closed:
     for first, end in zip(starts, [*starts[1:], len(recording)]):
         part = recording.part(first, end)
         if parts:  # a part begins with its own start, not with the end of the one before
-            known = np.concatenate([_HARDLY_ANY[None], part.step_covariance[1:]])
+            known = np.concatenate([_NEGLIGIBLE_COVARIANCE[None], part.step_covariance[1:]])
             part = replace(part, step_covariance=known)
         rows = slice(*np.searchsorted(frames, [first, end]))
         own = run._replace(recording=part)
@@ -279,7 +279,7 @@ def _sparse(run: _Run, at: _Solved, length: int) -> bool:
     submaps = loops.submaps_of(
         frames, labels, at.xy, count, length=length, overlapping=False, least=0
     )
-    return float(np.median([len(submap.labels) for submap in submaps])) < _ENOUGH
+    return float(np.median([len(submap.labels) for submap in submaps])) < _FEWEST_DISCS_OF_A_PLACE
 
 
 def _with_matches(

@@ -154,11 +154,11 @@ def _import_data_set(command: Import) -> None:
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
     elif file.name.endswith(data_sets.ODOMETRY):
-        run, *found = data_sets.read_robot(file, *sigmas, calibrated=command.calibrated)
+        run, *found = data_sets.read_utias(file, *sigmas, calibrated=command.calibrated)
         notes = [some.sentence() for some in found if some is not None]
         _write_run(command, run, "measurements", *notes)
     elif file.name == data_sets.DRIVE:
-        _write_run(command, data_sets.read_drive(file, *sigmas), "measurements")
+        _write_run(command, data_sets.read_victoria_park(file, *sigmas), "measurements")
     else:
         raise SlamError(
             f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "

@@ -59,7 +59,7 @@ def perform(command: Localize | Ekf) -> int:
     if command.association != "known":
         hint = " (--lost finds the start)" if placed else ""
         said += [line + hint for line in lost_lines(run, recording)]
-    elif run.count.innovation_squared > MOST_FACTOR * run.count.innovation_numbers:
+    elif run.count.innovation_squared > MOST_FACTOR * run.count.degrees_of_freedom:
         start = "is --start where the run begins? " if placed else ""
         said.append(
             f"errors are much larger than stated: {start}`slam audit` finds wrong identifiers"
@@ -84,7 +84,8 @@ def perform(command: Localize | Ekf) -> int:
             content["distance_from_reference_map"] = off
             said.append(
                 "from reference    landmarks rms {rms_m:.3f} m, median {median_m:.3f}, max "
-                "{max_m:.3f}; squared, over their covariance and 2: {normalised:.2f}".format(**off)
+                "{max_m:.3f}; normalised error squared per "
+                "coordinate: {normalised:.2f} (1 if consistent)".format(**off)
             )
     files.write_json(output / f"{name}.json", content, overwrite=command.force)
     print("\n".join([*_table(run, distance), *said]))
@@ -168,7 +169,7 @@ def _figures(run: FilterRun, distance: dict[str, float] | None) -> dict[str, Any
         "line_rows_used": count.lines,
         "rows_left_out": dict(sorted(count.left_out.items())),
         "innovation_squared": count.innovation_squared,
-        "innovation_expected": count.innovation_numbers,
+        "innovation_expected": count.degrees_of_freedom,
     }
     return figures if distance is None else figures | {"distance_from_reference": distance}
 
@@ -182,11 +183,11 @@ def _table(run: FilterRun, distance: dict[str, float] | None) -> list[str]:
     lines.append(f"rows used         {', '.join(used) or 'none'}")
     for reason, number in sorted(count.left_out.items()):
         lines.append(f"left out          {number} ({reason})")
-    if count.innovation_numbers:
-        factor = count.innovation_squared / count.innovation_numbers
+    if count.degrees_of_freedom:
+        factor = count.innovation_squared / count.degrees_of_freedom
         lines.append(
             f"innovations       chi2 {count.innovation_squared:.1f}, expected "
-            f"{count.innovation_numbers}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
+            f"{count.degrees_of_freedom}, factor {factor:.2f}, its root {math.sqrt(factor):.2f}"
         )
     if distance is not None:
         for head, kind, unit, scale, form in (

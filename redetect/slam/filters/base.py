@@ -59,17 +59,17 @@ class Prediction(NamedTuple):
     """Predicted measurements of d discs and e lines of a filter's state."""
 
     seen: FloatArray  # (2 d + e,): discs in the robot frame (m), lines' bearings (rad)
-    jacobian: FloatArray  # (2 d + e, k): by these numbers of the state:
-    numbers: IntArray  # (k,)
+    jacobian: FloatArray  # (2 d + e, k): with respect to components of the state
+    components: IntArray  # (k,): their indices
     sway: FloatArray  # (2 d + e, 2): changes due to tilts of the robot by one standard deviation
 
 
 class Innovation(NamedTuple):
-    """Measured minus predicted values of a frame's rows, m numbers."""
+    """Measured minus predicted values of a frame's rows, m components."""
 
     error: FloatArray  # (m,)
-    jacobian: FloatArray  # (m, k): of the prediction, by these numbers of the state:
-    numbers: IntArray  # (k,)
+    jacobian: FloatArray  # (m, k): of the prediction, with respect to components of the state
+    components: IntArray  # (k,): their indices
     noise: FloatArray  # (m, m): covariance of the measurements
 
 
@@ -81,14 +81,14 @@ class RowCount:
     lines: int = 0
     left_out: Counter[str] = field(default_factory=Counter)  # rows that were not, by the reason
     innovation_squared: float = 0.0  # sum of the squared normalised innovations
-    innovation_numbers: int = 0  # its expectation, the degrees of freedom
+    degrees_of_freedom: int = 0  # its expectation
 
     def use(self, rows: FrameRows, whitened: FloatArray) -> None:
         """Count rows that are used, with their whitened innovation (m,)."""
         self.discs += len(rows.circles)
         self.lines += len(rows.lines)
         self.innovation_squared += float(whitened @ whitened)
-        self.innovation_numbers += len(whitened)
+        self.degrees_of_freedom += len(whitened)
 
     def leave_out(self, reason: str, rows: int) -> None:
         """Count rows that are not used."""
@@ -119,10 +119,10 @@ def frames_of(recording: Recording) -> Iterator[FrameRows]:
 class Filter(ABC):
     """The pose and landmarks of a robot with their joint covariance, updated along a run.
 
-    Jacobians by the heading are evaluated at predicted poses and first estimates of landmarks
-    (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing
-    consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010): at the
-    latest estimates, corrections would add spurious information on the map's orientation.
+    Jacobians with respect to the heading are evaluated at predicted poses and first estimates of
+    landmarks (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for
+    designing consistent EKF SLAM estimators", International Journal of Robotics Research 29, 2010):
+    at the latest estimates, corrections would add spurious information on the map's orientation.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class Filter(ABC):
         looks the same.
     """
 
-    #: Number of the state's numbers for a line.
+    #: Number of the state's components for a line.
     line_size = 2
     #: Standard deviation of a tilt that moves all discs of a frame together (rad).
     tilt_sigma_rad = 0.0
@@ -151,14 +151,14 @@ class Filter(ABC):
         common_tilt_variance: float,
     ) -> None:
         self.camera_xy = np.asarray(camera_xy, dtype=np.float64)
-        #: Index of each landmark's first number in the state, by identifier.
+        #: Index of each landmark's first component in the state, by identifier.
         self.disc_slots: dict[int, int] = {}
         self.line_slots: dict[int, int] = {}
         self.count = RowCount()  #: Use of the rows.
-        # Numbers of the pose, and of the common tilt, if there is one.
+        # Components of the pose, and of the common tilt, if there is one.
         self._moving = np.arange(POSE_SIZE + 2 if common_tilt_variance else POSE_SIZE)
         self._tilt = slice(POSE_SIZE, len(self._moving))
-        self.size = len(self._moving)  #: Number of numbers in the state.
+        self.size = len(self._moving)  #: Number of components of the state.
         self._state = np.zeros(self.size)
         self._state[_POSE] = start
         self._linearised = self._state.copy()
@@ -193,7 +193,7 @@ class Filter(ABC):
         self._put(0, _POSE, by_pose, added, pose)
         return np.asarray(added)
 
-    def doubt_pose(self, covariance: FloatArray) -> None:
+    def inflate_pose_covariance(self, covariance: FloatArray) -> None:
         """Add (3, 3) to the covariance of the pose."""
         self._covariance[:POSE_SIZE, :POSE_SIZE] += covariance
 
@@ -204,22 +204,23 @@ class Filter(ABC):
         A row of several lines measures the mean of their bearings.
         """
 
-    def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+    def line_points(self, index: IntArray) -> tuple[FloatArray, FloatArray]:
         """Lines as homogeneous points (e, 3): the position is x / w, y / w.
 
-        Takes their numbers of the state (e, k); also returns the derivatives (e, 3, k) by these.
+        Takes the components of the state (e, k) that describe them; also returns the derivatives
+        (e, 3, k) with respect to these.
         """
-        points = np.insert(self._state[numbers], 2, 1.0, axis=1)
-        return points, np.tile(np.eye(3, 2), (len(numbers), 1, 1))
+        points = np.insert(self._state[index], 2, 1.0, axis=1)
+        return points, np.tile(np.eye(3, 2), (len(index), 1, 1))
 
     def predicted(self, discs: ArrayLike, lines: ArrayLike) -> Prediction:
         """Predicted measurements of discs and lines with the slots (d,) and (e,)."""
-        of_discs = numbers_from(discs, 2)
-        of_lines = numbers_from(lines, self.line_size)
+        of_discs = indices_from(discs, 2)
+        of_lines = indices_from(lines, self.line_size)
         pose, turn, d, e = self._state[:3], rotation(self._state[2]), len(of_discs), len(of_lines)
-        numbers = np.concatenate([self._moving, of_discs.ravel(), of_lines.ravel()])
+        index = np.concatenate([self._moving, of_discs.ravel(), of_lines.ravel()])
         first = len(self._moving)
-        jacobian = np.zeros((2 * d + e, len(numbers)))
+        jacobian = np.zeros((2 * d + e, len(index)))
         seen = models.disc_in_robot(pose, self._state[of_discs])
         if self._tilt.stop > self._tilt.start:
             jacobian[: 2 * d, self._tilt] = models.common_tilt_jacobian(seen).reshape(-1, 2)
@@ -250,7 +251,7 @@ class Filter(ABC):
             own[:, 0], own[:, 1] = -y, x
         turned[1][:, 2:3] = 1.0  # the direction of a ray
         jacobian[:, 2] = -jacobian[:, first:] @ np.concatenate([own.ravel() for own in turned])
-        return Prediction(np.append(seen.ravel(), bearing), jacobian, numbers, sway)
+        return Prediction(np.append(seen.ravel(), bearing), jacobian, index, sway)
 
     def innovation_of(self, rows: FrameRows) -> Innovation:
         """Innovation of rows whose landmarks are in the state."""
@@ -331,10 +332,10 @@ class Filter(ABC):
     def _put(
         self, slot: int, index: IntArray, jacobian: FloatArray, noise: FloatArray, value: FloatArray
     ) -> None:
-        """Set d numbers of the state, from `slot` on, to a function of others and a measurement.
+        """Set d components of the state, from `slot` on, to a function of others and a measurement.
 
-        Takes the indices of the others, `index` (k,), the derivative by them, `jacobian` (d, k),
-        and the measurement's covariance, `noise` (d, d).
+        Takes the indices of the others, `index` (k,), the derivative with respect to them,
+        `jacobian` (d, k), and the measurement's covariance, `noise` (d, d).
         """
         own = slice(slot, slot + len(value))
         columns = self._covariance[:, index] @ jacobian.T
@@ -345,7 +346,7 @@ class Filter(ABC):
         self._linearised[own] = self._state[own] = value
 
 
-def numbers_from(slots: ArrayLike, size: int) -> IntArray:
+def indices_from(slots: ArrayLike, size: int) -> IntArray:
     """(n, size) indices of the state from (n,) slots on."""
     return np.asarray(slots, dtype=np.int64).reshape(-1, 1) + np.arange(size)
 
@@ -449,11 +450,11 @@ def _after_slip(
     """
     jointly = replace(pairing, method="joint")  # the nearest one is often another, with such errors
     for factor in _SLIPS:
-        estimate.doubt_pose((factor - 1.0) * added)
+        estimate.inflate_pose_covariance((factor - 1.0) * added)
         again = jointly.identified(rows, estimate)
         if not _are_lost(again, before, estimate):
             return again
-        estimate.doubt_pose((1.0 - factor) * added)
+        estimate.inflate_pose_covariance((1.0 - factor) * added)
     return identified
 
 

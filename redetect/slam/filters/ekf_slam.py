@@ -7,7 +7,7 @@ pose predicted from odometry.
 
 Of a vertical line only the bearing is measured. It is represented by the ray of its first sight,
 from the camera's position then, and the inverse of its distance along the ray. In these four
-numbers bearings are nearly linear from the first sight on, however far away the line may be
+components bearings are nearly linear from the first sight on, however far away the line may be
 (J. Civera, A. J. Davison, J. M. M. Montiel, "Inverse depth parametrization for monocular SLAM",
 IEEE Transactions on Robotics 24(5), 2008).
 """
@@ -43,7 +43,7 @@ _INVERSE_DISTANCE, _INVERSE_DISTANCE_SIGMA = 0.4, 0.4
 # of an inverse distance in one iteration (1/m).
 _MOST_ITERATIONS, _CONVERGED, _LONGEST_STEP = 20, 1e-4, 0.2
 
-# Increment of the state's size; some unused numbers cost less than copying its covariance often.
+# Increment of the state's size; some unused components cost less than copying its covariance often.
 _CHUNK = 64
 # For poses alone the state is limited to this many discs: its update costs their number squared.
 _MOST_DISCS = 300
@@ -76,12 +76,12 @@ class EkfSlam(base.Filter):
         self.disc_rows: Counter[int] = Counter()
         self.line_rows: Counter[int] = Counter()
 
-    def line_points(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
+    def line_points(self, index: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `Filter.line_points`; the scale is the inverse distance along the first ray."""
-        x, y, direction, inverse = self._state[numbers].T
+        x, y, direction, inverse = self._state[index].T
         sin, cos = np.sin(direction), np.cos(direction)
         points = np.stack([inverse * x + sin, inverse * y - cos, inverse], axis=1)
-        by_numbers = np.zeros((len(numbers), 3, 4))
+        by_numbers = np.zeros((len(index), 3, 4))
         by_numbers[:, 0, 0] = by_numbers[:, 1, 1] = inverse
         by_numbers[:, 0, 2], by_numbers[:, 1, 2] = cos, sin
         by_numbers[:, :, 3] = np.stack([x, y, np.ones(len(x))], axis=1)
@@ -107,8 +107,8 @@ class EkfSlam(base.Filter):
 
     def landmark_map(self) -> LandmarkMap:
         """The landmarks with known positions, with their covariances."""
-        of_discs = base.numbers_from([*self.disc_slots.values()], 2)
-        of_lines = base.numbers_from([*self.line_slots.values()], self.line_size)
+        of_discs = base.indices_from([*self.disc_slots.values()], 2)
+        of_lines = base.indices_from([*self.line_slots.values()], self.line_size)
         inverse = of_lines[:, 3]
         sigma = np.sqrt(self._covariance[inverse, inverse])
         placed = sigma < LARGEST_RANGE_SIGMA * self._state[inverse]
@@ -146,7 +146,7 @@ class EkfSlam(base.Filter):
         ):
             for number in dropped:
                 del slots[number]
-            numbers = base.numbers_from([*slots.values()], size).ravel()
+            numbers = base.indices_from([*slots.values()], size).ravel()
             slots.update(zip([*slots], range(len(kept), len(kept) + len(numbers), size)))
             kept = np.append(kept, numbers)
         self.size = len(kept)
@@ -158,7 +158,7 @@ class EkfSlam(base.Filter):
         if not len(rows.circles) and not len(rows.lines):
             return
         before, tilt = self._state.copy(), self._covariance[self._tilt, self._tilt].copy()
-        inverse = base.numbers_from([*self.line_slots.values()], self.line_size)[:, 3]
+        inverse = base.indices_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
             factor, last = self._whitened(rows, before)
             change = before + factor @ last - self._state
@@ -197,12 +197,12 @@ class EkfSlam(base.Filter):
         self.count.lines += 1
 
     def _turned_about(self, xy: FloatArray) -> FloatArray:
-        """(2, 3) derivative of a position fixed to the robot, by its pose."""
+        """(2, 3) derivative of a position fixed to the robot, with respect to its pose."""
         x, y = xy - self._linearised[:2]
         return np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
 
     def _append(self, jacobian: FloatArray, noise: FloatArray, value: FloatArray) -> int:
-        """`_put` numbers that depend on the first ones at the end; returns their slot."""
+        """`_put` components that depend on the first ones at the end; returns their slot."""
         slot, self.size = self.size, self.size + len(value)
         if self.size > len(self._state):
             self._grow(_CHUNK)

@@ -57,7 +57,7 @@ _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
 #: of landmarks that show it, seconds.
 _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
-#: Step of the derivatives of residuals by a response.
+#: Step of the derivatives of residuals with respect to a response.
 _STEP = 1e-3
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
 _LATE_S = 0.08
@@ -187,7 +187,7 @@ class Response(NamedTuple):
 _RESPONSE_SIGMA = Response(0.25, 0.1, 0.1, 0.02)
 
 
-def read_robot(
+def read_utias(
     odometry: Path,
     sigma_m: float | None = None,
     sigma_rad: float | None = None,
@@ -212,7 +212,7 @@ def read_robot(
     sigma = np.empty((len(seen.ids), 2))
     sigma[:, 0] = usual_m if sigma_m is None else sigma_m
     sigma[:, 1] = usual_rad if sigma_rad is None else sigma_rad
-    response, noise, log = None, None, _driven_by(velocity)
+    response, noise, log = None, None, _robot_log(velocity)
     if calibrated:
         velocity = _without_short_stops(velocity)
         places = np.full((len(seen.ids), 2), np.nan)
@@ -221,7 +221,7 @@ def read_robot(
             places = ranges.places_of(seen.ids, true.ids, true.xy)
         response = response_of(velocity, seen, sigma, places)
         seen = seen._replace(range_m=seen.range_m / response.depth)
-        log = _driven_by(velocity, response)
+        log = _robot_log(velocity, response)
     steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
     rows = ranges.discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
     run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
@@ -259,7 +259,7 @@ def response_of(
 
     def residuals(numbers: ArrayLike) -> FloatArray:
         response = Response(*np.asarray(numbers).tolist())
-        poses = _driven_by(velocity, response).poses(seen.times)[seen.frame]
+        poses = _robot_log(velocity, response).poses(seen.times)[seen.frame]
         range_m = seen.range_m / response.depth
         place = range_m[:, None] * direction
 
@@ -343,7 +343,7 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
     return np.asarray(velocity[~np.repeat(dropped, end - first)])
 
 
-def _driven_by(velocity: FloatArray, response: Response | None = None) -> _Log:
+def _robot_log(velocity: FloatArray, response: Response | None = None) -> _Log:
     """The log of commands (k, 3), as the robot follows them; arcs are approximated by chords."""
     lag_s, speed_share, turn_share, _ = response or (0.0, 1.0, 1.0, 1.0)
     time, speed, turn_rate = (velocity * [1.0, speed_share, turn_share]).T
@@ -363,7 +363,9 @@ def _beside(odometry: Path, ending: str) -> Path:
 def _demand_order(path: Path, times: FloatArray, slack: float = 0.0) -> None:
     """Raise `SlamError` if times go back by more than some slack."""
     for k in np.flatnonzero(np.diff(times) < -slack)[:1]:
-        raise SlamError(f"{path}: {times[k + 1]:.3f} is after {times[k]:.3f}: expected order")
+        raise SlamError(
+            f"{path}: {times[k + 1]:.3f} follows {times[k]:.3f}: expected ascending times"
+        )
 
 
 def _demand_together(one: Path, first: FloatArray, other: Path, second: FloatArray) -> None:
@@ -395,10 +397,10 @@ def _whole(path: Path, name: str, numbers: FloatArray) -> IntArray:
     return numbers.astype(np.int64)
 
 
-def read_drive(
+def read_victoria_park(
     drive: Path, sigma_m: float | None = None, sigma_rad: float | None = None
 ) -> Recording:
-    """The car's log, with the trees found in its scans as discs; see `read_robot`."""
+    """The car's log, with the trees found in its scans as discs; see `read_utias`."""
     time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
     scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
     time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
@@ -418,7 +420,7 @@ def read_drive(
     of_ranges = _RAW_SIGMA_M if sigma_m is None else sigma_m
     of_bearings = _RAW_SIGMA_RAD if sigma_rad is None else sigma_rad
     rows = ranges.discs_of_ranges(trees[:, 0], trees[:, 1], of_ranges, of_bearings)
-    log = _driven(time / 1000.0, speed, steering)
+    log = _car_log(time / 1000.0, speed, steering)
     steps = log.steps(np.append(log.times[0], times))
     return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
 
@@ -443,7 +445,7 @@ def trees_of(scan: FloatArray) -> FloatArray:
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
-def _driven(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
+def _car_log(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
     """The scanner's log, from times (s), the speed of a rear wheel and the steering."""
 
     def along(held: IntArray, duration: FloatArray) -> FloatArray:

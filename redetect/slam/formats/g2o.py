@@ -29,7 +29,7 @@ from redetect.storage import write_text
 from redetect.storage.bounded import read_text
 
 #: The largest number of a vertex: other tools store it in 31 bits.
-LARGEST_NUMBER = 2**31 - 1
+LARGEST_VERTEX = 2**31 - 1
 _LARGEST_BYTES = 1 << 28
 # Less has no finite inverse (m^-2, rad^-2).
 _LEAST_INFORMATION = 1e-100
@@ -82,9 +82,9 @@ def _rows(graph: RunGraph) -> Iterator[str]:
         yield f"{_POSE} {number} {_numbers(pose)}"
     base = first_disc_vertex(len(graph.poses) - 1)
     for disc, xy in zip(graph.disc_ids.tolist(), from_dataset(graph.discs)):
-        if disc > LARGEST_NUMBER - base:
+        if disc > LARGEST_VERTEX - base:
             raise SlamError(
-                f"disc {disc}: expected an identifier of at most {LARGEST_NUMBER - base}, to have "
+                f"disc {disc}: expected an identifier of at most {LARGEST_VERTEX - base}, to have "
                 "a number in the graph"
             )
         yield f"{_DISC} {base + disc} {_numbers(xy)}"
@@ -186,14 +186,13 @@ def _read_rows(path: str | os.PathLike[str]) -> dict[str, list[_Row]]:
             numbers = tuple(map(number_in, words[count:]))
         except ValueError:
             vertices, numbers = (), ()
-        usable = all(0 <= i <= LARGEST_NUMBER for i in vertices) and all(
-            map(FINITE.contain, numbers)
-        )
+        usable = all(0 <= i <= LARGEST_VERTEX for i in vertices)
+        usable &= all(map(FINITE.contain, numbers))
         if not usable or len(numbers) != len(names):
             raise SlamError(
                 f"{path}:{line}: {kind} {' '.join(words)[:60]!a}: expected "
                 f"{'a vertex' if count == 1 else 'two vertices'}, whole numbers of 0 to "
-                f"{LARGEST_NUMBER}, and finite numbers {' '.join(names)}"
+                f"{LARGEST_VERTEX}, and finite numbers {' '.join(names)}"
             )
         if kind != _SIGHT:
             if vertices in known:

@@ -53,10 +53,10 @@ class Noise(NamedTuple):
 
     ranges: float = 1.0  # their standard deviation over the stated one
     bearings: float = 1.0
-    ranges_alike: float = 1.0  # correlation of errors while a landmark is in view
-    bearings_alike: float = 0.0
+    range_correlation: float = 1.0  # correlation of errors while a landmark is in view
+    bearing_correlation: float = 0.0
     steps: float = 1.0  # their standard deviation over the stated one
-    wrong: int = 0  # number of rows that contradict the others, and have lost their identifier
+    outliers: int = 0  # number of rows that contradict the others, and have lost their identifier
 
     def sentence(self) -> str:
         """Description of the noise."""
@@ -65,7 +65,8 @@ class Noise(NamedTuple):
         return (
             f"errors of ranges are {self.ranges:.2f}, of bearings {self.bearings:.2f}, of steps "
             f"{self.steps:.2f} times the usual ones, a landmark's correlated by "
-            f"{self.ranges_alike:.2f}, {self.bearings_alike:.2f}; {self.wrong} rows are wrong"
+            f"{self.range_correlation:.2f}, {self.bearing_correlation:.2f}; {self.outliers} rows "
+            "are wrong"
         )
 
 
@@ -77,21 +78,21 @@ def discs_of_ranges(
     bearing_rad: ArrayLike,
     sigma_m: ArrayLike,
     sigma_rad: ArrayLike,
-    near: FloatArray | None = None,
+    linearised_at: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Landmarks measured by range and bearing, as positions in the robot frame.
 
     Takes `range_m, bearing_rad` (n,) and their standard deviations, (n,) or one each; returns `xy`
-    (n, 2), `covariance` (n, 2, 2). They are linearised `near` (n, 2), where that is not NaN, else
-    as measured: then bearings seem to fit better the nearer a landmark is, which shrinks a map of
+    (n, 2), `covariance` (n, 2, 2). The model is `linearised_at` (n, 2), or as measured by default
+    and at NaN: then bearings seem to fit better the nearer a landmark is, which shrinks a map of
     vague ranges by the square of their relative error.
     """
     distance, angle = np.asarray(range_m, np.float64), np.asarray(bearing_rad, np.float64)
     far, at = distance, angle
-    if near is not None:
-        known = np.isfinite(near).all(axis=1)
-        far = np.where(known, np.hypot(*near.T), distance)
-        at = np.where(known, np.arctan2(near[:, 0], -near[:, 1]), angle)
+    if linearised_at is not None:
+        known = np.isfinite(linearised_at).all(axis=1)
+        far = np.where(known, np.hypot(*linearised_at.T), distance)
+        at = np.where(known, np.arctan2(linearised_at[:, 0], -linearised_at[:, 1]), angle)
     direction = np.stack([np.sin(at), -np.cos(at)], axis=-1)
     across = far[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
     spread = np.asarray(sigma_rad, np.float64)[..., None] * across
@@ -105,22 +106,24 @@ def with_noise(
     seen: Sightings,
     sigma: FloatArray,
     noise: Noise = USUAL,
-    right: BoolArray | None = None,
-    near: FloatArray | None = None,
+    inliers: BoolArray | None = None,
+    linearised_at: FloatArray | None = None,
 ) -> Recording:
     """A run with rows of some noise, by default the usual one; parameters as in `estimate_noise`.
 
     The n rows of a visit, with a correlation c, have the weight of n / (1 + (n - 1) c). Those that
-    are not `right` (n,) lose their identifiers; the others are linearised `near` (n, 2).
+    are not `inliers` (n,) lose their identifiers; for the others see `discs_of_ranges`.
     """
     visits = _visits(seen)
     others = np.bincount(visits)[visits, None] - 1.0
-    together = 1.0 + others * [noise.ranges_alike, noise.bearings_alike]
+    together = 1.0 + others * [noise.range_correlation, noise.bearing_correlation]
     sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
-    ids = seen.ids if right is None else np.where(right, seen.ids, UNKNOWN_ID)
-    if near is not None and right is not None:
-        near = np.where(right[:, None], near, np.nan)
-    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigmas[:, 0], sigmas[:, 1], near)
+    ids = seen.ids if inliers is None else np.where(inliers, seen.ids, UNKNOWN_ID)
+    if linearised_at is not None and inliers is not None:
+        linearised_at = np.where(inliers[:, None], linearised_at, np.nan)
+    rows = discs_of_ranges(
+        seen.range_m, seen.bearing_rad, sigmas[:, 0], sigmas[:, 1], linearised_at
+    )
     return replace(run, circles=CircleRows(seen.frame, *rows, ids))
 
 
@@ -152,28 +155,28 @@ def _with_own_noise(
     """
     _demand_shown(2 * (len(seen.ids) - len(np.unique(seen.ids))) >= _FEWEST_NUMBERS)
     noise, visits, steps, longer, turn = USUAL, _visits(seen), run.steps, 0.0, 0.0
-    near = _predicted(map_run(run, weighting=Weighting(loss="geman-mcclure")), seen)
-    error = _errors(near, seen) / sigma
+    predicted = _predicted(map_run(run, weighting=Weighting(loss="geman-mcclure")), seen)
+    error = _errors(predicted, seen) / sigma
     squared = np.sum(error**2, axis=1)
-    right = squared <= max(1.0, float(np.nanmedian(squared)) / _MEDIAN) * _WRONG
-    run = with_noise(run, seen, sigma, noise, right, near)
+    inliers = squared <= max(1.0, float(np.nanmedian(squared)) / _MEDIAN) * _WRONG
+    run = with_noise(run, seen, sigma, noise, inliers, predicted)
     for _ in range(_ROUNDS):
         mapped = map_run(run)
-        near = _predicted(mapped, seen)
-        error = _errors(near, seen) / sigma
-        right = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1) <= _WRONG
+        predicted = _predicted(mapped, seen)
+        error = _errors(predicted, seen) / sigma
+        inliers = np.sum((error / [noise.ranges, noise.bearings]) ** 2, axis=1) <= _WRONG
         table, check = mapped.table, check_odometry(mapped)
         # Factors are NaN if there are too few numbers.
-        _demand_shown(right.any() and check.rows_factor > 0.0 and check.odometry_factor > 0.0)
+        _demand_shown(inliers.any() and check.rows_factor > 0.0 and check.odometry_factor > 0.0)
         # The share of the numbers of rows that the others check.
         redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
-        variance = np.mean(error[right] ** 2, axis=0) / redundant
+        variance = np.mean(error[inliers] ** 2, axis=0) / redundant
         of_steps = noise.steps * math.sqrt(check.odometry_factor)
         factors = np.append(np.sqrt(variance), of_steps)
         _demand_shown(np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)))
-        alike = np.clip(_products(error[right], visits[right]) / variance, 0.0, 1.0)
-        wrong = int(np.count_nonzero(~right))
-        noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, wrong])
+        alike = np.clip(_products(error[inliers], visits[inliers]) / variance, 0.0, 1.0)
+        outliers = int(np.count_nonzero(~inliers))
+        noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, outliers])
         longer = (1.0 + longer) * (1.0 + check.length) - 1.0
         longer /= 1.0 + (check.length_sigma / _LENGTH_SIGMA) ** 2
         turn += check.turn_per_metre
@@ -182,7 +185,7 @@ def _with_own_noise(
         corrected[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
         spread = noise.steps**2 * ASSUMED.covariance(steps) + further
         run = replace(run, steps=corrected, step_covariance=spread)
-        run = with_noise(run, seen, sigma, noise, right, near)
+        run = with_noise(run, seen, sigma, noise, inliers, predicted)
     return run, noise
 
 

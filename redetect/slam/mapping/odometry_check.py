@@ -60,7 +60,7 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
     border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
-        by_change, along = np.zeros((count, 3, 3)), _without_errors(graph.steps, estimate.poses)
+        by_change, along = np.zeros((count, 3, 3)), _adjusted_movements(graph.steps, estimate.poses)
         by_change[:, :2, 0] = -along
         by_change[:, 2, 1] = -np.hypot(*along.T)
         by_change[1:-1, :, 2] = 0.5 * (graph.steps[:-2] - graph.steps[2:])
@@ -106,7 +106,7 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     )
 
 
-def _without_errors(steps: FloatArray, poses: FloatArray) -> FloatArray:
+def _adjusted_movements(steps: FloatArray, poses: FloatArray) -> FloatArray:
     """(N, 2) movements (m) of odometry's steps (N, 3), with its scale but without random errors:
     those of adjusted `poses` (N + 1, 3) times the scale.
     """
