@@ -57,8 +57,8 @@ def rows_as_recorded(
     The lens cancels: the ray of a disc meets the floor as from the camera's calibrated pose.
 
     Takes `floor_xy` (n, 2) in the robot frame and `mounting` (3, 4); returns `rows_xy` (n, 2), and
-    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter with respect to what
-    `rows_through_mounting` names.
+    its derivatives `by_floor` (n, 2, 2) and `by_mounting` (n, 2, 6), the latter as in
+    `rows_through_mounting`.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
     from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]

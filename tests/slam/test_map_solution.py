@@ -322,7 +322,7 @@ def test_a_disconnected_run_is_refused() -> None:
 
 
 def test_a_run_that_begins_with_a_lost_step_is_refused() -> None:
-    with pytest.raises(SlamError, match=r"step 1 \(s\.0000\).*lost before the first landmark"):
+    with pytest.raises(SlamError, match=r"step 1 \(s\.0000\).*share 0 .*, or zeros as the"):
         map_run(_lost_at(small_run(9), 0))
 
 

@@ -363,9 +363,8 @@ def _beside(odometry: Path, ending: str) -> Path:
 def _demand_order(path: Path, times: FloatArray, slack: float = 0.0) -> None:
     """Raise `SlamError` if times go back by more than some slack."""
     for k in np.flatnonzero(np.diff(times) < -slack)[:1]:
-        raise SlamError(
-            f"{path}: {times[k + 1]:.3f} follows {times[k]:.3f}: expected ascending times"
-        )
+        found = f"{times[k + 1]:.3f} follows {times[k]:.3f}"
+        raise SlamError(f"{path}: {found}: expected ascending times")
 
 
 def _demand_together(one: Path, first: FloatArray, other: Path, second: FloatArray) -> None:

@@ -117,13 +117,11 @@ def with_noise(
     visits = _visits(seen)
     others = np.bincount(visits)[visits, None] - 1.0
     together = 1.0 + others * [noise.range_correlation, noise.bearing_correlation]
-    sigmas = sigma * [noise.ranges, noise.bearings] * np.sqrt(together)
+    sigma_m, sigma_rad = (sigma * [noise.ranges, noise.bearings] * np.sqrt(together)).T
     ids = seen.ids if inliers is None else np.where(inliers, seen.ids, UNKNOWN_ID)
     if linearised_at is not None and inliers is not None:
         linearised_at = np.where(inliers[:, None], linearised_at, np.nan)
-    rows = discs_of_ranges(
-        seen.range_m, seen.bearing_rad, sigmas[:, 0], sigmas[:, 1], linearised_at
-    )
+    rows = discs_of_ranges(seen.range_m, seen.bearing_rad, sigma_m, sigma_rad, linearised_at)
     return replace(run, circles=CircleRows(seen.frame, *rows, ids))
 
 

@@ -136,9 +136,7 @@ def _apply(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 def _disc_rows(
     graph: Graph, estimate: Estimate, weighting: Weighting
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(n, 2) predicted minus measured discs (m); derivatives (n, 2, k) with respect to pose, disc and
-    mounting.
-    """
+    """Predicted minus measured discs (n, 2) (m); Jacobians (n, 2, k) of pose, disc, mounting."""
     pose, disc = estimate.poses[graph.disc_pose], estimate.disc_xy[graph.disc_index]
     seen, (by_pose, by_disc) = models.disc_in_robot(pose, disc), models.disc_jacobians(pose, disc)
     if estimate.mounting is None:

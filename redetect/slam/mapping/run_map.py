@@ -322,15 +322,11 @@ def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name:
         if counts[k].sum() < _FEWEST_SHARED:
             first = min(waiting)
             step = int(lost[first - 1])
-            at = f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): odometry "
-            if step == 0:
-                raise SlamError(
-                    f"{at}is lost before the first landmark: expected a smaller covariance, or "
-                    "zeros for one that is not known"
-                )
+            remedy = "" if step else ", or zeros as the covariance of a first step that is unknown"
             raise SlamError(
-                f"{at}is lost or another run begins there, and the parts before and after share "
-                f"{counts[first].sum()} landmarks: expected at least {_FEWEST_SHARED}"
+                f"{name}: disconnected at step {step + 1} ({recording.prefixes[step]}): odometry "
+                "is lost or another run begins there, and the parts before and after share "
+                f"{counts[first].sum()} landmarks: expected at least {_FEWEST_SHARED}{remedy}"
             )
         waiting.remove(k)
         known = known | lines[k]

@@ -82,9 +82,8 @@ def solve(
     """
     if not weighting.calibrate:
         start = replace(start, mounting=None)
-    elif graph.camera is None:
-        raise SlamError("the mounting cannot be estimated without a calibration: expected a .cam")
     elif start.mounting is None:
+        assert graph.camera is not None
         start = replace(start, mounting=np.array(graph.camera.robot_from_camera))
     problem = _MapProblem(graph, weighting)
     try:
