@@ -32,7 +32,7 @@ _FOLDS = 8
 # Fits to folds end at a step that lowers the cost by less than this share: they begin where the fit
 # to all views ended, and what the rest would change is far less than a variance.
 _FOLD_TOLERANCE = 1e-6
-# An additional coefficient must lower the sum of squared cross-validation errors by so many
+# An additional coefficient must lower the sum of squared cross-validation errors by this, in
 # variances.
 _WORTH = 4.0
 # With fewer coefficients than the lens has, a fold can bar the way to a fit of more: those are also

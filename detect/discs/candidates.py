@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from redetect.array_types import BoolArray, Float32Array, FloatArray, IntArray
@@ -15,27 +14,15 @@ def local_maxima(quality: FloatArray, threshold: float) -> BoolArray:
     Connected pixels of equal quality are one maximum, at the pixel nearest to their centroid: a
     plateau is neither lost nor found twice. Pixels of quality 0 are never maxima.
     """
-    around = np.ones((3, 3), np.uint8)
+    from skimage import measure, morphology  # of the report's detector alone, and slow to import
+
     quality = np.where((quality >= threshold) & (quality > 0.0), quality, 0.0)
-    highest = (quality > 0.0) & (quality >= cv2.dilate(quality, around))
-    while True:
-        # A plateau that touches a higher pixel is removed, pixel by pixel.
-        lost = cv2.dilate(np.where(highest, 0.0, quality), around)
-        if not np.any(highest & (lost >= quality)):
-            break
-        highest &= lost < quality
-    labels, plateau = cv2.connectedComponents(highest.astype(np.uint8), connectivity=8)
-    rows, columns = np.nonzero(highest)
-    number, count = plateau[rows, columns] - 1, labels - 1  # 0 is what is no maximum
-    size = np.bincount(number, minlength=count)
-    off = np.zeros(len(number))
-    for place in (rows, columns):
-        off += (place - (np.bincount(number, place, count) / size)[number]) ** 2
-    # The first of those nearest.
-    order = np.lexsort((np.arange(len(number)), off, number))
-    middle = order[np.concatenate([[0], np.cumsum(size)[:-1]])] if count else order
+    # Within a border of zeros, an image of one quality is a plateau, too.
+    highest = morphology.local_maxima(np.pad(quality, 1), connectivity=2)[1:-1, 1:-1]
     maxima = np.zeros(quality.shape, np.bool_)
-    maxima[rows[middle], columns[middle]] = True
+    for plateau in measure.regionprops(measure.label(highest, connectivity=2)):
+        off = ((plateau.coords - plateau.coords.mean(axis=0)) ** 2).sum(axis=1)
+        maxima[tuple(plateau.coords[np.argmin(off)])] = True  # the first of those nearest
     return maxima
 
 

@@ -109,7 +109,7 @@ def filled_pattern(indptr: IntArray, indices: IntArray) -> IntArray:
         mark[row] = row
         for at in range(indptr[row], indptr[row + 1]):
             column = indices[at]
-            # Up the elimination tree, to what is known to be in this row.
+            # Up the elimination tree, to entries of this row that were found before.
             while column < row and mark[column] != row:
                 mark[column] = row
                 entries.append(column * n + row)
