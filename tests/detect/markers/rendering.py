@@ -1,22 +1,33 @@
-"""Markers rendered with exact truth: many samples per pixel through a homography."""
+"""Markers before a camera, rendered with exact truth."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from detect.markers.dictionaries import templates_of
-from detect.markers.geometry import square_homography
+from camera import Camera
+from camera.rotations import rotation_of
+from camera.uncertainty import IDENTITY
+from detect.markers.dictionaries import marker_dictionary
+from redetect.groundtruth.trajectories import se3
+from tools.simulator.markers.rendering import Imaging, exact_grey, render_light
+from tools.simulator.markers.surface import Surface, Texture, marker_texture, plain, square_corners
 
 FloatArray = NDArray[np.float64]
 
-#: Samples per pixel and axis.
-SAMPLES = 8
+# The card is so far behind its print, in widths of the marker.
+_BEHIND = 1e-6
+# One picture of a moving marker for each of these, pixels.
+_STEP_PX = 0.25
+
+
+def pinhole(width: int, height: int) -> Camera:
+    """A camera that sees perspective like most, and needs no calibration."""
+    middle = 0.5 * (width - 1), 0.5 * (height - 1)
+    return Camera(width, height, 700.0, 700.0, *middle, (0.0, 0.0, 0.0, 0.0, 0.0), IDENTITY)
 
 
 @dataclass(frozen=True)
@@ -24,64 +35,33 @@ class View:
     """How a marker is seen.
 
     `width` is the side's length in pixels if it were seen from the front; `slant_deg` the angle
-    between its normal and the line of sight, about an axis in its plane at `axis_deg`; `roll_deg`
-    turns the image. `focal` (px) decides the perspective.
+    between its normal and the optical axis, about an axis in its plane at `axis_deg`; `roll_deg`
+    turns the image.
     """
 
     width: float
     slant_deg: float = 0.0
     axis_deg: float = 0.0
     roll_deg: float = 0.0
-    focal: float = 700.0
+
+    def pose(self, camera: Camera, middle: tuple[float, float]) -> FloatArray:
+        """camera_from_marker of a marker of width 1 whose middle is seen at a pixel."""
+        slant, axis, roll = np.radians([self.slant_deg, self.axis_deg, self.roll_deg])
+        turn = rotation_of(np.array([0.0, 0.0, roll])) @ rotation_of(
+            slant * np.array([math.cos(axis), math.sin(axis), 0.0])
+        )
+        place = np.append(camera.undistort(middle), 1.0) * camera.scale_x / self.width
+        # y is up on a marker and down in the image.
+        return se3.transform(turn @ np.diag([1.0, -1.0, -1.0]), place)
 
 
-def view_corners(view: View, centre: tuple[float, float]) -> FloatArray:
-    """(4, 2) corners, top left first, clockwise in the image."""
-    square = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-    slant, axis, roll = np.radians([view.slant_deg, view.axis_deg, view.roll_deg])
-    direction = np.array([math.cos(axis), math.sin(axis), 0.0])
-    rotation, _ = cv2.Rodrigues(slant * direction)
-    spin, _ = cv2.Rodrigues(roll * np.array([0.0, 0.0, 1.0]))
-    points = square @ np.asarray(spin @ rotation).T
-    depth = view.focal / view.width + points[:, 2]
-    return np.asarray(view.focal * points[:, :2] / depth[:, None] + np.array(centre))
-
-
-@njit(cache=True, error_model="numpy")
-def _paint(
-    canvas: NDArray[np.float32],
-    inverse: NDArray[np.float64],
-    lines: NDArray[np.float64],
-    black: NDArray[np.float64],
-    quiet: float,
-    dark: float,
-    light: float,
-    samples: int,
-) -> None:
-    """Paint the marker with its quiet zone over a canvas of `samples` per pixel."""
-    n = len(lines) - 1
-    for row in range(canvas.shape[0]):
-        v = (row + 0.5) / samples - 0.5
-        for column in range(canvas.shape[1]):
-            u = (column + 0.5) / samples - 0.5
-            q = inverse[2, 0] * u + inverse[2, 1] * v + inverse[2, 2]
-            if q <= 0.0:
-                continue
-            x = (inverse[0, 0] * u + inverse[0, 1] * v + inverse[0, 2]) / q
-            y = (inverse[1, 0] * u + inverse[1, 1] * v + inverse[1, 2]) / q
-            if x < -quiet or y < -quiet or x > 1.0 + quiet or y > 1.0 + quiet:
-                continue
-            value = light
-            if 0.0 <= x < 1.0 and 0.0 <= y < 1.0:
-                i = np.searchsorted(lines, x, side="right") - 1
-                j = np.searchsorted(lines, y, side="right") - 1
-                if black[min(j, n - 1), min(i, n - 1)] > 0.5:
-                    value = dark
-            canvas[row, column] = value
+def corners_of(camera: Camera, pose: FloatArray) -> FloatArray:
+    """(4, 2) pixels of a marker's corners, as they are printed from the top left clockwise."""
+    return camera.project(se3.apply(pose, square_corners(1.0)))
 
 
 def render(
-    size: tuple[int, int],
+    camera: Camera,
     markers: list[tuple[str, int, FloatArray]],
     *,
     dark: float = 40.0,
@@ -91,16 +71,12 @@ def render(
     blur: float = 0.0,
     motion: tuple[float, float] = (0.0, 0.0),
     gradient: tuple[float, float] = (0.0, 0.0),
-    samples: int = SAMPLES,
 ) -> FloatArray:
     """Grey values without noise and rounding.
 
     Parameters
     ----------
-    size : (int, int)
-        Width and height.
-    markers : list of (dictionary, id, corners)
-        Corners (4, 2) as `view_corners` gives them.
+    markers : list of (dictionary, id, (4, 4) pose as `View` gives it)
     dark, light : float
         Grey levels of the print.
     background : float or (H, W) array
@@ -113,42 +89,27 @@ def render(
         Way of the image during the exposure, pixels.
     gradient : (float, float)
         Relative change of the light across the image's width and height.
-    samples : int
-        Per pixel and axis.
     """
-    width, height = size
-    canvas = np.empty((height * samples, width * samples), np.float32)
-    if isinstance(background, float):
-        canvas[:] = background
-    else:
-        canvas[:] = np.repeat(np.repeat(background, samples, axis=0), samples, axis=1)
-    for name, number, corners in markers:
-        templates = templates_of(name, (number,))
-        inverse = np.asarray(np.linalg.inv(square_homography(corners)), np.float64)
-        quiet = quiet_cells * templates.dictionary.cell
-        _paint(
-            canvas, inverse, templates.lines, templates.blackness(0), quiet, dark, light, samples
-        )
-    if blur > 0.0:
-        canvas = np.asarray(cv2.GaussianBlur(canvas, (0, 0), blur * samples), np.float32)
-    length = math.hypot(*motion)
-    if length > 0.0:
-        steps = max(2, math.ceil(length * samples))
-        total = np.zeros_like(canvas)
-        for k in range(steps):
-            part = (k + 0.5) / steps - 0.5
-            shift = np.array([[1.0, 0.0, part * motion[0] * samples],
-                              [0.0, 1.0, part * motion[1] * samples]])  # fmt: skip
-            total += cv2.warpAffine(
-                canvas, shift, canvas.shape[::-1], borderMode=cv2.BORDER_REPLICATE
-            )
-        canvas = total / np.float32(steps)
-    image = canvas.reshape(height, samples, width, samples).mean(axis=(1, 3), dtype=np.float64)
-    if any(gradient):
-        u = np.linspace(-0.5, 0.5, width)[None, :]
-        v = np.linspace(-0.5, 0.5, height)[:, None]
-        image *= 1.0 + gradient[0] * u + gradient[1] * v
-    return np.asarray(image)
+    surfaces = []
+    for name, number, pose in markers:
+        dictionary = marker_dictionary(name)
+        white = marker_texture(dictionary, number, quiet_cells=0).values > 0.5
+        printed = Texture(np.where(white, light, dark).astype(np.float32))
+        card = 1.0 + 2.0 * quiet_cells * dictionary.cell
+        behind = pose @ se3.transform(np.eye(3), [0.0, 0.0, -_BEHIND])
+        surfaces += [Surface(pose, 1.0, 1.0, printed), Surface(behind, card, card, plain(light))]
+    steps = math.ceil(math.hypot(*motion) / _STEP_PX) or 1
+    exposures = []
+    for part in (np.arange(steps) + 0.5) / steps - 0.5:
+        way = part * np.array([*motion, 0.0]) / camera.scale_x
+        exposures.append([s.moved(se3.transform(np.eye(3), s.pose[2, 3] * way)) for s in surfaces])
+    ground = np.full((camera.height, camera.width), background, np.float32)
+    imaging = Imaging(blur_px=blur, black_level=0.0, gain=1.0)
+    seen = render_light(camera, exposures, ground, fine=imaging.fine)
+    u = np.linspace(-0.5, 0.5, camera.width)
+    v = np.linspace(-0.5, 0.5, camera.height)[:, None]
+    lit = (1.0 + gradient[0] * u + gradient[1] * v).astype(np.float32)
+    return exact_grey(seen, lit, imaging).astype(np.float64)
 
 
 def exposed(image: FloatArray, noise: float, rng: np.random.Generator) -> NDArray[np.uint8]:

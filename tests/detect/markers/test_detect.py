@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
+from camera.uncertainty import IDENTITY
 from detect.errors import DetectError, FrameError
 from detect.markers import candidates as regions
 from detect.markers import detect as identities
@@ -19,7 +20,7 @@ from detect.markers import edges, geometry
 from detect.markers.detect import MarkerDetections, detect_markers
 from detect.markers.dictionaries import dictionary_names, marker_dictionary
 from detect.settings import MarkerSettings
-from tests.detect.markers.rendering import View, exposed, render, view_corners
+from tests.detect.markers.rendering import View, corners_of, exposed, pinhole, render
 from tests.pictures import read_grey
 
 FloatArray = NDArray[np.float64]
@@ -45,12 +46,13 @@ def picture(
 ) -> tuple[NDArray[np.uint8], FloatArray]:
     """A marker in the middle of an image, and its corners."""
     view = View(60.0, 35.0, 20.0, 33.0) if view is None else view
-    corners = view_corners(view, (size[0] / 2 + 0.3, size[1] / 2 - 0.2))
+    camera = pinhole(*size)
+    pose = view.pose(camera, (size[0] / 2 + 0.3, size[1] / 2 - 0.2))
     grey = render(
-        size, [(dictionary, number, corners)], dark=dark, light=light, background=background,
+        camera, [(dictionary, number, pose)], dark=dark, light=light, background=background,
         quiet_cells=quiet_cells, blur=blur, gradient=gradient, motion=motion,
     )  # fmt: skip
-    return exposed(grey, noise, np.random.default_rng(seed)), corners
+    return exposed(grey, noise, np.random.default_rng(seed)), corners_of(camera, pose)
 
 
 def normalised_error(found: MarkerDetections, corners: FloatArray) -> float:
@@ -122,40 +124,40 @@ def test_covariances_are_right() -> None:
 @pytest.mark.parametrize("width", [15.0, 16.0, 17.0, 18.0])
 def test_small_sharpened_tags_are_found(width: float) -> None:
     # Clear edges of few pixels, between which undamped steps of a fit go back and forth.
+    camera = pinhole(80, 80)
     for roll_deg in (0.0, 3.0, 10.0, 33.0):
-        corners = view_corners(View(width, 20.0, 40.0, roll_deg), (40.3, 39.8))
-        grey = render((80, 80), [("apriltag_36h11", 0, corners)], blur=0.3)
+        pose = View(width, 20.0, 40.0, roll_deg).pose(camera, (40.3, 39.8))
+        grey = render(camera, [("apriltag_36h11", 0, pose)], blur=0.3)
         sharp = grey + 0.7 * (grey - cv2.GaussianBlur(grey, (0, 0), 1.0))
         image = exposed(np.asarray(sharp), 0.7, np.random.default_rng(0))
         found = detect_markers(image, MarkerSettings(dictionary="apriltag_36h11"))
         assert found.ids.tolist() == [0]
-        assert np.abs(found.corners[0] - corners).max() < 0.15
+        assert np.abs(found.corners[0] - corners_of(camera, pose)).max() < 0.15
 
 
 @pytest.mark.parametrize("width", [16.0, 22.0, 30.0, 48.0])
 def test_tags_with_a_seam_of_white_are_found_on_dark_ground(width: float) -> None:
     # As they are cut out of a sheet: the ground is as dark as the tag, on all sides or on some.
-    size = (100, 100)
+    camera = pinhole(100, 100)
     rng = np.random.default_rng(3)
     for roll_deg in (3.0, 33.0, 70.0):
-        corners = view_corners(View(width, 25.0, 40.0, roll_deg), (50.3, 49.8))
-        ground = 25.0 + 20.0 * cv2.GaussianBlur(rng.normal(size=size), (0, 0), 2.0)
+        pose = View(width, 25.0, 40.0, roll_deg).pose(camera, (50.3, 49.8))
+        ground = 25.0 + 20.0 * cv2.GaussianBlur(rng.normal(size=(100, 100)), (0, 0), 2.0)
         for bright in (100, 45):
             ground[:, bright:] += 130.0
             grey = render(
-                size, [("apriltag_36h11", 5, corners)], background=np.asarray(ground),
+                camera, [("apriltag_36h11", 5, pose)], background=np.asarray(ground),
                 quiet_cells=0.5, blur=0.6,
             )  # fmt: skip
             image = exposed(grey, 1.5, rng)
             found = detect_markers(image, MarkerSettings(dictionary="apriltag_36h11"))
             assert found.ids.tolist() == [5]
-            assert np.abs(found.corners[0] - corners).max() < 0.2
+            assert np.abs(found.corners[0] - corners_of(camera, pose)).max() < 0.2
 
 
 def test_the_tone_curve_of_a_camera_moves_no_corner() -> None:
-    corners = view_corners(View(90.0, 35.0, 20.0, 33.0), (80.3, 69.8))
-    markers = [("6x6_250", 7, corners)]
-    light = render((160, 140), markers, dark=12.0, light=180.0, background=60.0, blur=0.8)
+    view = View(90.0, 35.0, 20.0, 33.0)
+    light, corners = picture(view=view, dark=12.0, light=180.0, background=60.0, noise=0.0)
     image = exposed(255.0 * (light / 255.0) ** (1.0 / 2.2), 2.0, np.random.default_rng(0))
     found = detect_markers(image, ARUCO)
     assert np.abs(found.corners[0] - corners).max() < 0.06
@@ -204,16 +206,17 @@ def test_brightness_and_contrast_do_not_matter() -> None:
 
 
 def test_several_markers_of_several_sizes() -> None:
+    camera = pinhole(256, 200)
     places = {3: (75.0, 85.0, 85.0), 40: (190.0, 60.0, 45.0), 200: (190.0, 150.0, 25.0)}
-    drawn = {
-        number: view_corners(View(width, 25.0, 40.0, 10.0 * number), (u, v))
+    poses = {
+        number: View(width, 25.0, 40.0, 10.0 * number).pose(camera, (u, v))
         for number, (u, v, width) in places.items()
     }
-    grey = render((256, 200), [("6x6_250", n, c) for n, c in drawn.items()], blur=0.7)
+    grey = render(camera, [("6x6_250", n, pose) for n, pose in poses.items()], blur=0.7)
     found = detect_markers(exposed(grey, 2.0, np.random.default_rng(0)), ARUCO)
     assert found.ids.tolist() == sorted(places)
     for number, corners in zip(found.ids, found.corners):
-        assert np.abs(corners - drawn[int(number)]).max() < 0.15
+        assert np.abs(corners - corners_of(camera, poses[int(number)])).max() < 0.15
 
 
 @pytest.mark.parametrize(
@@ -226,23 +229,12 @@ def test_several_markers_of_several_sizes() -> None:
 def test_distortion_is_taken_off(
     coef: tuple[float, float, float, float, float], polynomial: tuple[float, float, float]
 ) -> None:
-    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-    camera = Camera(320, 240, 200.0, 200.0, 159.5, 119.5, coef, pose, polynomial=polynomial)
+    camera = Camera(320, 240, 200.0, 200.0, 159.5, 119.5, coef, IDENTITY, polynomial=polynomial)
     assert (camera.seen_share < 0.95) == any(polynomial)
-    # A marker off the middle, drawn straight, then bent pixel by pixel.
-    straight = view_corners(View(70.0, 20.0, 40.0, 15.0, focal=200.0), (265.0, 60.0))
-    grey = render(
-        (1280, 960), [("6x6_250", 7, 4.0 * straight + 1.5)], background=200.0, samples=2
-    ).astype(np.float32)
-    v, u = np.mgrid[0:960, 0:1280]
-    pixels = (np.stack([u, v], axis=-1) - 1.5) / 4.0
-    seen = camera.undistort(pixels) * 200.0 + np.array([159.5, 119.5])
-    at = np.nan_to_num(4.0 * seen + 1.5).astype(np.float32)
-    bent = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    bent = cv2.GaussianBlur(bent, (0, 0), 2.4)
-    small = bent.reshape(240, 4, 320, 4).mean(axis=(1, 3), dtype=np.float64)
-    image = exposed(small, 1.0, np.random.default_rng(0))
-    corners = camera.distort((straight - np.array([159.5, 119.5])) / 200.0)
+    pose = View(70.0, 20.0, 40.0, 15.0).pose(camera, (255.0, 70.0))
+    grey = render(camera, [("6x6_250", 7, pose)], background=200.0, blur=0.7)
+    image = exposed(grey, 1.0, np.random.default_rng(0))
+    corners = corners_of(camera, pose)
     with_camera = detect_markers(image, ARUCO, camera)
     assert with_camera.ids.tolist() == [7]
     assert np.abs(with_camera.corners[0] - corners).max() < 0.08

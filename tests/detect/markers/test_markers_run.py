@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera import Camera, write_camera
+from camera import write_camera
 from detect.cli import main
 from detect.runs.plan import FramePlan, Job
 from detect.runs.stream import detect_run
@@ -18,9 +18,10 @@ from detect.sources.interface import Run
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from tests.detect.commands import Captured
-from tests.detect.markers.rendering import View, exposed, render, view_corners
+from tests.detect.markers.rendering import View, corners_of, exposed, pinhole, render
 
-POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+CAMERA = pinhole(220, 120)
+VIEW = View(70.0, 20.0, 30.0, 15.0)
 
 
 @pytest.fixture
@@ -30,14 +31,10 @@ def folder(tmp_path: Path) -> Path:
     (run / "images").mkdir(parents=True)
     for index, numbers in enumerate([[5], [], [5, 9]]):
         drawn = [
-            (
-                "rawseeds",
-                number,
-                view_corners(View(70.0, 20.0, 30.0, 15.0), (60.0 + 100.0 * k, 60.0)),
-            )
+            ("rawseeds", number, VIEW.pose(CAMERA, (60.0 + 100.0 * k, 60.0)))
             for k, number in enumerate(numbers)
         ]
-        image = exposed(render((220, 120), drawn, blur=0.7), 1.0, np.random.default_rng(index))
+        image = exposed(render(CAMERA, drawn, blur=0.7), 1.0, np.random.default_rng(index))
         assert cv2.imwrite(str(run / "images" / f"f{index}.png"), image)
     return run
 
@@ -51,7 +48,7 @@ def test_rows_of_a_folder_without_a_calibration(folder: Path, capsys: Captured) 
     assert [[row.id for row in frame.markers] for frame in frames] == [[5], [], [5, 9]]
     row = frames[0].markers[0]
     assert row.dictionary == "rawseeds"
-    expected = view_corners(View(70.0, 20.0, 30.0, 15.0), (60.0, 60.0))
+    expected = corners_of(CAMERA, VIEW.pose(CAMERA, (60.0, 60.0)))
     found = np.array([[corner.u, corner.v] for corner in row.corners])
     assert np.abs(found - expected).max() < 0.05
     assert all(0.0 < corner.cuu < 0.01 for corner in row.corners)
@@ -68,19 +65,17 @@ def test_ids_on_the_command_line(folder: Path) -> None:
 
 
 def test_a_calibration_of_another_size_costs_its_frames(folder: Path) -> None:
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0, 0.0), POSE)
-    write_camera(camera, folder / "run.cam")
+    write_camera(pinhole(64, 48), folder / "run.cam")
     assert main(["markers", str(folder)]) == 3
     assert not any(frame.markers for frame in read_frames(folder / "detected.markers"))
 
 
 def test_a_calibration_is_used_where_there_is_one(folder: Path) -> None:
-    camera = Camera(220, 120, 200.0, 200.0, 109.5, 59.5, (0.0, 0.0, 0.0, 0.0, 0.0), POSE)
     assert not isinstance(open_source(folder), Run)
-    write_camera(camera, folder / "run.cam")
+    write_camera(CAMERA, folder / "run.cam")
     run = open_source(folder)
     assert isinstance(run, Run)
-    assert run.camera == camera
+    assert run.camera == CAMERA
     plan = FramePlan(run.camera, markers=MarkerSettings())
     summary = detect_run(Job(run, plan, {"markers": folder / "detected.markers"}))
     assert summary.found["markers"] == 3
