@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.landmarks import wrap_angle
+from redetect.plane import chain_steps
 
 FloatArray = NDArray[np.float64]
 LASER_COVARIANCE = np.array([[4e-4, 1e-4, 0.0], [1e-4, 9e-4, 2e-5], [0.0, 2e-5, 1e-4]])
@@ -33,18 +34,18 @@ def drive(
             ),
         ]
     )
+    true_step = step + rng.normal(size=step.shape) * sigma
     return (
-        PlanarPoses(times, chain(step + rng.normal(size=step.shape) * sigma, rng.normal(size=3))),
-        PlanarPoses(times, chain(step, np.array([7.0, -3.0, 2.0]))),
+        PlanarPoses(times, chain(true_step[1:], rng.normal(size=3))),
+        PlanarPoses(times, chain(step[1:], (7.0, -3.0, 2.0))),
     )
 
 
-def chain(steps: FloatArray, start: FloatArray) -> FloatArray:
-    """(N, 3) poses from a start; each step but the first is in the frame of the pose before."""
-    theta = start[2] + np.concatenate([[0.0], np.cumsum(steps[1:, 2])])
-    moves = (steps[1:, 0] + 1j * steps[1:, 1]) * np.exp(1j * theta[:-1])
-    xy = complex(start[0], start[1]) + np.concatenate([[0.0], np.cumsum(moves)])
-    return np.column_stack([xy.real, xy.imag, wrap_angle(theta)])
+def chain(steps: FloatArray, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
+    """(N + 1, 3) poses along N steps, their headings wrapped."""
+    poses = chain_steps(steps, start)
+    poses[:, 2] = wrap_angle(poses[:, 2])
+    return poses
 
 
 def measure(
@@ -55,6 +56,12 @@ def measure(
     return PlanarPoses(
         exact.times_s, exact.poses + noise, np.broadcast_to(covariance, (len(exact), 3, 3)).copy()
     )
+
+
+def errors_m(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:
+    """Distances of positions from the truth."""
+    exact, _ = interpolate_poses(truth, poses.times_s)
+    return np.asarray(np.linalg.norm((poses.poses - exact.poses)[:, :2], axis=1))
 
 
 def normalised_error(poses: PlanarPoses, truth: PlanarPoses) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from redetect.groundtruth.trajectories.streams import PlanarPoses
+from tools.simulator.laser.motion import RobotClock
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class Clocks:
     truth_rate_hz: float = 25.0
     truth_sigma_rad: float = 0.0026
     walk: float = 0.003
-    jump_at_s: float | None = None
+    jump_at_s: float = float("inf")
     jump_s: float = 0.0
     turns: bool = True
 
@@ -46,11 +47,9 @@ def simulate(clocks: Clocks, seed: int) -> tuple[PlanarPoses, PlanarPoses]:
     turned = np.abs(np.diff(own, prepend=own[0]))
     own += np.cumsum(rng.normal(0, 1, len(own)) * clocks.walk * np.sqrt(turned))
     middle = clocks.start_s + clocks.length_s / 2
-    robot_times = odometry_times + clocks.offset_s + clocks.drift * (odometry_times - middle)
-    if clocks.jump_at_s is not None:
-        robot_times += np.where(odometry_times > clocks.jump_at_s, clocks.jump_s, 0.0)
+    clock = RobotClock(middle, clocks.offset_s, clocks.drift, clocks.jump_at_s, clocks.jump_s)
     return (
-        headings_only(robot_times, own - clocks.angle_rad),
+        headings_only(clock.robot_times(odometry_times), own - clocks.angle_rad),
         headings_only(times, truth),
     )
 

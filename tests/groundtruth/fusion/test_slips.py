@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.fuse import Fusion, fuse
+from redetect.groundtruth.fusion.fuse import fuse
 from redetect.groundtruth.settings import FuseSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.plane import between
-from tests.groundtruth.fusion.drives import chain, drive, measure, normalised_error
+from tests.groundtruth.fusion.drives import chain, drive, errors_m, measure, normalised_error
 
 FloatArray = NDArray[np.float64]
 
@@ -26,12 +26,7 @@ def slipping(
     steps = between(own.poses[:-1], own.poses[1:])
     during = (own.times_s[1:] > from_s) & (own.times_s[1:] <= to_s)
     steps[during] += np.array([extra_m, 0.0, turned_rad]) / np.count_nonzero(during)
-    return PlanarPoses(own.times_s, chain(np.vstack([np.zeros((1, 3)), steps]), own.poses[0]))
-
-
-def errors_m(fusion: Fusion, truth: PlanarPoses) -> FloatArray:
-    exact, _ = interpolate_poses(truth, fusion.poses.times_s)
-    return np.asarray(np.linalg.norm((fusion.poses.poses - exact.poses)[:, :2], axis=1))
+    return PlanarPoses(own.times_s, chain(steps, own.poses[0]))
 
 
 @pytest.mark.parametrize("extra_m", [0.2, 1.0])
@@ -41,7 +36,7 @@ def test_wheels_that_spin_do_not_carry_the_path_away(extra_m: float) -> None:
     odometry = slipping(own, 20.0, 21.0, extra_m)
     laser = measure(rng, truth, np.arange(0.0, 59.9, 0.08), FINE)
     fusion = fuse(odometry, {"laser": laser})
-    assert errors_m(fusion, truth).max() < 0.05
+    assert errors_m(fusion.poses, truth).max() < 0.05
     assert 0.7 < float(np.mean(normalised_error(fusion.poses, truth))) / 3.0 < 1.5
     assert len(fusion.rejected) < 0.01 * len(laser)
     assert fusion.slips_s
@@ -85,7 +80,7 @@ def test_bursts_of_wrong_poses_side_by_side_are_no_slips(every_s: float, seed: i
         poses[begin : begin + 6] += rng.normal(0.0, 0.3, 3)
     fusion = fuse(own, {"laser": PlanarPoses(laser.times_s, poses, laser.covariances)})
     assert fusion.slips_s == ()
-    assert errors_m(fusion, truth).max() < 0.02
+    assert errors_m(fusion.poses, truth).max() < 0.02
 
 
 def test_a_burst_of_wrong_poses_is_no_slip() -> None:
@@ -98,7 +93,7 @@ def test_a_burst_of_wrong_poses_is_no_slip() -> None:
     fusion = fuse(odometry, {"laser": laser})
     assert fusion.slips_s == ()
     assert len(fusion.rejected) == np.count_nonzero(wrong)
-    assert errors_m(fusion, truth).max() < 0.02
+    assert errors_m(fusion.poses, truth).max() < 0.02
 
 
 def test_odometry_that_was_reset_is_followed_at_once() -> None:
@@ -109,7 +104,7 @@ def test_odometry_that_was_reset_is_followed_at_once() -> None:
     odometry.poses[after] = between(own.poses[after][0], own.poses[after])
     laser = measure(rng, truth, np.arange(0.0, 59.9, 0.08), FINE)
     fusion = fuse(odometry, {"laser": laser})
-    off = errors_m(fusion, truth)
+    off = errors_m(fusion.poses, truth)
     away = np.abs(fusion.poses.times_s - 30.0) > 0.2
     assert off[away].max() < 0.02
     assert len(fusion.rejected) < 5
