@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.groundtruth.lasers.acquisition import fixed_scanners
 from redetect.groundtruth.lasers.scanners import Robot, Scanner, Scans, write_scanners
+from redetect.groundtruth.lasers.tracking_kernels import FixedScanners
 from redetect.plane import apply
+from tools.simulator.laser.measuring import cast_on_walls
 from tools.simulator.laser.session_files import write_robot, write_scans
 
 FloatArray = NDArray[np.float64]
@@ -60,16 +63,10 @@ def sides(outline: FloatArray, pose: FloatArray) -> FloatArray:
 
 def cast(pose: FloatArray, angles_rad: FloatArray, segments: FloatArray) -> FloatArray:
     """Exact distances (m) along beams from a pose, infinite where no segment is met."""
-    direction = pose[2] + angles_rad
-    dx, dy = np.cos(direction)[:, None], np.sin(direction)[:, None]
-    ex, ey = segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]
-    rx, ry = segments[:, 0] - pose[0], segments[:, 1] - pose[1]
-    cross = dx * ey - dy * ex
-    with np.errstate(divide="ignore", invalid="ignore"):
-        r = (rx * ey - ry * ex) / cross
-        t = (rx * dy - ry * dx) / cross
-    hit = (cross != 0.0) & (t >= 0.0) & (t <= 1.0) & (r > 0.0)
-    return np.asarray(np.where(hit, r, np.inf).min(axis=1))
+    rays = np.column_stack([np.tile(pose[:2], (len(angles_rad), 1)), pose[2] + angles_rad])
+    ranges = np.full(len(rays), np.inf)
+    cast_on_walls(rays, segments, ranges)
+    return ranges
 
 
 def ranges_mm(
@@ -114,14 +111,24 @@ def record(
     return scans
 
 
+def scans_of(
+    one: Scanner, segments: FloatArray, rng: np.random.Generator, count: int = 50,
+    drop_outs: float = 0.0,
+) -> Scans:  # fmt: skip
+    """Scans of segments at rest."""
+    ranges = np.stack([ranges_mm(one, segments, rng, drop_outs) for _ in range(count)])
+    return Scans(np.arange(count) / 75.0, ranges)
+
+
 def empty_scans(scanners: tuple[Scanner, ...], seed: int, count: int = 150) -> list[Scans]:
     """Scans of the empty room."""
     rng = np.random.default_rng(seed)
-    times = np.arange(count) / 75.0
-    return [
-        Scans(times, np.stack([ranges_mm(one, ROOM, rng, 0.005) for _ in range(count)]))
-        for one in scanners
-    ]
+    return [scans_of(one, ROOM, rng, count, 0.005) for one in scanners]
+
+
+def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
+    """What tracking needs of scanners that saw the empty room."""
+    return fixed_scanners(scanners, empty_scans(scanners, 7))
 
 
 def circle(t: float) -> FloatArray:

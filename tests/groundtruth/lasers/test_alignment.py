@@ -31,9 +31,9 @@ from tests.groundtruth.lasers.scene import (
     circle,
     empty_scans,
     four_scanners,
-    ranges_mm,
     record,
     scanner,
+    scans_of,
     write_session,
 )
 from tools.simulator.laser.session_files import write_building, write_scans
@@ -59,10 +59,7 @@ def furnished(scanners: tuple[Scanner, ...], seed: int, count: int = 100) -> lis
     things = [[2.0, 5.6, 2.0, 6.0], [2.0, 5.6, 3.0, 5.6], [3.0, 5.6, 3.0, 6.0]]
     things += [[7.4, 0.0, 7.4, 0.5], [7.4, 0.5, 8.0, 0.5]]
     walls = np.vstack([ROOM, np.array(things)])
-    return [
-        Scans(np.arange(count) / 75.0, np.stack([ranges_mm(s, walls, rng) for _ in range(count)]))
-        for s in scanners
-    ]
+    return [scans_of(one, walls, rng, count) for one in scanners]
 
 
 def test_exact_poses_come_back_from_measured_ones() -> None:
@@ -130,7 +127,7 @@ def test_a_corridor_leaves_a_direction_open() -> None:
     walls = np.array([[-30.0, 0.0, 30.0, 0.0], [-30.0, 3.0, 30.0, 3.0]])
     one = scanner("corridor", np.array([0.0, 1.0, 0.2]), max_range_m=12.0)
     rng = np.random.default_rng(4)
-    empty = Scans(np.arange(50) / 75.0, np.stack([ranges_mm(one, walls, rng) for _ in range(50)]))
+    empty = scans_of(one, walls, rng)
     found = align_scanners(by_hand((one,), SHIFTS[:1]), [empty], walls)
     assert found.undetermined == ("corridor",)
     error = found.scanners[0].pose - one.pose
@@ -154,7 +151,7 @@ def test_a_round_room_leaves_a_turn_open(chords: int) -> None:
     walls = ring(2000)
     one = scanner("round", np.array([1.5, 1.0, 0.2]))
     rng = np.random.default_rng(4)
-    empty = Scans(np.arange(50) / 75.0, np.stack([ranges_mm(one, walls, rng) for _ in range(50)]))
+    empty = scans_of(one, walls, rng)
     for shift in (*SHIFTS, 3.0 * SHIFTS[0]):
         found = align_scanners(by_hand((one,), shift[None]), [empty], ring(chords))
         assert found.undetermined == ("round",)
@@ -176,10 +173,10 @@ def test_what_few_readings_determine_is_undetermined() -> None:
     one = scanner("corridor", np.array([0.0, 1.0, 0.2]), max_range_m=30.0)
     for seed in (7, 8, 11):
         rng = np.random.default_rng(seed)
-        scans = np.stack([ranges_mm(one, walls, rng) for _ in range(50)])
+        scans = scans_of(one, walls, rng)
         stated = replace(one, covariance=np.diag([0.04, 0.04, 0.01]))
         stated = replace(stated, pose=one.pose + rng.normal(0.0, [0.2, 0.2, 0.1]))
-        found = align_scanners([stated], [Scans(np.arange(50) / 75.0, scans)], walls).scanners[0]
+        found = align_scanners([stated], [scans], walls).scanners[0]
         error = found.pose - one.pose
         assert error @ np.linalg.solve(found.covariance, error) < 16.0
 
@@ -190,7 +187,7 @@ def test_walls_drawn_slightly_askew_do_not_move_a_scanner_along_a_corridor() -> 
     drawn = walls + np.array([[0.0, 0.01, 0.0, -0.01], [0.0, 0.0, 0.0, 0.02]])
     one = scanner("corridor", np.array([0.0, 1.0, 0.2]), max_range_m=12.0)
     rng = np.random.default_rng(4)
-    empty = Scans(np.arange(50) / 75.0, np.stack([ranges_mm(one, walls, rng) for _ in range(50)]))
+    empty = scans_of(one, walls, rng)
     found = align_scanners(by_hand((one,), SHIFTS[:1]), [empty], drawn)
     assert found.undetermined == ("corridor",)
     assert not found.inconsistent
@@ -205,10 +202,10 @@ def test_a_lone_scanner_between_two_walls_cannot_tell_whether_they_are_off() -> 
     one = scanner("wedge", np.array([0.5, 1.2, 0.2]), max_range_m=12.0)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        scans = np.stack([ranges_mm(one, walls, rng) for _ in range(20)])
+        scans = scans_of(one, walls, rng, 20)
         drawn = walls + rng.normal(0.0, 0.01, walls.shape)
         stated = by_hand((one,), SHIFTS[seed : seed + 1])
-        found = align_scanners(stated, [Scans(np.arange(20) / 75.0, scans)], drawn)
+        found = align_scanners(stated, [scans], drawn)
         assert found.undetermined == ("wedge",)
         error = found.scanners[0].pose - one.pose
         assert error @ np.linalg.solve(found.scanners[0].covariance, error) < 16.0

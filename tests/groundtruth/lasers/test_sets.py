@@ -7,29 +7,14 @@ import pytest
 from numpy.typing import NDArray
 
 from redetect.groundtruth.lasers.acquisition import (
-    fixed_scanners,
     learn_background,
     sets_of_scans,
 )
 from redetect.groundtruth.lasers.scanners import Scanner, Scans
 from redetect.groundtruth.lasers.tracking_kernels import FixedScanners
-from tests.groundtruth.lasers.scene import empty_scans, four_scanners, scanner
+from tests.groundtruth.lasers.scene import empty_scans, scanner
 
 FloatArray = NDArray[np.float64]
-
-
-def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
-    return fixed_scanners(scanners, empty_scans(scanners, 7))
-
-
-@pytest.fixture(scope="module")
-def scanners() -> tuple[Scanner, ...]:
-    return four_scanners()
-
-
-@pytest.fixture(scope="module")
-def tables(scanners: tuple[Scanner, ...]) -> FixedScanners:
-    return tables_of(scanners)
 
 
 def test_background_is_learned() -> None:

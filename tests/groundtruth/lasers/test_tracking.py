@@ -45,33 +45,20 @@ from tests.groundtruth.lasers.scene import (
     FRONTED,
     PLAIN,
     ROOM,
+    cast,
     circle,
     empty_scans,
-    four_scanners,
     ranges_mm,
     record,
     scanner,
     sides,
+    tables_of,
     write_session,
 )
 
 FloatArray = NDArray[np.float64]
 
 GATE_M = LaserSettings().gate_m
-
-
-def tables_of(scanners: tuple[Scanner, ...]) -> FixedScanners:
-    return fixed_scanners(scanners, empty_scans(scanners, 7))
-
-
-@pytest.fixture(scope="module")
-def scanners() -> tuple[Scanner, ...]:
-    return four_scanners()
-
-
-@pytest.fixture(scope="module")
-def tables(scanners: tuple[Scanner, ...]) -> FixedScanners:
-    return tables_of(scanners)
 
 
 def one_set(
@@ -120,8 +107,6 @@ def test_points_are_moved_on_with_the_robot() -> None:
 
 def exact(scanners: tuple[Scanner, ...], pose: FloatArray, tables: FixedScanners) -> NewReadings:
     """Readings without noise nor rounding."""
-    from tests.groundtruth.lasers.scene import cast
-
     parts: list[list[FloatArray]] = [[], [], [], []]
     for k, one in enumerate(scanners):
         walls = cast(one.pose, one.angles_rad, ROOM)
