@@ -15,6 +15,7 @@ from redetect.groundtruth.settings import PoseSettings
 from redetect.groundtruth.trajectories import se3
 from redetect.landmarks import MarkerCorner, MarkerLandmark
 from tools.simulator.driving import planar_transform
+from tools.simulator.markers.room import looking_at
 
 FloatArray = NDArray[np.float64]
 
@@ -31,15 +32,6 @@ def lens(scale_px: float = 900.0, coef: tuple[float, ...] = COEF) -> Camera:
     return Camera(
         1280, 960, scale_px, scale_px * 1.01, 640.0, 470.0, (a2, a3, b1, b2, b3), NO_MOUNTING
     )
-
-
-def looking_at(position: FloatArray, target: FloatArray) -> FloatArray:
-    """`world_from_camera` of an upright camera."""
-    z = np.asarray(target, float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    return se3.transform(np.stack([x, np.cross(z, x), z], axis=1), position)
 
 
 def hall_cameras(count: int) -> FloatArray:

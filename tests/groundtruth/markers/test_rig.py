@@ -29,13 +29,13 @@ from tests.groundtruth.markers.scene import (
     frames_of,
     hall_cameras,
     lens,
-    looking_at,
     marker_rows,
     network_of,
     points_of,
     visible,
 )
 from tools.simulator.driving import planar_transform
+from tools.simulator.markers.room import looking_at
 
 FloatArray = NDArray[np.float64]
 
