@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from camera import Camera
+from camera.model_checks import checked_pose
 from detect.lines import LineDetections
 
 FloatArray = NDArray[np.float64]
@@ -61,23 +62,18 @@ def pinhole(
         offset_x=0.5 * (width - 1),
         offset_y=0.5 * (height - 1),
         coef=coef,
-        robot_from_camera=_pose(rotation, np.array([0.0, 0.0, 1.2])),
+        robot_from_camera=checked_pose("pose", np.column_stack([rotation, [0.0, 0.0, 1.2]])),
     )
-
-
-def tilted(camera: Camera, pitch_rad: float, roll_rad: float) -> Camera:
-    """The camera as it really stands when the robot is tilted by a rotation (pitch, roll, 0)."""
-    level = Rotation.from_rotvec([pitch_rad, roll_rad, 0.0]).as_matrix()
-    return replace(camera, robot_from_camera=_pose(level @ camera.rotation, camera.centre))
 
 
 def mirrored(camera: Camera) -> Camera:
     """The camera that sees the mirror image, left and right exchanged."""
     flip = np.diag([-1.0, 1.0, 1.0])
+    pose = np.column_stack([flip @ camera.rotation @ flip, flip @ camera.centre])
     return replace(
         camera,
         offset_x=camera.width - 1 - camera.offset_x,
-        robot_from_camera=_pose(flip @ camera.rotation @ flip, flip @ camera.centre),
+        robot_from_camera=checked_pose("pose", pose),
     )
 
 
@@ -139,9 +135,3 @@ def _blurred_pixel(distance: FloatArray, blur: float) -> FloatArray:
     upper, lower = (distance[near] + 0.5) / blur, (distance[near] - 0.5) / blur
     share[near] = blur * (primitive(upper) - primitive(lower))
     return share
-
-
-def _pose(
-    rotation: FloatArray, centre: FloatArray
-) -> tuple[tuple[float, float, float, float], ...]:
-    return tuple((float(a), float(b), float(c), float(t)) for (a, b, c), t in zip(rotation, centre))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +13,10 @@ from camera import Camera
 from detect.circles import detect_circles, disc_table
 from detect.lines import detect_lines
 from detect.markers.geometry import picture_of
+from detect.projection import leaning_camera
 from detect.settings import CircleSettings
 from lut import build_vertical_table
-from tests.detect.line_scene import EDGES, edge_columns, pinhole, render, tilt_of, tilted
+from tests.detect.line_scene import EDGES, edge_columns, pinhole, render, tilt_of
 from tests.detect.painted_floor import PaintedFloor
 
 TANGENTIAL = (2e-3, -3e-3)
@@ -65,11 +67,11 @@ def test_verticals_are_found_as_exactly_as_through_a_radial_lens(lens: dict[str,
     radial = pinhole(240, 160, 200.0, pitch_deg=10.0, roll_deg=1.0, coef=(0.0, -0.1, 0.0, 0.0, 0.0))
     bent = replace(radial, **lens)
     truth = np.array([edge.bearing_rad for edge in EDGES])
-    turn = np.radians((2.3, -1.0))
+    turn = (math.radians(2.3), math.radians(-1.0))
     errors = []
     for seen_by, believed in ((radial, radial), (bent, bent), (bent, radial)):
         rng = np.random.default_rng(0)
-        image = render(tilted(seen_by, *turn), EDGES, noise=2.0, rng=rng)
+        image = render(leaning_camera(seen_by, turn), EDGES, noise=2.0, rng=rng)
         found = detect_lines(image, build_vertical_table(believed))
         assert len(found.lines.alpha_rad) == len(EDGES)
         off = np.degrees(np.abs(tilt_of(found) - turn).max())
@@ -80,7 +82,7 @@ def test_verticals_are_found_as_exactly_as_through_a_radial_lens(lens: dict[str,
             pixels = bent.distort(ends.reshape(-1, 2, 2))
             for (top, bottom), bearing in zip(pixels, truth):
                 rows = np.array([top[1], bottom[1]])
-                columns = edge_columns(tilted(bent, *turn), bearing, rows)
+                columns = edge_columns(leaning_camera(bent, turn), bearing, rows)
                 np.testing.assert_allclose([top[0], bottom[0]], columns, atol=0.3)
     assert errors[0][0] < 4e-4
     assert errors[1][0] < 4e-4

@@ -21,7 +21,7 @@ from detect.drawing.frame import draw_rows, draw_tracks, track_pixels
 from detect.errors import FrameError
 from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines
-from detect.projection import DiscProjection
+from detect.projection import DiscProjection, leaning_camera
 from detect.row_files import ImageRows
 from detect.sources.interface import decode_gray
 from lut.verticals import build_vertical_table
@@ -34,7 +34,6 @@ from tests.detect.line_scene import (
     pinhole,
     render,
     tilt_of,
-    tilted,
 )
 from tests.detect.verticals.stages import judge_tracks, line_starts, line_tracks, tracks_again
 from tests.landmarks.rows import parse_record
@@ -58,7 +57,7 @@ def truth(edges: Sequence[Edge] = EDGES) -> np.ndarray:
 def test_bearings_and_tilt_of_a_tilted_camera(tilt_deg: tuple[float, float]) -> None:
     """Calibrated with one pose, standing in another: bearings are those of the world."""
     pitch, roll = np.radians(tilt_deg)
-    found = detect_lines(scene(tilted(CAMERA, pitch, roll)), TABLE)
+    found = detect_lines(scene(leaning_camera(CAMERA, (pitch, roll))), TABLE)
     np.testing.assert_allclose(found.lines.alpha_rad, truth(), atol=4e-4)
     np.testing.assert_allclose(tilt_of(found), (pitch, roll), atol=np.radians(0.08))
     assert found.tilt is not None
@@ -79,7 +78,7 @@ def test_cameras_that_do_not_see_the_horizon_see_verticals(
     table = build_vertical_table(camera)
     assert abs(table.anchor_elevation_rad) > 0.1
     pitch, roll = np.radians([0.8, -0.5])
-    found = detect_lines(scene(tilted(camera, pitch, roll)), table)
+    found = detect_lines(scene(leaning_camera(camera, (pitch, roll))), table)
     order = np.argsort(-found.lines.alpha_rad)
     off = found.lines.alpha_rad[order] - truth()
     assert np.all(np.abs(off) < 3.0 * found.lines.sigma_rad[order])
@@ -92,7 +91,7 @@ def test_cameras_that_do_not_see_the_horizon_see_verticals(
 
 
 def test_rows_hold_ends_beta_and_sigma() -> None:
-    found = detect_lines(scene(tilted(CAMERA, 0.02, -0.01)), TABLE)
+    found = detect_lines(scene(leaning_camera(CAMERA, (0.02, -0.01))), TABLE)
     rows = found.landmarks()
     assert len(rows) == len(EDGES)
     for row, bearing in zip(rows, truth()):
@@ -106,14 +105,14 @@ def test_rows_hold_ends_beta_and_sigma() -> None:
         # Ends lie on whole rows, and on the edge.
         pixels = CAMERA.distort(np.reshape(ends, (2, 2)))
         np.testing.assert_allclose(pixels[:, 1], np.rint(pixels[:, 1]), atol=0.02)
-        expected = edge_columns(tilted(CAMERA, 0.02, -0.01), bearing, pixels[:, 1])
+        expected = edge_columns(leaning_camera(CAMERA, (0.02, -0.01)), bearing, pixels[:, 1])
         np.testing.assert_allclose(pixels[:, 0], expected, atol=0.3)
     # Leftmost first.
     assert np.all(np.diff(found.lines.alpha_rad) < 0.0)
 
 
 def test_published_convention_turns_the_other_way() -> None:
-    image = scene(tilted(CAMERA, 0.04, 0.0))
+    image = scene(leaning_camera(CAMERA, (0.04, 0.0)))
     level = detect_lines(image, TABLE)
     other = detect_lines(image, TABLE, replace(DEFAULT, alpha="published"))
     assert level.tilt is not None
@@ -151,7 +150,7 @@ def test_affine_brightness_does_not_matter(gain: float, offset: float) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_mirrored_image_and_camera_give_mirrored_rows(seed: int) -> None:
-    image = scene(tilted(CAMERA, 0.02, 0.01), seed=seed)
+    image = scene(leaning_camera(CAMERA, (0.02, 0.01)), seed=seed)
     found = detect_lines(image, TABLE)
     other = detect_lines(
         np.ascontiguousarray(image[:, ::-1]), build_vertical_table(mirrored(CAMERA))
@@ -284,7 +283,7 @@ def _end_rows(line: LineLandmark, camera: Camera) -> np.ndarray:
 
 def test_one_call_goes_the_path_of_the_steps() -> None:
     """Starts, tracks and judgement, and doubtful tracks once more, each by itself."""
-    camera = tilted(CAMERA, 0.02, -0.01)
+    camera = leaning_camera(CAMERA, (0.02, -0.01))
     # Edges that are nearly too short and too faint.
     faint = scene(camera, (*EDGES, Edge(0.22, 13.0), Edge(0.06, 13.0)))
     image, horizon = scene(camera), int(np.median(TABLE.anchor_row))

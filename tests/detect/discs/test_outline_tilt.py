@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,9 +18,8 @@ from detect.discs.outline_tilt import (
     mean_of_tilts,
     tilt_of_outlines,
 )
-from detect.projection import image_positions, level_rotation
+from detect.projection import image_positions, leaning_camera
 from redetect.landmarks import FrameTilt
-from tests.detect.line_scene import tilted
 from tests.detect.painted_floor import PaintedFloor
 
 FloatArray = NDArray[np.float64]
@@ -32,10 +30,7 @@ def seen_from(
     camera: Camera, tilt: tuple[float, float], paint: Callable[[PaintedFloor], None]
 ) -> FrameTilt | None:
     """The tilt found in an image that a robot tilted so takes of the discs."""
-    # The robot turns about its origin on the floor, and the camera with it.
-    turned = tilted(camera, *tilt)
-    rows = np.column_stack([turned.rotation, level_rotation(tilt) @ camera.centre]).tolist()
-    floor = PaintedFloor(replace(camera, robot_from_camera=tuple(map(tuple, rows))))
+    floor = PaintedFloor(leaning_camera(camera, tilt))
     for place in DISCS:
         floor.disc(place)
     paint(floor)

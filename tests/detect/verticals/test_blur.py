@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from detect.line_settings import DEFAULT, PUBLISHED
 from detect.lines import blur_of_sharpness, detect_lines, median_sharpness, widened, width_for
+from detect.projection import leaning_camera
 from detect.verticals.refinement import LineFits
 from lut.verticals import build_vertical_table
-from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.line_scene import Edge, pinhole, render
 
 CAMERA = pinhole(480, 240, 400.0, pitch_deg=8.0)
 TABLE = build_vertical_table(CAMERA)
@@ -27,7 +28,8 @@ NEVER_WIDER = replace(DEFAULT, blurred_widths=())
 
 def seen(turned_px: int = 1, blur_px: float = 0.6, noise: float = 2.0) -> NDArray[np.uint8]:
     """The edges, seen by a robot that tilts and, while the shutter is open, turns."""
-    sharp = render(tilted(CAMERA, 0.01, -0.006), EDGES, blur_px=blur_px).astype(np.float64)
+    leaning = leaning_camera(CAMERA, (0.01, -0.006))
+    sharp = render(leaning, EDGES, blur_px=blur_px).astype(np.float64)
     ramp = cv2.blur(sharp, (turned_px, 1)) if turned_px > 1 else sharp
     ramp += np.random.default_rng(5).normal(0.0, noise, ramp.shape)
     return np.asarray(np.clip(np.rint(ramp), 0, 255), np.uint8)

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.projection import leaning_camera
 from detect.sources.interface import decode_gray
 from detect.verticals.refinement import Crossings, newton_step, step_filters
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
 from lut.verticals import VerticalTable, build_vertical_table
-from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.line_scene import Edge, pinhole, render
 from tests.detect.verticals.stages import judge_tracks, line_tracks, start_response
 from tests.reference import verticals as reference
 from tools.detector_maps import line_response
@@ -32,7 +33,7 @@ def images() -> dict[str, NDArray[np.uint8]]:
     rng = np.random.default_rng(4)
     shape = (CAMERA.height, CAMERA.width)
     edges = [Edge(0.4, 60.0), Edge(0.2, -50.0), Edge(0.0, 80.0), Edge(-0.3, -40.0)]
-    seen = render(tilted(CAMERA, 0.02, -0.01), edges, noise=2.0, rng=rng)
+    seen = render(leaning_camera(CAMERA, (0.02, -0.01)), edges, noise=2.0, rng=rng)
     return {
         "random": rng.integers(0, 256, shape).astype(np.uint8),
         "black": np.zeros(shape, np.uint8),

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from detect.line_settings import DEFAULT, numbers_of
 from detect.lines import detect_lines
+from detect.projection import leaning_camera
 from detect.verticals.judgement import share_edges
 from detect.verticals.tilt import (
     TiltEstimate,
@@ -20,7 +21,7 @@ from detect.verticals.tilt import (
     levelling_rotation,
 )
 from lut.verticals import build_vertical_table
-from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.line_scene import Edge, pinhole, render
 from tests.detect.verticals.stages import consensus, verticals
 
 SETTINGS = replace(DEFAULT, largest_tilt_deg=5.0)
@@ -186,7 +187,7 @@ def test_blurred_edges_among_texture_do_not_overstate_the_tilt(narrow: bool) -> 
         true = np.radians(rng.uniform(-1.5, 1.5, 2))
         bearings = np.linspace(-0.55, 0.55, 7) + rng.uniform(-0.05, 0.05, 7)
         edges = [Edge(b, 60.0 * (-1.0) ** i) for i, b in enumerate(bearings)]
-        image = render(tilted(camera, true[0], true[1]), edges, blur_px=2.5)
+        image = render(leaning_camera(camera, (true[0], true[1])), edges, blur_px=2.5)
         texture = gaussian_filter(rng.normal(0.0, 1.0, image.shape), (1.0, 0.7))
         texture *= 2.5 / texture.std()
         grey = np.clip(np.rint(image + texture), 0, 255).astype(np.uint8)

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
+from detect.projection import leaning_camera
 from detect.verticals import starts
 from detect.verticals.starts import LineStarts, start_band
 from detect.verticals.tracking import LineTracks
 from lut.verticals import build_vertical_table
-from tests.detect.line_scene import Edge, pinhole, render, tilted
+from tests.detect.line_scene import Edge, pinhole, render
 from tests.detect.verticals.stages import (
     last_rows,
     line_starts,
@@ -136,7 +137,7 @@ def test_tracks_bridge_gaps_up_to_a_length(gap: int) -> None:
 
 
 def test_tracks_know_polarity_and_follow_subpixel() -> None:
-    camera = tilted(CAMERA, 0.0, np.radians(4.0))
+    camera = leaning_camera(CAMERA, (0.0, np.radians(4.0)))
     image = render(camera, [Edge(0.1, 80.0), Edge(-0.15, -60.0)], grey=100.0)
     tracks = line_tracks(image, line_starts(image, TABLE, DEFAULT), TABLE, DEFAULT)
     assert sorted(tracks.polarity) == [-1.0, 1.0]
@@ -220,7 +221,7 @@ def test_tracks_see_nearly_the_response_of_the_whole_strip(
     table = build_vertical_table(camera)
     preset = replace(preset, border_rows=2, threshold=min(preset.threshold, 0.2))
     edges = [Edge(0.3, 60.0), Edge(0.1, -80.0), Edge(-0.2, 50.0)]
-    seen = tilted(camera, 0.0, np.radians(tilt_deg))
+    seen = leaning_camera(camera, (0.0, np.radians(tilt_deg)))
     image = render(seen, edges, noise=4.0, rng=np.random.default_rng(1))
     response = line_response(image, table, preset)
     tracks = line_tracks(image, line_starts(image, table, preset), table, preset)
