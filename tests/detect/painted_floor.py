@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from camera import Camera
 from camera.uncertainty import with_pose
+from tools.evaluation.boards import rays_of
 from tools.simulator.single_disc import DiscCrop, render_disc
 
 FLOOR = 90.0
@@ -35,6 +36,8 @@ SHAPES: dict[str, Shape] = {
 
 _CELLS_PER_PIXEL = 6
 _REACH_M = 0.3
+# Most tests have one lens.
+_rays_of = lru_cache(maxsize=1)(rays_of)
 
 
 class PaintedFloor:
@@ -85,8 +88,9 @@ class PaintedFloor:
     def wall(self, distance_m: float = 12.0, panel_deg: float = 5.0) -> PaintedFloor:
         """A round wall about the camera, of light and dark panels: their edges are vertical."""
         n, (height, width) = 4, self.grey.shape
-        rays = _rays(with_pose(self.camera, np.eye(3, 4)), n) @ self.camera.rotation.T
-        x, y, z = np.moveaxis(rays, -1, 0)
+        ray_xy = _rays_of(with_pose(self.camera, np.eye(3, 4)), n).xy
+        rotation = self.camera.rotation
+        x, y, z = np.moveaxis(ray_xy @ rotation[:, :2].T + rotation[:, 2], -1, 0)
         on_wall = distance_m * z > -self.camera.centre[2] * np.hypot(x, y)
         panel = np.floor(np.degrees(np.arctan2(x, -y)) / panel_deg) % 2
         grey = np.where(on_wall, DOOR - 50.0 * panel, np.nan).reshape(height, n, width, n)
@@ -97,15 +101,6 @@ class PaintedFloor:
     def image(self, noise: float = 1.5, seed: int = 0) -> NDArray[np.uint8]:
         noisy = self.grey + np.random.default_rng(seed).normal(0.0, noise, self.grey.shape)
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _rays(camera: Camera, n: int) -> FloatArray:
-    """What n x n points of each pixel see, in the camera's frame: most tests have one lens."""
-    fine = (np.arange(n) + 0.5) / n - 0.5
-    u = (np.arange(camera.width)[:, None] + fine).ravel()
-    v = (np.arange(camera.height)[:, None] + fine).ravel()
-    return camera.unproject(np.stack(np.meshgrid(u, v), -1))
 
 
 @lru_cache(maxsize=256)

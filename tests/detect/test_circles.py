@@ -141,23 +141,21 @@ def test_suppression_alone_makes_one_disc_one_row(
     assert len(detect(discs_image, published_camera, REPORT)) > len(PLACES)
 
 
-def test_disc_partly_behind_the_lower_border(published_camera: Camera) -> None:
-    """A disc as near as centres may be: 12 px above the lower border, which cuts it."""
-    place = published_camera.floor_from_pixel(np.array([380.0, 276.0]))
+@pytest.mark.parametrize(
+    ("pixel", "grey", "within_m"),
+    [((380.0, 276.0), LIGHT, 0.005), ((14.0, 200.0), DARK, 0.01), ((753.0, 200.0), DARK, 0.01)],
+    ids=["lower", "left", "right"],
+)
+def test_disc_partly_behind_a_border(
+    published_camera: Camera, pixel: tuple[float, float], grey: float, within_m: float
+) -> None:
+    """The lower one is as near as centres may be: 12 px above the border, which cuts it."""
+    place = published_camera.floor_from_pixel(np.array(pixel))
     outline = published_camera.project_floor(circle_on_floor(place, 0.10, 64))
-    assert outline[:, 1].max() > published_camera.height
-    image = PaintedFloor(published_camera).disc(place).image()
-    assert_found_once(detect(image, published_camera), place[None], within_m=0.005)
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-def test_disc_at_the_side_border(published_camera: Camera, side: int) -> None:
-    u = 14.0 if side < 0 else published_camera.width - 15.0
-    place = published_camera.floor_from_pixel(np.array([u, 200.0]))
-    outline = published_camera.project_floor(circle_on_floor(place, 0.10, 64))
-    assert outline[:, 0].min() < 0 or outline[:, 0].max() > published_camera.width - 1
-    image = PaintedFloor(published_camera).disc(place, DARK).image()
-    assert_found_once(detect(image, published_camera), place[None], within_m=0.01)
+    size = (published_camera.width, published_camera.height)
+    assert np.any((outline < 0.0) | (outline > np.array(size) - 1.0))
+    image = PaintedFloor(published_camera).disc(place, grey).image()
+    assert_found_once(detect(image, published_camera), place[None], within_m=within_m)
 
 
 @settings(max_examples=15)
