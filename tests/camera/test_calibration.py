@@ -10,6 +10,7 @@ import pytest
 from camera import Camera
 from camera.boards.board import Board
 from camera.calibration.adjustment import (
+    Adjusted,
     Estimate,
     Points,
     adjust,
@@ -394,22 +395,24 @@ def test_what_of_the_image_was_not_covered_is_told(published_camera: Camera) -> 
     assert "top left" not in told
 
 
+def fit_to_one_view(camera: Camera) -> tuple[Adjusted, Points]:
+    R, t = board_poses(camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
+    truth = Estimate(intrinsics_of(camera), R[None], t[None])
+    points = points_of(seen_views(camera, 1, 0.1, seed=8), BOARD, (768, 288))
+    fit = adjust(truth, points, np.zeros((COUNT, 0)))
+    return fit, points
+
+
 def test_residuals_that_no_board_leaves_are_told(published_camera: Camera) -> None:
     """A fisheye lens that sees more than the model can is fitted as well as it can be."""
-    R, t = board_poses(published_camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
-    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
-    points = points_of(seen_views(published_camera, 1, 0.1, seed=8), BOARD, (768, 288))
-    fit = adjust(truth, points, np.zeros((COUNT, 0)))
+    fit, points = fit_to_one_view(published_camera)
     for times, told in ((1.0, False), (20.0, True)):
         worse = replace(fit, residuals=times * fit.residuals)
         assert any("do not fit" in text for text in warnings_of(worse, points, 40.0)) == told
 
 
 def test_an_uncertain_projection_is_told(published_camera: Camera) -> None:
-    R, t = board_poses(published_camera, BOARD, 1, 8, distances_m=DISTANCES_M)[0]
-    truth = Estimate(intrinsics_of(published_camera), R[None], t[None])
-    points = points_of(seen_views(published_camera, 1, 0.1, seed=8), BOARD, (768, 288))
-    fit = adjust(truth, points, np.zeros((COUNT, 0)))
+    fit, points = fit_to_one_view(published_camera)
     for sigma, told in ((0.001, False), (0.1, True)):
         covariance = np.zeros((COUNT, COUNT))
         covariance[11, 11] = sigma**2

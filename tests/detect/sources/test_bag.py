@@ -143,6 +143,11 @@ def test_steps_and_covariances_of_odometry_come_back(tmp_path: Path) -> None:
         )
 
 
+def blank(ros: Ros, time_s: float) -> Said:
+    """An image that nothing is looked for in."""
+    return Said("/i", time_s, ros.image(np.zeros((4, 4), np.uint8), "mono8", time_s))
+
+
 def test_covariances_that_do_not_grow_are_none(tmp_path: Path) -> None:
     """Drivers that always publish the same covariance say nothing of a step's."""
     ros = Ros()
@@ -150,7 +155,7 @@ def test_covariances_that_do_not_grow_are_none(tmp_path: Path) -> None:
     for k in range(3):
         odometry = ros.odometry(0.3 * k, 0.0, 0.0, 1.0 + k, np.diag([0.1, 0.1, 0.2]))
         said.append(Said("/odom", 1.0 + k, odometry))
-        said.append(Said("/i", 1.0 + k, ros.image(np.zeros((4, 4), np.uint8), "mono8", 1.0 + k)))
+        said.append(blank(ros, 1.0 + k))
     steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
     assert [step.dy for step in steps] == pytest.approx([0.0, -0.3, -0.3])
     assert all(step.cxx == step.cyy == step.cphiphi == 0.0 for step in steps)
@@ -163,7 +168,7 @@ def test_variances_that_are_added_up(tmp_path: Path) -> None:
         variances = np.diag([0.1, 0.1, 0.2]) + k * np.diag([2e-4, 2e-4, 1e-4])
         odometry = ros.odometry(0.3 * k, 0.0, 0.0, 1.0 + k, variances)
         said.append(Said("/odom", 1.0 + k, odometry))
-        said.append(Said("/i", 1.0 + k, ros.image(np.zeros((4, 4), np.uint8), "mono8", 1.0 + k)))
+        said.append(blank(ros, 1.0 + k))
     for frame in list(open_source(ros.write(tmp_path / "d", said)).frames)[1:]:
         step = frame.step
         assert (step.cxx, step.cyy, step.cphiphi) == pytest.approx((2e-4, 2e-4, 1e-4))
@@ -175,8 +180,7 @@ def test_a_step_is_unknown_if_a_part_of_it_is(tmp_path: Path) -> None:
         odometry = ros.odometry(0.3 * k, 0.0, 0.0, 1.0 + k, variance * np.eye(3))
         said.append(Said("/odom", 1.0 + k, odometry))
         if k % 3 == 0:
-            image = ros.image(np.zeros((4, 4), np.uint8), "mono8", 1.0 + k)
-            said.append(Said("/i", 1.0 + k, image))
+            said.append(blank(ros, 1.0 + k))
     steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
     assert [step.cphiphi for step in steps] == pytest.approx([0.0, 0.0, 0.15])
 
@@ -206,8 +210,7 @@ def test_steps_of_a_filter_that_corrects_its_heading(tmp_path: Path) -> None:
         time_s, (x, y, theta) = 1.0 + 0.1 * k, found.tolist()
         said.append(Said("/odom", time_s, ros.odometry(x, y, theta, time_s, covariance)))
         if k % 8 == 0:
-            image = ros.image(np.zeros((4, 4), np.uint8), "mono8", time_s)
-            said.append(Said("/i", time_s, image))
+            said.append(blank(ros, time_s))
             truths.append(TimedPose(time_s, truth[0], truth[1], truth[2]))
     steps = [frame.step for frame in open_source(ros.write(tmp_path / "d", said)).frames]
     errors = []
@@ -230,8 +233,7 @@ def test_covariances_of_twists_where_those_of_poses_do_not_grow(tmp_path: Path) 
             message = ros.odometry(0.02 * k, 0.0, 1.0, time_s, 0.1 * np.eye(3), stated)
             said.append(Said("/odom", time_s, message))
             if k % 10 == 0:
-                image = ros.image(np.zeros((4, 4), np.uint8), "mono8", time_s)
-                said.append(Said("/i", time_s, image))
+                said.append(blank(ros, time_s))
         steps = [frame.step for frame in open_source(ros.write(tmp_path / name, said)).frames]
         variances = np.array([[s.cxx, s.cyy, s.cphiphi] for s in steps[1:]])
         expected = [1e-3, 4e-3, 2.5e-4] if name == "full" else [0.0, 0.0, 0.0]
@@ -245,9 +247,7 @@ def test_images_between_poses_and_beyond_them(tmp_path: Path) -> None:
         Said("/odom", time_s, ros.odometry(x, 0.0, theta, time_s, np.zeros((3, 3))))
         for time_s, x, theta in ((1.0, 0.0, 3.1), (1.4, 0.4, -3.1), (1.8, 0.8, -3.1), (5.0, 1, 0))
     ]
-    blank = np.zeros((4, 4), np.uint8)
-    for time_s in (0.5, 1.0, 1.2, 1.5, 3.0, 5.0, 5.5):
-        said.append(Said("/i", time_s, ros.image(blank, "mono8", time_s)))
+    said += [blank(ros, time_s) for time_s in (0.5, 1.0, 1.2, 1.5, 3.0, 5.0, 5.5)]
     run = open_source(ros.write(tmp_path / "d", sorted(said, key=lambda s: s.time_s)))
     frames = list(run.frames)
     assert [frame.time_s for frame in frames] == pytest.approx([1.0, 1.2, 1.5, 5.0])
@@ -264,8 +264,7 @@ def test_odometry_that_is_reset_is_lost_there(tmp_path: Path) -> None:
         x = 0.01 * k + 3.0 if k < 55 else 0.01 * k
         moved = ros.odometry(x, 0.0, 0.0, 1.0 + 0.02 * k, np.zeros((3, 3)))
         said.append(Said("/odom", 1.0 + 0.02 * k, moved))
-    blank = np.zeros((4, 4), np.uint8)
-    said += [Said("/i", t, ros.image(blank, "mono8", t)) for t in np.arange(1.0, 2.9, 0.2).tolist()]
+    said += [blank(ros, time_s) for time_s in np.arange(1.0, 2.9, 0.2).tolist()]
     run = open_source(ros.write(tmp_path / "d", sorted(said, key=lambda s: s.time_s)))
     steps = [frame.step for frame in run.frames]
     lost = [k for k, step in enumerate(steps) if step.cxx > 1e5]
@@ -403,7 +402,7 @@ def test_a_bag_without_images(tmp_path: Path) -> None:
 
 def test_poses_have_to_be_in_order_and_finite(tmp_path: Path) -> None:
     ros = Ros()
-    blank = [Said("/i", t, ros.image(GRAY, "mono8", t)) for t in (1.0, 2.0, 3.0, 4.0)]
+    images = [blank(ros, time_s) for time_s in (1.0, 2.0, 3.0, 4.0)]
     for name, stamps, x, told in (
         ("back", (1.0, 3.0, 2.0), 0.0, "comes after that of 3.000000 s: expected times in order"),
         ("nan", (1.0, 2.0, 3.0), float("nan"), "expected a finite pose"),
@@ -412,7 +411,7 @@ def test_poses_have_to_be_in_order_and_finite(tmp_path: Path) -> None:
             Said("/odom", 1.0 + k, ros.odometry(x, 0, 0, t, np.zeros((3, 3))))
             for k, t in enumerate(stamps)
         ]
-        path = ros.write(tmp_path / name, sorted([*poses, *blank], key=lambda s: s.time_s))
+        path = ros.write(tmp_path / name, sorted([*poses, *images], key=lambda s: s.time_s))
         with pytest.raises(DetectError, match=told):
             list(open_source(path).frames)
 

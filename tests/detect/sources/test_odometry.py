@@ -30,11 +30,15 @@ from redetect.landmarks.frame_files import format_time, read_times
 PREFIXES = ["s.0000", "s.0001", "s.0002"]
 
 
+def write_times(run: Path, times_s: tuple[float, ...]) -> None:
+    rows = [format_time(prefix, time_s) for prefix, time_s in zip(PREFIXES, times_s)]
+    (run / "s.times").write_text("# times\n" + "\n".join(rows) + "\n")
+
+
 @pytest.fixture
 def timed_run(small_run: Path) -> Path:
     """The small run, with the times of its images."""
-    rows = [format_time(prefix, 100.0 + 0.5 * k) for k, prefix in enumerate(PREFIXES)]
-    (small_run / "s.times").write_text("# times\n" + "\n".join(rows) + "\n")
+    write_times(small_run, (100.0, 100.5, 101.0))
     return small_run
 
 
@@ -226,8 +230,7 @@ def test_a_gap_of_velocities_is_no_movement_at_the_last_one(
     rows += [(rows[-1][0] + 5.0 + 0.1 * k, 0.0, 0.0, 0.01, 0.01) for k in range(5)]
     path = tmp_path / "a.velocities"
     np.savetxt(path, rows)
-    times = [format_time(PREFIXES[k], at) for k, at in enumerate((100.0, 100.4, 105.5))]
-    (timed_run / "s.times").write_text("\n".join(times) + "\n")
+    write_times(timed_run, (100.0, 100.4, 105.5))
     options = SourceOptions(odometry=str(path))
     _, before, over = [frame.step for frame in open_source(timed_run, None, options).frames]
     assert before.cxx < 1e-3
@@ -241,8 +244,7 @@ def test_a_gap_of_ticks_is_no_arc(timed_run: Path, tmp_path: Path) -> None:
     rows += [(105.4 + 0.1 * k, 2.0 * way - side, 2.0 * way + side) for k in range(5)]
     path = tmp_path / "a.ticks"
     np.savetxt(path, rows)
-    times = [format_time(PREFIXES[k], at) for k, at in enumerate((100.0, 100.4, 105.5))]
-    (timed_run / "s.times").write_text("\n".join(times) + "\n")
+    write_times(timed_run, (100.0, 100.4, 105.5))
     options = SourceOptions(odometry=str(path), wheel_base_m=0.5, metres_per_tick=1.0)
     _, before, over = [frame.step for frame in open_source(timed_run, None, options).frames]
     assert (before.cxx, over.cxx) == (0.0, 1e6)
