@@ -16,7 +16,7 @@ from redetect.groundtruth.validation.onboard import (
     reference_poses,
     refine_mounts,
 )
-from redetect.groundtruth.validation.reference_poses import Distance, poses_from_distances
+from redetect.groundtruth.validation.reference_poses import poses_from_distances
 from redetect.plane import compose
 from tests.groundtruth.validation.test_validate_references import (
     ROOM,
@@ -44,8 +44,7 @@ def references(
     found = []
     for _ in range(count):
         truth = np.array([rng.uniform(2, 8), rng.uniform(2, 4.5), rng.uniform(-3.1, 3.1)])
-        rows = [Distance(0, 5.0, d.point, d.fiducial, d.distance_m)
-                for d in measured(truth, survey, rng)]  # fmt: skip
+        rows = measured(truth, survey, rng)
         # The readings are cast from where the scanners really are.
         seen = onboard(compose(truth, shift), ROOM, rng)
         references, refused = reference_poses(poses_from_distances(survey, rows), seen, ROOM)

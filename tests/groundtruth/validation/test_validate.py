@@ -27,6 +27,7 @@ from redetect.groundtruth.validation.scoring import (
     reference_errors,
     score_poses,
 )
+from tests.groundtruth.validation.test_validate_references import measured
 from tools.simulator.laser.session_files import (
     write_building,
     write_distances,
@@ -48,15 +49,11 @@ CLOCK_OFFSET_S = 3.0
 
 
 def distances_at(stands: FloatArray, rng: np.random.Generator | None = None) -> list[Distance]:
-    rows = []
-    for k, (x, y, theta) in enumerate(stands):
-        c, s = math.cos(theta), math.sin(theta)
-        for name, (px, py) in SURVEY.robot_points.items():
-            for fiducial, (fx, fy) in SURVEY.fiducials.items():
-                length = math.hypot(x + c * px - s * py - fx, y + s * px + c * py - fy)
-                noise = 0.0 if rng is None else SURVEY.sigma_m * rng.normal()
-                rows.append(Distance(k, 10.0 * k, name, fiducial, length + noise))
-    return rows
+    return [
+        row
+        for k, pose in enumerate(stands)
+        for row in measured(pose, SURVEY, rng, stand=k, time_s=10.0 * k)
+    ]
 
 
 def ground_truth(stands: FloatArray, covariance: FloatArray | None = None) -> PlanarPoses:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from redetect.groundtruth.lasers.scanners import Scanner, Scans
+from redetect.groundtruth.lasers.scanners import Scans
 from redetect.groundtruth.lasers.walls import wall_curves
 from redetect.groundtruth.validation.onboard import Onboard, averaged_scans, refined_by_walls
 from redetect.groundtruth.validation.reference_poses import (
@@ -24,6 +24,8 @@ from redetect.groundtruth.validation.reference_poses import (
     poses_from_distances,
 )
 from redetect.landmarks import wrap_angle
+from redetect.plane import compose
+from tests.groundtruth.lasers.scene import cast, scanner
 
 FloatArray = NDArray[np.float64]
 
@@ -55,6 +57,8 @@ def measured(
     pose: tuple[float, float, float] | FloatArray,
     survey: Survey,
     rng: np.random.Generator | None = None,
+    stand: int = 0,
+    time_s: float = 5.0,
 ) -> list[Distance]:
     x, y, theta = pose
     c, s = math.cos(theta), math.sin(theta)
@@ -63,7 +67,7 @@ def measured(
         for fiducial, (fx, fy) in survey.fiducials.items():
             length = math.hypot(x + c * px - s * py - fx, y + s * px + c * py - fy)
             noise = 0.0 if rng is None else survey.sigma_m * rng.normal()
-            rows.append(Distance(0, 5.0, name, fiducial, length + noise))
+            rows.append(Distance(stand, time_s, name, fiducial, length + noise))
     return rows
 
 
@@ -72,34 +76,14 @@ def solved(rows: list[Distance], survey: Survey) -> DistancePose:
     return pose
 
 
-def scanner(name: str, pose: tuple[float, float, float], sigma_m: float = 0.01) -> Scanner:
-    step = math.radians(1.0)
-    return Scanner(name, np.array(pose), np.zeros((3, 3)), -math.pi / 2, step, 181, 30.0, sigma_m)
-
-
-def cast(pose: FloatArray, mounted: Scanner, walls: FloatArray) -> FloatArray:
-    """(readings,) exact ranges from a robot's pose (m)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    origin = pose[:2] + np.array([[c, -s], [s, c]]) @ mounted.pose[:2]
-    angles = pose[2] + mounted.pose[2] + mounted.angles_rad
-    ray = np.column_stack([np.cos(angles), np.sin(angles)])
-    along = walls[:, 2:] - walls[:, :2]
-    to_wall = walls[:, :2] - origin
-    det = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = (to_wall[:, 0] * along[:, 1] - to_wall[:, 1] * along[:, 0]) / det
-        part = (to_wall[:, 0] * ray[:, None, 1] - to_wall[:, 1] * ray[:, None, 0]) / det
-    hit = (distance > 0) & (part >= 0) & (part <= 1)
-    return np.asarray(np.where(hit, distance, np.inf).min(axis=1))
-
-
 def onboard(pose: FloatArray, walls: FloatArray, rng: np.random.Generator) -> list[Onboard]:
     """A second of scans of a robot that stands."""
     boards = []
     times = np.arange(4.5, 5.5, 0.02)
-    for mounted in (scanner("front", (0.3, 0.0, 0.0)), scanner("rear", (-0.4, 0.0, math.pi))):
+    for name, mounting in (("front", (0.3, 0.0, 0.0)), ("rear", (-0.4, 0.0, math.pi))):
+        mounted = scanner(name, np.array(mounting), max_range_m=30.0)
         ranges = []
-        exact = cast(pose, mounted, walls)
+        exact = cast(compose(pose, mounted.pose), mounted.angles_rad, walls)
         for _ in times:
             noisy = exact + mounted.sigma_m * rng.normal(size=len(exact))
             ranges.append(np.where(np.isfinite(noisy), np.rint(1e3 * noisy), 0).astype(np.uint16))
