@@ -31,6 +31,7 @@ from tests.groundtruth.lasers.scene import (
     circle,
     empty_scans,
     four_scanners,
+    ranges_mm,
     record,
     scanner,
     scans_of,
