@@ -130,7 +130,7 @@ def test_a_swaying_robot_is_followed_where_the_sway_is_told() -> None:
 def test_well_separated_landmarks_are_followed_without_a_mistake(method: Method) -> None:
     path = circuit(0.9)
     recording = drive(path, scattered(1, 60, 0.6), scattered(2, 25, 1.0), seed=3)
-    of_discs, of_lines = associate_locally(
+    of_discs, of_lines, _ = associate_locally(
         recording, AssociateSettings(method=method), camera_xy=CAMERA_XY
     )
     discs = score_association(of_discs, ids_of(recording))

@@ -1,4 +1,4 @@
-"""Steps that are much worse than stated: filters without identifiers find the discs again."""
+"""Steps that are much worse than stated: without identifiers, the discs are found again."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import pytest
 
 from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
+from redetect.slam.association.run import associate_run
+from redetect.slam.association.scoring import score_association
 from redetect.slam.filters.base import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_run
@@ -18,10 +20,10 @@ from tests.slam.small_run import SmallRun, small_run
 _DISCS = 20
 
 
-def run_with_slips(seed: int) -> SmallRun:
-    """A run whose odometry turns by 10 degrees too much, once in either lap, and sees no lines."""
+def run_with_slips(seed: int, degrees: float = 10.0) -> SmallRun:
+    """A run whose odometry turns too much, once in either lap, and sees no lines."""
     run = small_run(seed, discs=_DISCS)
-    run.recording.steps[[20, 45], 2] += np.radians(10.0)
+    run.recording.steps[[20, 45], 2] += np.radians(degrees)
     return replace(run, recording=replace(run.recording, lines=run.recording.lines.only(slice(0))))
 
 
@@ -48,3 +50,13 @@ def test_slam_survives_slips(method: Literal["nearest", "joint"], seed: int) -> 
     run = run_with_slips(seed)
     found = run_ekf(run.recording, EkfSlam(), Associator(method))
     assert errors_m(found.path.poses, run).max() < 0.25
+
+
+@pytest.mark.parametrize("degrees", [10.0, 20.0])
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_association_survives_slips(degrees: float, seed: int) -> None:
+    run = run_with_slips(seed, degrees)
+    found = associate_run(run.recording)
+    score = score_association(found.circle_labels, [(k,) for k in run.recording.circles.ids])
+    assert score.pair_precision == 1.0
+    assert score.pair_recall > 0.95

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.array_types import IntArray
+from redetect.array_types import FloatArray, IntArray
 from redetect.slam.association.compatibility import compatible
-from redetect.slam.filters.base import FrameRows, frames_of
+from redetect.slam.filters.base import FrameRows, after_slip, frames_of
 from redetect.slam.filters.ekf_slam import EkfSlam
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
@@ -28,37 +30,47 @@ _FORGET_FRAMES, _FORGET_SIGMA_M, _NEAR_M = 60, 0.35, 4.0
 _MOST_LANDMARKS = 40
 
 
+class LocalLabels(NamedTuple):
+    """Labels of a run's rows from frame to frame, from 0 in the order of first sight."""
+
+    circles: IntArray  # (n,)
+    lines: IntArray  # (m,)
+    #: (N,) factors on the covariances of steps: more than 1 where wheels have slipped
+    slips: FloatArray
+
+
 def associate_locally(
     recording: Recording,
     settings: AssociateSettings | None = None,
     *,
     camera_xy: ArrayLike = (0.0, 0.0),
     progress: Callable[[int], None] | None = None,
-) -> tuple[IntArray, IntArray]:
-    """Label the rows of a run, frame by frame, ignoring IDs in the file.
-
-    Returns the landmarks of discs' rows (n,) and lines' rows (m,), from 0 in order of first sight.
-    """
+) -> LocalLabels:
+    """Label the rows of a run, frame by frame, ignoring IDs in the file."""
     settings = settings or AssociateSettings()
-    circles = recording.circles
-    scaled = replace(circles, covariance=settings.sigma_scale**2 * circles.covariance)
-    none = FrameRows(circles.only([]), LineRows.of())
+    discs = recording.circles
+    scaled = replace(discs, covariance=settings.sigma_scale**2 * discs.covariance)
+    none = FrameRows(discs.only([]), LineRows.of())
     disc_labels: list[int] = []
     line_labels: list[int] = []
+    slips: list[float] = []
     discs_seen: dict[int, int] = {}  # frame of each landmark's last sight
     lines_seen: dict[int, int] = {}
     lost = {0, *recording.lost.tolist()}
     for frame, rows in enumerate(frames_of(replace(recording, circles=scaled))):
         if frame in lost:
             ekf = EkfSlam(camera_xy=camera_xy, tilt_sigma_rad=settings.tilt_sigma_rad)
-        ekf.predict(recording.steps[frame], recording.step_covariance[frame])
+            before = none
+        added = ekf.predict(recording.steps[frame], recording.step_covariance[frame])
         _forget(ekf, frame, discs_seen, lines_seen)
         # Discs first, since they improve the pose.
-        if len(rows.circles):
-            found = _labels(ekf, rows.circles, len(discs_seen), settings)
-            disc_labels += found
-            discs_seen.update(dict.fromkeys(found, frame))
-            ekf.measure(none._replace(circles=replace(rows.circles, ids=np.array(found))))
+        labelled = partial(_labelled, ekf, rows.circles, len(discs_seen))
+        jointly = partial(labelled, replace(settings, method="joint"))
+        before, slip = after_slip(labelled(settings), before, added, ekf, jointly)
+        ekf.measure(before)
+        slips.append(slip)
+        disc_labels += before.circles.ids.tolist()
+        discs_seen.update(dict.fromkeys(before.circles.ids.tolist(), frame))
         if len(rows.lines):
             found = _labels(ekf, rows.lines, len(lines_seen), settings)
             line_labels += found
@@ -66,7 +78,14 @@ def associate_locally(
             ekf.measure(none._replace(lines=replace(rows.lines, ids=tuple((k,) for k in found))))
         if progress:
             progress(frame + 1)
-    return np.array(disc_labels, dtype=np.int64), np.array(line_labels, dtype=np.int64)
+    circles, lines = (np.array(each, dtype=np.int64) for each in (disc_labels, line_labels))
+    return LocalLabels(circles, lines, np.array(slips))
+
+
+def _labelled(ekf: EkfSlam, rows: CircleRows, fresh: int, settings: AssociateSettings) -> FrameRows:
+    """Discs with the landmarks that they show as identifiers; see `_labels`."""
+    found = np.array(_labels(ekf, rows, fresh, settings), dtype=np.int64)
+    return FrameRows(replace(rows, ids=found), LineRows.of())
 
 
 def _labels(

@@ -28,7 +28,7 @@ from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.plane import chain_steps, compose, rotation
 from redetect.slam.association import loops
-from redetect.slam.association.frame_to_frame import associate_locally
+from redetect.slam.association.frame_to_frame import LocalLabels, associate_locally
 from redetect.slam.association.line_points import lines_by_points
 from redetect.slam.association.loop_closing import (
     SAME_PLACE,
@@ -96,8 +96,10 @@ def associate_run(
     settings = settings or AssociateSettings()
     report = progress or (lambda _: None)
     local = _associated_locally(recording, settings, camera_xy, report)
+    slipped = local.slips[:, None, None] * recording.step_covariance
+    recording = replace(recording, step_covariance=slipped)
     swayed = _with_sway(recording, settings)
-    circle_labels, line_labels = local
+    circle_labels, line_labels, _ = local
     matches: tuple[loops.Match, ...] = ()
     path = None
     if settings.map_level and len(recording.circles):
@@ -117,16 +119,16 @@ def associate_run(
         closed = _closed_by_parts(run, line_labels)
         line_labels, path, matches = closed.at.labels, closed.at.path, closed.matches
     circle_labels, line_labels = in_order(circle_labels), in_order(line_labels)
-    local_circles, local_lines = map(in_order, local)
+    local_circles, local_lines = in_order(local.circles), in_order(local.lines)
     return RunAssociation(circle_labels, line_labels, local_circles, local_lines, matches, path)
 
 
 def _associated_locally(
     recording: Recording, settings: AssociateSettings, camera_xy: ArrayLike, report: Progress
-) -> tuple[IntArray, IntArray]:
+) -> LocalLabels:
     """Labels from frame to frame; of a run with discs and lines, discs are associated alone."""
     both = len(recording.circles) > 0 and len(recording.lines) > 0
-    circle_labels, line_labels = associate_locally(
+    local = associate_locally(
         recording,
         # Bearings say more of a frame's heading than discs, whose sway would only blur it.
         replace(settings, tilt_sigma_deg=0.0) if both else settings,
@@ -135,8 +137,8 @@ def _associated_locally(
     )
     if both:
         # Discs help to associate lines; lines are often confused and would only harm the discs.
-        circle_labels, _ = associate_locally(_without_lines(recording), settings)
-    return circle_labels, line_labels
+        local = associate_locally(_without_lines(recording), settings)._replace(lines=local.lines)
+    return local
 
 
 class _Solved(NamedTuple):

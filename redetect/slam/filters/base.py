@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -39,7 +40,7 @@ NEW_DISC_GATES = 4.0
 #: Largest distance at which lines are expected to be visible (m), since walls hide others.
 FARTHEST_LINE_M = 15.0
 # Least number of discs by which a slip is noticed; factors on the covariance of its step.
-_SEVERAL, _SLIPS = 3, (10.0, 100.0)
+_SEVERAL, _SLIPS = 3, (10.0, 100.0, 1000.0)
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
 _NEAR_M, _NEAR_SIGMAS = 0.6, 4.0
 
@@ -408,8 +409,9 @@ def run_filter(
         try:
             added = estimate.predict(recording.steps[k], recording.step_covariance[k])
             identified = pairing.identified(rows, estimate)
-            if pairing.method != "known" and _are_lost(identified, before, estimate):
-                identified = _after_slip(rows, identified, before, added, estimate, pairing)
+            if pairing.method != "known":
+                jointly = partial(replace(pairing, method="joint").identified, rows, estimate)
+                identified, _ = after_slip(identified, before, added, estimate, jointly)
             estimate.measure(identified)
             before = identified
         except SlamError as error:
@@ -428,34 +430,32 @@ def run_filter(
     )
 
 
-def _are_lost(rows: FrameRows, before: FrameRows, estimate: Filter) -> bool:
-    """Whether most rows of a frame show no known disc, and most discs of the frame before are lost.
+def after_slip(
+    identified: FrameRows, before: FrameRows, added: FloatArray, estimate: Filter,
+    jointly: Callable[[], FrameRows],
+) -> tuple[FrameRows, float]:  # fmt: skip
+    """Rows of a frame, identified with a larger error of the step if that finds lost discs again.
 
-    Of fewer than three rows or discs, that means nothing.
+    Wheels may have slipped: `before` are the rows of the frame before, `added` is what the step
+    added to the covariance of the pose. Rows are identified again `jointly`, since the nearest disc
+    is often another one with such errors. Also returns the factor on that covariance, which the
+    estimate then includes.
     """
-    found, expected = rows.circles.ids.tolist(), set(before.circles.ids.tolist()) - {UNKNOWN_ID}
-    known = sum(number in estimate.disc_slots for number in found)
-    several = len(found) >= _SEVERAL and len(expected) >= _SEVERAL
-    return several and 2 * known < len(found) and 2 * len(expected & {*found}) < len(expected)
-
-
-def _after_slip(
-    rows: FrameRows, identified: FrameRows, before: FrameRows, added: FloatArray,
-    estimate: Filter, pairing: Associator,
-) -> FrameRows:  # fmt: skip
-    """Rows of a frame, identified with a larger error of the step if that finds the discs again.
-
-    Wheels may have slipped. `identified` are the same rows with the error as stated, `before` those
-    of the frame before, `added` is what the step added to the covariance of the pose.
-    """
-    jointly = replace(pairing, method="joint")  # the nearest one is often another, with such errors
+    expected = set(before.circles.ids.tolist()) - {UNKNOWN_ID}
+    rows, half = identified.circles.ids.tolist(), len(expected) // 2
+    known = sum(number in estimate.disc_slots for number in rows)
+    several = min(len(rows), len(expected)) >= _SEVERAL
+    best, most, slip = identified, half, 1.0
+    if not several or 2 * known > len(rows) or len(expected & {*rows}) > half:
+        return best, slip
     for factor in _SLIPS:
         estimate.inflate_pose_covariance((factor - 1.0) * added)
-        again = jointly.identified(rows, estimate)
-        if not _are_lost(again, before, estimate):
-            return again
+        again = jointly()
         estimate.inflate_pose_covariance((1.0 - factor) * added)
-    return identified
+        if (count := len(expected & set(again.circles.ids.tolist()))) > most:
+            best, most, slip = again, count, factor
+    estimate.inflate_pose_covariance((slip - 1.0) * added)
+    return best, slip
 
 
 def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:
