@@ -126,7 +126,8 @@ def test_relative_noise_is_that_multiple_of_the_rows_own(project_root: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"), [(0.001, "most rows match no disc"), (100.0, "metres?")]
+    ("scale", "said"),
+    [(0.001, "steps lose the discs in view: do rows and odometry fit"), (100.0, "metres?")],
 )
 def test_odometry_in_another_unit_is_doubted(
     scale: float, said: str, project_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

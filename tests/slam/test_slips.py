@@ -53,7 +53,7 @@ def test_slam_survives_slips(method: Literal["nearest", "joint"], seed: int) -> 
 
 
 @pytest.mark.parametrize("degrees", [10.0, 20.0])
-@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("seed", [3, 4, 6])
 def test_association_survives_slips(degrees: float, seed: int) -> None:
     run = run_with_slips(seed, degrees)
     found = associate_run(run.recording)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.association.compatibility import compatible
-from redetect.slam.filters.base import FrameRows, after_slip, frames_of
+from redetect.slam.filters.base import FrameRows, after_slip, frames_of, known_discs
 from redetect.slam.filters.ekf_slam import EkfSlam
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
@@ -60,22 +60,24 @@ def associate_locally(
     for frame, rows in enumerate(frames_of(replace(recording, circles=scaled))):
         if frame in lost:
             ekf = EkfSlam(camera_xy=camera_xy, tilt_sigma_rad=settings.tilt_sigma_rad)
-            before = none
+            expected: set[int] = set()
         added = ekf.predict(recording.steps[frame], recording.step_covariance[frame])
         _forget(ekf, frame, discs_seen, lines_seen)
         # Discs first, since they improve the pose.
         labelled = partial(_labelled, ekf, rows.circles, len(discs_seen))
         jointly = partial(labelled, replace(settings, method="joint"))
-        before, slip = after_slip(labelled(settings), before, added, ekf, jointly)
-        ekf.measure(before)
+        found, slip = after_slip(labelled(settings), expected, added, ekf, jointly)
+        expected = known_discs(found, ekf)
+        ekf.measure(found)
         slips.append(slip)
-        disc_labels += before.circles.ids.tolist()
-        discs_seen.update(dict.fromkeys(before.circles.ids.tolist(), frame))
+        labels = found.circles.ids.tolist()
+        disc_labels += labels
+        discs_seen.update(dict.fromkeys(labels, frame))
         if len(rows.lines):
-            found = _labels(ekf, rows.lines, len(lines_seen), settings)
-            line_labels += found
-            lines_seen.update(dict.fromkeys(found, frame))
-            ekf.measure(none._replace(lines=replace(rows.lines, ids=tuple((k,) for k in found))))
+            labels = _labels(ekf, rows.lines, len(lines_seen), settings)
+            line_labels += labels
+            lines_seen.update(dict.fromkeys(labels, frame))
+            ekf.measure(none._replace(lines=replace(rows.lines, ids=tuple((k,) for k in labels))))
         if progress:
             progress(frame + 1)
     circles, lines = (np.array(each, dtype=np.int64) for each in (disc_labels, line_labels))

@@ -78,6 +78,7 @@ class RunAssociation:
     local_line_labels: IntArray
     matches: tuple[loops.Match, ...]  # the loops that were closed
     path: FloatArray | None  # (N + 1, 3): the corresponding path; None without map level
+    slips: FloatArray  # (N,): see `LocalLabels`
 
 
 def associate_run(
@@ -120,7 +121,9 @@ def associate_run(
         line_labels, path, matches = closed.at.labels, closed.at.path, closed.matches
     circle_labels, line_labels = in_order(circle_labels), in_order(line_labels)
     local_circles, local_lines = in_order(local.circles), in_order(local.lines)
-    return RunAssociation(circle_labels, line_labels, local_circles, local_lines, matches, path)
+    return RunAssociation(
+        circle_labels, line_labels, local_circles, local_lines, matches, path, local.slips
+    )
 
 
 def _associated_locally(

@@ -32,6 +32,8 @@ from redetect.slam.recording import (
 )
 from redetect.storage import demand_free
 
+#: Share of steps with slips beyond which odometry is doubted; of run e less than one in a hundred.
+_MANY_SLIPS = 0.1
 #: Labels (n,) of a file's rows, by the kind of the rows.
 Labels = dict[type[CircleLandmark] | type[LineLandmark], IntArray]
 
@@ -79,9 +81,13 @@ def perform(options: Associate) -> int:
         labels: Labels = {CircleLandmark: of_discs[k], LineLandmark: of_lines[k]}
         write_rows(target, identified_rows(rows, labels, source), overwrite=options.force)
         print(f"{target}: {_counted(rows, labels)}")
-    for run, own in zip(runs, of_discs):
+    of_steps = np.split(result.slips > 1.0, np.cumsum([len(run) for run in runs]))
+    for run, own, slipped in zip(runs, of_discs, of_steps):
         if 2 * np.count_nonzero(own < 0) > len(own):
-            print(_doubt(run), file=sys.stderr)
+            print(_doubt(run, "most rows match no disc that is seen again"), file=sys.stderr)
+        elif np.mean(slipped) > _MANY_SLIPS:
+            lost = f"{np.count_nonzero(slipped)} of {len(run)} steps lose the discs in view"
+            print(_doubt(run, lost), file=sys.stderr)
     if result.path is not None and len(recording.circles) and not result.matches:
         back = unrecognised_return(recording, result.circle_labels, result.path)
         if back is not None:
@@ -138,13 +144,13 @@ def _counted(rows: Sequence[Row], labels: Labels) -> str:
     return ", ".join(parts) or "no landmarks"
 
 
-def _doubt(run: Recording) -> str:
-    """What may be wrong with a run most of whose rows of discs match none."""
+def _doubt(run: Recording, sign: str) -> str:
+    """What may be wrong with a run, and a sign of it."""
     length, reach = files.lengths_of(run)
     return (
-        "most rows match no disc that is seen again: do rows and odometry fit each other? Steps "
-        f"are {length:.2g} m long (median), rows {np.median(reach):.2g} m away; expected metres, "
-        "radians, and the axes of the robot, X left and Y backward"
+        f"{sign}: do rows and odometry fit each other? Steps are {length:.2g} m long (median), "
+        f"rows {np.median(reach):.2g} m away; expected metres, radians, and the axes of the robot, "
+        "X left and Y backward"
     )
 
 

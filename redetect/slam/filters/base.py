@@ -404,16 +404,16 @@ def run_filter(
     poses = np.empty((len(recording) + 1, 3))
     covariance = np.empty((len(recording) + 1, 3, 3))
     poses[0], covariance[0] = estimate.state[:3], estimate.pose_covariance
-    before = FrameRows(recording.circles.only(slice(0)), recording.lines.only(slice(0)))
+    expected: set[int] = set()
     for k, rows in enumerate(frames_of(recording)):
         try:
             added = estimate.predict(recording.steps[k], recording.step_covariance[k])
             identified = pairing.identified(rows, estimate)
             if pairing.method != "known":
                 jointly = partial(replace(pairing, method="joint").identified, rows, estimate)
-                identified, _ = after_slip(identified, before, added, estimate, jointly)
+                identified, _ = after_slip(identified, expected, added, estimate, jointly)
+            expected = known_discs(identified, estimate)
             estimate.measure(identified)
-            before = identified
         except SlamError as error:
             raise SlamError(f"step {k + 1} ({recording.prefixes[k]}): {error}") from None
         disc_ids.extend(identified.circles.ids.tolist())
@@ -430,29 +430,36 @@ def run_filter(
     )
 
 
+def known_discs(rows: FrameRows, estimate: Filter) -> set[int]:
+    """The discs of the estimate that a frame's rows show."""
+    return set(rows.circles.ids.tolist()) & estimate.disc_slots.keys()
+
+
 def after_slip(
-    identified: FrameRows, before: FrameRows, added: FloatArray, estimate: Filter,
+    identified: FrameRows, expected: set[int], added: FloatArray, estimate: Filter,
     jointly: Callable[[], FrameRows],
 ) -> tuple[FrameRows, float]:  # fmt: skip
     """Rows of a frame, identified with a larger error of the step if that finds lost discs again.
 
-    Wheels may have slipped: `before` are the rows of the frame before, `added` is what the step
-    added to the covariance of the pose. Rows are identified again `jointly`, since the nearest disc
-    is often another one with such errors. Also returns the factor on that covariance, which the
-    estimate then includes.
+    Wheels may have slipped: `expected` are the known discs that the frame before shows, `added` is
+    what the step added to the covariance of the pose. Rows are identified again `jointly`, since
+    the nearest disc is often another one with such errors. Also returns the factor on that
+    covariance, which the estimate then includes.
     """
-    expected = set(before.circles.ids.tolist()) - {UNKNOWN_ID}
-    rows, half = identified.circles.ids.tolist(), len(expected) // 2
-    known = sum(number in estimate.disc_slots for number in rows)
-    several = min(len(rows), len(expected)) >= _SEVERAL
+    known, rows, half = (
+        known_discs(identified, estimate),
+        len(identified.circles),
+        len(expected) // 2,
+    )
+    several = min(rows, len(expected)) >= _SEVERAL
     best, most, slip = identified, half, 1.0
-    if not several or 2 * known > len(rows) or len(expected & {*rows}) > half:
+    if not several or 2 * len(known) > rows or len(known & expected) > half:
         return best, slip
     for factor in _SLIPS:
         estimate.inflate_pose_covariance((factor - 1.0) * added)
         again = jointly()
         estimate.inflate_pose_covariance((1.0 - factor) * added)
-        if (count := len(expected & set(again.circles.ids.tolist()))) > most:
+        if (count := len(expected & known_discs(again, estimate))) > most:
             best, most, slip = again, count, factor
     estimate.inflate_pose_covariance((slip - 1.0) * added)
     return best, slip
