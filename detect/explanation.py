@@ -201,6 +201,7 @@ def why_none(images: Sequence[GreyImage], camera: Camera, settings: CircleSettin
         (stages["steps"], "have a contrast too faint for the noise (--noise-floor), or no rim"),
         (stages["prescreening"] + stages["rim"], "have no rim of this radius (--radius-m)"),
         (stages["evidence"], "do not look like a disc (--evidence)"),
+        (stages["beside a better disc"], "are beside a better one"),
     )
     failed = ", ".join(f"{count} {test}" for count, test in outcomes if count)
     return f"Of {counted(stages.total(), 'candidate')} in {searched}, {failed}."

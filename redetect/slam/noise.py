@@ -14,9 +14,6 @@ from redetect.landmarks.records import numbers_of_step
 from redetect.slam.recording import ASSUMED, Recording
 from redetect.slam.settings import AddedNoise
 
-# Indices of the variances in the numbers of a STEP row.
-_STEP_VARIANCES = [3, 5, 8]
-
 
 def noisy_rows(rows: Iterable[landmarks.Row], noise: AddedNoise) -> Iterator[landmarks.Row]:
     """Rows of a landmark file with noise added; without noise they are unchanged.
@@ -42,13 +39,20 @@ def _noisy(
 ) -> landmarks.Record:
     """A row with noise; unchanged if its kind gets none."""
     if isinstance(record, landmarks.Step) and (noise.step_sigma or noise.turn_sigma):
-        added = np.array([noise.step_sigma, noise.step_sigma, noise.turn_sigma])
-        numbers = np.array(numbers_of_step(record))
-        if not numbers[3:].any():
-            numbers[_STEP_VARIANCES] = np.diag(ASSUMED.covariance(numbers[None, :3])[0])
-        numbers[:3] += added * rng.standard_normal(3)
-        numbers[_STEP_VARIANCES] += added**2
-        return landmarks.Step(record.prefix, *numbers.tolist())
+        cxx, cyy, cphiphi = record.cxx, record.cyy, record.cphiphi
+        if not any(numbers_of_step(record)[3:]):
+            movement = np.array([[record.dx, record.dy, record.dphi]])
+            cxx, cyy, cphiphi = np.diag(ASSUMED.covariance(movement)[0]).tolist()
+        x, y, turn = rng.standard_normal(3).tolist()
+        return replace(
+            record,
+            dx=record.dx + noise.step_sigma * x,
+            dy=record.dy + noise.step_sigma * y,
+            dphi=record.dphi + noise.turn_sigma * turn,
+            cxx=cxx + noise.step_sigma**2,
+            cyy=cyy + noise.step_sigma**2,
+            cphiphi=cphiphi + noise.turn_sigma**2,
+        )
     if isinstance(record, landmarks.CircleLandmark) and noise.sigma:
         x, y = rng.standard_normal(2).tolist()
         return replace(

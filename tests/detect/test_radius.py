@@ -7,12 +7,15 @@ import re
 import shutil
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
 
 from camera import Camera, read_camera, write_camera
+from detect import explanation
 from detect.cli import main, parsed
 from detect.options import All, Circles
 from detect.projection import leaning_camera
@@ -78,7 +81,13 @@ def test_grains_of_the_floor_are_no_discs(published_camera: Camera, radius_m: fl
 
 
 @pytest.mark.parametrize(
-    "words", [["--radius-m", "auto"], ["--radius-m=auto"], ["--circles.radius-m", "auto"]]
+    "words",
+    [
+        ["--radius-m", "auto"],
+        ["--radius-m=auto"],
+        ["--circles.radius-m", "auto"],
+        ["--radius-m", "0.06", "--radius-m", "auto"],
+    ],
 )
 def test_auto_stands_for_finding_it(words: list[str]) -> None:
     command = "all" if "circles" in words[0] else "circles"
@@ -167,6 +176,19 @@ def test_discs_that_look_larger_or_smaller_are_told(
     assert ("the discs look" in said) == (radius_m != 0.06)
     if radius_m != 0.06:
         assert number_in(said, "the discs look") == pytest.approx(0.06 / radius_m, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "stage", [stage for stage in get_args(explanation.Stage) if stage != "disc"]
+)
+def test_every_stage_that_drops_candidates_is_told(
+    stage: explanation.Stage, published_camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dropped = [SimpleNamespace(stage=stage)]
+    monkeypatch.setattr(explanation, "_candidates", lambda scene: dropped)
+    blank = np.full((288, 768), 100, np.uint8)
+    said = explanation.why_none([blank], published_camera, CircleSettings())
+    assert said.startswith("Of 1 candidate in 1 image, 1 ")
 
 
 def test_where_there_are_no_discs_it_is_said_what_to_look_at(run: Path, capsys: Captured) -> None:

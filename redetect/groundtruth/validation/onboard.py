@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -151,13 +152,15 @@ def reference_poses(
     """
     references: list[ReferencePose] = []
     refused: list[Refused] = []
-    curves = None if segments is None else wall_curves(segments)
+    refined = None
+    if segments is not None:
+        refined = partial(refined_by_walls, segments=segments, curves=wall_curves(segments))
     for d in distances:
         if d.status != DistanceStatus.OK:
             refused.append(Refused(d.index, d.time_s, d.status, d.reason))
-        elif onboard and segments is not None and curves is not None:
+        elif onboard and refined is not None:
             time = d.time_s if clock is None else float(clock.robot_times([d.time_s])[0])
-            references.append(refined_by_walls(d, averaged_scans(onboard, time), segments, curves))
+            references.append(refined(d, averaged_scans(onboard, time)))
         else:
             references.append(
                 _unrefined(d, ScanUse.NOT_ASKED if segments is None else ScanUse.NO_SCANS)

@@ -446,14 +446,11 @@ def after_slip(
     the nearest disc is often another one with such errors. Also returns the factor on that
     covariance, which the estimate then includes.
     """
-    known, rows, half = (
-        known_discs(identified, estimate),
-        len(identified.circles),
-        len(expected) // 2,
-    )
-    several = min(rows, len(expected)) >= _SEVERAL
+    known, half = known_discs(identified, estimate), len(expected) // 2
+    several = min(len(identified.circles), len(expected)) >= _SEVERAL
+    are_lost = 2 * len(known) <= len(identified.circles) and len(known & expected) <= half
     best, most, slip = identified, half, 1.0
-    if not several or 2 * len(known) > rows or len(known & expected) > half:
+    if not (several and are_lost):
         return best, slip
     for factor in _SLIPS:
         estimate.inflate_pose_covariance((factor - 1.0) * added)
