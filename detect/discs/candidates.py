@@ -42,14 +42,12 @@ def suppress_close(floor_xy: FloatArray, order: IntArray, separation: float) -> 
     return kept[:count]
 
 
-@kernel()
 def best_apart(
     floor_xy: FloatArray, score: FloatArray, least: float, separation: float
 ) -> IntArray:
     """Indices of positions with at least some score, without those too close to a better one."""
-    kept = np.argsort(-score, kind="mergesort")
-    kept = kept[: np.sum(score >= least)]
-    return np.sort(suppress_close(floor_xy, kept, separation))
+    order = np.argsort(-score, kind="stable")[: np.count_nonzero(score >= least)]
+    return np.sort(suppress_close(floor_xy, order, separation))
 
 
 @kernel()

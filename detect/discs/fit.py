@@ -124,45 +124,35 @@ class Scene(NamedTuple):
     camera_numbers: FloatArray
 
 
-class Start(NamedTuple):
-    """Initial values of a fit; lengths in metres."""
-
-    x: float
-    y: float
-    radius: float
-    blur_px: float
-
-
 class FitSettings(NamedTuple):
-    """How a disc is fitted."""
+    """How discs are fitted."""
 
     by_parts: bool
-    radius: float  # prior, metres
-    radius_sigma: float  # relative standard deviation of the prior
     reach: Reach
 
 
-class Fit(NamedTuple):
-    """A fitted disc; lengths in metres."""
+#: Initial values of a fit, and the prior of the disc's radius; metres and pixels.
+START = np.dtype(
+    [("floor_xy", float, 2), ("radius", float), ("blur", float), ("size", float),
+     ("size_sigma", float)]
+)  # fmt: skip
 
-    converged: bool  #: If not, the covariance is infinite, and the rest undefined.
-    x: float
-    y: float
-    radius: float
-    blur: float  #: Along u, pixels.
-    blur_bound: float  #: Largest blur that the patch allowed.
-    contrast: float  #: Grey level inside minus outside (by parts: of the first sector).
-    #: Share of the variance about the background that the disc explains (of the first sector).
-    explained: float
-    cov_xx: float
-    cov_xy: float
-    cov_yy: float
-    #: Inverse variance of the radius from the grey values alone, without the prior.
-    radius_information: float
-
-
-#: Of a disc that cannot be fitted.
-NO_FIT = Fit(False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, math.inf, 0.0, math.inf, 0.0)
+#: A fitted disc; lengths in metres. If it has not converged, the rest is 0.
+FIT = np.dtype(
+    [
+        ("converged", bool),
+        ("floor_xy", float, 2),
+        ("radius", float),
+        ("blur", float),  # along u, pixels
+        ("blur_bound", float),  # the largest blur that the patch allowed
+        ("contrast", float),  # grey level inside minus outside (by parts: of the first sector)
+        # Share of the variance about the background that the disc explains (of the first sector).
+        ("explained", float),
+        ("covariance", float, (2, 2)),  # of the centre
+        # Inverse variance of the radius from the grey values alone, without the prior.
+        ("radius_information", float),
+    ]
+)
 
 
 class BlurredDisc(NamedTuple):
@@ -201,30 +191,42 @@ def eliminate(matrices: FloatArray, unknowns: range) -> None:
                     matrices[i, j, s] -= matrices[i, k, s] * per_pivot[s] * matrices[j, k, s]
 
 
+@kernel()
+def fit_discs(scene: Scene, starts: Any, settings: FitSettings, work: Any) -> Any:
+    """(N,) `FIT`: fits from (N,) `START`; `work` is the working space, a `WORK`."""
+    fits = np.zeros(len(starts), FIT)
+    for k in range(len(starts)):
+        _fit_disc(scene, starts[k], settings, work, fits[k])
+    return fits
+
+
+# Inlined by Numba: only then a kernel that was just compiled and one that was loaded from the
+# cache agree to the last digit.
 @kernel(inline="always")
-def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fit:
-    """Fit a disc; `work` is the working space, a `WORK`."""
+def _fit_disc(scene: Scene, start: Any, settings: FitSettings, work: Any, fit: Any) -> None:
+    """Fit one disc, and write it into `fit`."""
     patch, rows, by_parts = work.patch, work.rows, settings.by_parts
-    candidate, begin = _candidate_at(scene, settings.radius, start)
+    radius_sigma = start.size_sigma / start.size
+    candidate, begin = _candidate_at(scene, start)
     shape, ends = gather(
         scene.image, scene.floor_xy, candidate, scene.blur_ratio, settings.reach, begin, patch
     )
     if ends[SECTORS] == 0:
-        return NO_FIT
+        return
     per_pixel = floor_steps(scene.floor_xy, candidate.u, candidate.v)
     level = float(scene.image[candidate.v, candidate.u])
     most_blur = _MOST_BLUR
     if shape != EDGE:
-        most_blur = min(_MOST_GROWTH * start.blur_px + _MOST_GROWTH_PX, _MOST_BLUR)
+        most_blur = min(_MOST_GROWTH * start.blur + _MOST_GROWTH_PX, _MOST_BLUR)
     usual = BlurredDisc(0.0, 0.0, 1.0, _blur_of(shape, _BLUR_PX, scene.blur_ratio))
-    blur = _blur_of(shape, start.blur_px, scene.blur_ratio)
+    blur = _blur_of(shape, start.blur, scene.blur_ratio)
     edge = BlurredDisc(begin.x, begin.y, begin.radius, blur)
     parts = ends if by_parts else ends[::SECTORS].copy()
     groups = len(parts) - 1
     zeros = np.zeros((5, groups))
     levels = Levels(zeros[0], zeros[1], zeros[2], zeros[3], zeros[4])
     grouped, normal = np.zeros((_TERMS, _TERMS, groups)), np.zeros((_TERMS, _TERMS, 1))
-    movement = np.zeros(_TERMS)
+    movement, first = np.zeros(_GREY), _OUTSIDE if by_parts else 0
     patch.trust[: ends[SECTORS]] = 1.0
     for step in range(_STEPS):
         disc = Disc(edge.x, edge.y, edge.radius)
@@ -233,64 +235,60 @@ def fit_disc(scene: Scene, start: Start, settings: FitSettings, work: Any) -> Fi
         else:
             chord_shares(patch, ends[SECTORS], disc, edge.blur)
         _write_rows(patch, ends[SECTORS], edge, level, by_parts, rows)
-        _multiply(rows, parts, _OUTSIDE if by_parts else 0, grouped)
+        _multiply(rows, parts, first, grouped)
         _eliminate_levels(grouped, levels, by_parts, per_pixel, scene.noise)
         if by_parts:
             if _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
-                return NO_FIT
+                return
         elif not abs(levels.contrast[0]) > 0.0:
-            return NO_FIT
+            return
         if by_parts:
             _trust(patch, rows, ends, grouped, levels, scene.noise)
         _scale(grouped, levels)
-        _add_up(grouped, edge, usual, settings.radius_sigma, normal)
-        _solve(normal.copy(), _BLUR_1, movement)
+        _add_up(grouped, edge, usual, radius_sigma, normal)
+        solve(normal.copy(), movement)
         edge = _moved(edge, movement, most_blur)
         moved = max(math.hypot(movement[_X], movement[_Y]), abs(movement[_RADIUS]))
         if moved < _CONVERGED_STEP and step > _EARLY:
             break
     reduced = normal.copy()
     eliminate(reduced, range(_BLUR_1, _RADIUS))
-    information = _radius_information(reduced) - 1.0 / settings.radius_sigma**2
+    information = _radius_information(reduced) - 1.0 / radius_sigma**2
     eliminate(reduced, range(_RADIUS, _X))
     noise = _inverse(reduced, 0)
     if by_parts:
         xx, xy, yy = _covariance_by_parts(grouped, levels, normal, noise)
     else:
-        unknowns = np.zeros(_TERMS)
-        _multiply(rows, parts, 0, grouped)  # again, as they were before the elimination
-        _solve(grouped, 0, unknowns)
+        unknowns = np.zeros(_GREY)
+        _multiply(rows, parts, first, grouped)  # again, as they were before the elimination
+        solve(grouped, unknowns)
         area = _correlated_area(patch, rows, ends[SECTORS], unknowns)
         xx, xy, yy = area * noise[0], area * noise[1], area * noise[2]
     information *= (noise[0] + noise[2]) / (xx + yy)
     near = math.hypot(edge.x - begin.x, edge.y - begin.y) <= _MOST_OFF or not by_parts
     if not (near and 0.0 < xx * yy - xy * xy < math.inf):  # adjacent sectors alone fix no centre
-        return NO_FIT
-    floor_xy = scene.floor_xy[candidate.v, candidate.u]
-    unit = settings.radius**2
-    return Fit(
-        True,
-        floor_xy[0] + settings.radius * edge.x,
-        floor_xy[1] + settings.radius * edge.y,
-        settings.radius * edge.radius,
-        edge.blur.second if shape == CHORDS_ALONG_V else edge.blur.first,
-        most_blur,
-        levels.contrast[0],
-        levels.explained[0],
-        unit * xx, unit * xy, unit * yy,
-        max(information, 0.0) / unit,
-    )  # fmt: skip
+        return
+    unit, floor_xy = start.size, scene.floor_xy[candidate.v, candidate.u]
+    fit.converged = True
+    fit.floor_xy[0], fit.floor_xy[1] = floor_xy[0] + unit * edge.x, floor_xy[1] + unit * edge.y
+    fit.radius = unit * edge.radius
+    fit.blur = edge.blur.second if shape == CHORDS_ALONG_V else edge.blur.first
+    fit.blur_bound, fit.contrast, fit.explained = most_blur, levels.contrast[0], levels.explained[0]
+    fit.covariance[0, 0], fit.covariance[1, 1] = unit**2 * xx, unit**2 * yy
+    fit.covariance[0, 1] = fit.covariance[1, 0] = unit**2 * xy
+    fit.radius_information = max(information, 0.0) / unit**2
 
 
 @kernel(inline="always")
-def _candidate_at(scene: Scene, radius: float, start: Start) -> tuple[Candidate, Disc]:
+def _candidate_at(scene: Scene, start: Any) -> tuple[Candidate, Disc]:
     """The pixel nearest to a start, and the disc relative to it."""
-    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, start.x, start.y)
+    floor_x, floor_y = start.floor_xy[0], start.floor_xy[1]
+    pixel_u, pixel_v = project_floor_point(scene.camera_numbers, floor_x, floor_y)
     height, width = scene.image.shape
     u, v = min(max(round(pixel_u), 1), width - 2), min(max(round(pixel_v), 1), height - 2)
-    x, y = start.x - scene.floor_xy[v, u, 0], start.y - scene.floor_xy[v, u, 1]
-    disc = Disc(x / radius, y / radius, start.radius / radius)
-    return Candidate(u, v, radius, start.blur_px), disc
+    x, y = floor_x - scene.floor_xy[v, u, 0], floor_y - scene.floor_xy[v, u, 1]
+    disc = Disc(x / start.size, y / start.size, start.radius / start.size)
+    return Candidate(u, v, start.size, start.blur), disc
 
 
 @kernel(forceinline=True)
@@ -477,12 +475,16 @@ def _add_up(
 
 
 @kernel()
-def _solve(normal: FloatArray, first: int, unknowns: FloatArray) -> None:
-    """Solve normal equations (T, T, 1), which are overwritten, for the unknowns from `first` on."""
-    eliminate(normal, range(first, _GREY))
-    for k in range(_Y, first - 1, -1):
-        rest = normal[_GREY, k, 0]
-        for i in range(k + 1, _GREY):
+def solve(normal: FloatArray, unknowns: FloatArray) -> None:
+    """Solve normal equations (T, T, 1), the last row of which is the right side.
+
+    They are overwritten. Unknowns that nothing depends on are 0.
+    """
+    last = len(unknowns)
+    eliminate(normal, range(last))
+    for k in range(last - 1, -1, -1):
+        rest = normal[last, k, 0]
+        for i in range(k + 1, last):
             rest -= normal[i, k, 0] * unknowns[i]
         unknowns[k] = rest / normal[k, k, 0] if normal[k, k, 0] > 0.0 else 0.0
 

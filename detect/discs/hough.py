@@ -49,7 +49,6 @@ class HoughCandidates(NamedTuple):
     sign: FloatArray  # (N,) 1 for light discs, -1 for dark ones
 
 
-@kernel()
 def hough_candidates(
     image: GreyImage, table: VoteTable, radius: float, sign: int, least_step: float
 ) -> HoughCandidates:
@@ -58,23 +57,17 @@ def hough_candidates(
     The table is that of the image's camera for this radius; `sign` is 1 for light discs, -1 for
     dark ones, 0 for both; edges have a gradient of at least `least_step` grey levels per pixel.
     """
-    signs = np.array([1.0, -1.0]) if sign == 0 else np.full(1, float(sign))
-    most = len(signs) * _MOST_PEAKS
-    floor_xy, height, sign_of = np.empty((most, 2)), np.empty(most), np.empty(most)
-    n = 0
-    votes = count_votes(image, table, radius * signs, least_step)
-    for s in range(len(signs)):
-        place, score = _peaks(votes[s], table)
-        order = np.argsort(-score, kind="mergesort")
-        order = order[: max(_MOST_COMPARED, np.sum(score >= _CLEAR_SCORE))]
+    signs = np.array([1.0, -1.0] if sign == 0 else [float(sign)])
+    found = []
+    for of_sign, votes in zip(signs, count_votes(image, table, radius * signs, least_step)):
+        place, score = peaks(votes, table)
+        order = np.argsort(-score, kind="stable")
+        order = order[: max(_MOST_COMPARED, np.count_nonzero(score >= _CLEAR_SCORE))]
         best = suppress_close(place, order, _APART * radius)
-        for i in best[: max(_MOST_DOUBTFUL, np.sum(score[best] >= _CLEAR_SCORE))]:
-            for k in range(2):
-                turned = place[i, 0] * table.turn[0, k] + place[i, 1] * table.turn[1, k]
-                floor_xy[n, k] = turned + table.foot[k]
-            height[n], sign_of[n] = score[i], signs[s]
-            n += 1
-    return HoughCandidates(floor_xy[:n].copy(), height[:n].copy(), sign_of[:n].copy())
+        best = best[: max(_MOST_DOUBTFUL, np.count_nonzero(score[best] >= _CLEAR_SCORE))]
+        floor_xy = place[best] @ table.turn + table.foot
+        found.append((floor_xy, score[best], np.full(len(best), of_sign)))
+    return HoughCandidates._make(map(np.concatenate, zip(*found)))
 
 
 class _Edges(NamedTuple):
@@ -169,8 +162,8 @@ def _vote(
             votes[np.uint64(row_of_step[step] * columns + column)] += share[i]
 
 
-@kernel(fastmath={"reassoc", "nsz"}, forceinline=True)
-def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
+@kernel(fastmath={"reassoc", "nsz"})
+def peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Positions (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     first, last, ahead = table.first, table.last, table.ahead

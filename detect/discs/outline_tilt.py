@@ -24,7 +24,8 @@ import numpy as np
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import COS, DIRECTIONS, SIN, median, profiles, rim_points
+from detect.discs.fit import eliminate, solve
+from detect.discs.rim import COS, SIN, median, profiles, rim_points
 from detect.verticals.tilt import levelling_rotation
 from redetect.array_types import Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
@@ -42,7 +43,8 @@ DISC_SIGMA_RAD, FLOOR_SIGMA_RAD = math.radians(0.45), math.radians(0.3)
 _STEP_RAD = 1e-4
 _ITERATIONS = 7
 _FREEDOM = 4.0  #: Degrees of freedom of Student's t distribution of the discs' tilts.
-_LEAST_PIVOT = 1e-13  #: A pivot below this share of its diagonal entry counts as zero.
+_MOST_TILT_RAD = 0.3
+_DIRECTIONS_XY = np.stack([COS, SIN], axis=-1)
 
 
 class OutlineTilt(NamedTuple):
@@ -61,54 +63,31 @@ def tilt_of_outlines(
     `floor_xy` (N, 2) are the positions of the discs, not levelled; the camera is higher than
     calibrated by `raised_m`. The tilt's prefix is empty.
     """
-    height_ratio = 1.0 + raised_m / float(camera.centre[2])
-    tilts, covariances = _tilts_of_discs(
-        image, camera_numbers(camera), np.array(camera.centre), floor_xy, radius_m, height_ratio
-    )
-    if not len(tilts):
-        return None
-    mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
-    (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
-    pitch, roll = mean.tolist()
-    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))
-
-
-@kernel()
-def _tilts_of_discs(
-    image: GreyImage,
-    numbers: FloatArray,
-    centre: FloatArray,
-    floor_xy: FloatArray,
-    radius: float,
-    height_ratio: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Tilts of the discs for which the estimate succeeds, and their covariances."""
-    tilts, covariances = np.empty((len(floor_xy), 2)), np.empty((len(floor_xy), 2, 2))
-    used = 0
-    point_xy, px_per_m = np.empty((DIRECTIONS, 2)), np.empty(DIRECTIONS)
-    for k in range(len(floor_xy)):
-        x, y = floor_xy[k, 0], floor_xy[k, 1]
-        radial = profiles(image, numbers, x, y, radius)
+    numbers = camera_numbers(camera)
+    # If the camera is higher than calibrated, discs are larger than they seem.
+    radius = radius_m / (1.0 + raised_m / float(camera.centre[2]))
+    outlines = []
+    for x, y in floor_xy.tolist():
+        radial = profiles(image, numbers, x, y, radius_m)
         if not radial.pixels_per_radius.min() >= LEAST_AXIS_PX:
             continue
         contrast = _contrast(radial.grey)
         if not abs(contrast) >= LEAST_CONTRAST:
             continue
-        distance, _ = rim_points(radial, contrast)
-        count = 0
-        for m in range(DIRECTIONS):
-            count += not math.isnan(distance[m])
-            point_xy[m, 0] = radius * distance[m] * COS[m]
-            point_xy[m, 1] = radius * distance[m] * SIN[m]
-            px_per_m[m] = radial.pixels_per_radius[m] / radius
-        if count < LEAST_DIRECTIONS:
-            continue
-        # If the camera is higher than calibrated, discs are larger than they seem.
-        outline = fit_outline(point_xy, px_per_m, centre, x, y, radius / height_ratio)
-        if outline.found:
-            tilts[used], covariances[used] = outline.tilt, outline.covariance
-            used += 1
-    return tilts[:used], covariances[:used]
+        rim, _ = rim_points(radial, contrast)
+        if np.isfinite(rim).sum() >= LEAST_DIRECTIONS:
+            point_xy = radius_m * rim[:, None] * _DIRECTIONS_XY
+            px_per_m = radial.pixels_per_radius / radius_m
+            outline = fit_outline(point_xy, px_per_m, camera.centre, x, y, radius)
+            outlines += [outline] if outline.found else []
+    if not outlines:
+        return None
+    tilts = np.array([outline.tilt for outline in outlines])
+    covariances = np.array([outline.covariance for outline in outlines])
+    mean, covariance = mean_of_tilts(tilts, covariances + DISC_SIGMA_RAD**2 * np.eye(2))
+    (cpp, cpr), (_, crr) = (covariance + FLOOR_SIGMA_RAD**2 * np.eye(2)).tolist()
+    pitch, roll = mean.tolist()
+    return FrameTilt("", pitch, roll, cpp, cpr, crr, len(tilts))
 
 
 @kernel()
@@ -132,11 +111,11 @@ def fit_outline(
     visible. `px_per_m` is the scale of the image in each direction, `centre` the camera's.
     """
     count = len(point_xy)
-    unknowns = np.zeros(4)  # centre, metres; pitch, roll
-    weight, residual, row = np.zeros(count), np.zeros(count), np.zeros((count, 4))
+    unknowns, step = np.zeros(4), np.zeros(4)  # centre, metres; pitch, roll
+    weight, residual, row = np.zeros(count), np.zeros(count), np.zeros((count, 5))
     for k in range(count):
         weight[k] = 0.0 if math.isnan(point_xy[k, 0]) else 1.0
-    normal, inverse, right, sigma = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), 0.0
+    normal, sigma = np.empty((5, 5, 1)), 0.0
     shapes, lengths, off = np.empty((5, 4)), np.empty(5), np.empty(count)
     for iteration in range(_ITERATIONS):
         pitch, roll = unknowns[2], unknowns[3]
@@ -161,6 +140,7 @@ def fit_outline(
             row[k, 1] = -(across * b + along * d) * px_per_m[k]
             row[k, 2] = (lengths[1] - lengths[2]) / (2.0 * _STEP_RAD) * px_per_m[k]
             row[k, 3] = (lengths[3] - lengths[4]) / (2.0 * _STEP_RAD) * px_per_m[k]
+            row[k, 4] = -residual[k]
         if iteration > 1:
             # The first steps, from a level floor to the tilted one, use all points.
             used = 0
@@ -172,20 +152,14 @@ def fit_outline(
             for k in range(count):
                 if weight[k] > 0.0:
                     weight[k] = 1.0 / (1.0 + (residual[k] / (2.0 * sigma)) ** 2) ** 2
-        for i in range(4):
-            right[i] = 0.0
-            for k in range(count):
-                right[i] -= weight[k] * row[k, i] * residual[k]
-            for j in range(4):
-                normal[i, j] = 0.0
+        for i in range(5):
+            for j in range(i + 1):
+                normal[i, j, 0] = 0.0
                 for k in range(count):
-                    normal[i, j] += weight[k] * row[k, i] * row[k, j]
-            normal[i, i] *= 1.0 + 1e-9
-        if not invert_positive(normal, inverse):
-            return OutlineTilt(False, unknowns[2:].copy(), inverse[2:, 2:].copy())
+                    normal[i, j, 0] += weight[k] * row[k, i] * row[k, j]
+        solve(normal.copy(), step)
         for i in range(4):
-            for j in range(4):
-                unknowns[i] += inverse[i, j] * right[j]
+            unknowns[i] += step[i]
     on = 0
     squares = weights = 0.0
     for k in range(count):
@@ -193,8 +167,13 @@ def fit_outline(
         squares += weight[k] * residual[k] ** 2
         weights += weight[k]
     variance = max(squares / weights, POINT_SIGMA_PX**2) * _CORRELATED_POINTS
-    found = bool(on >= LEAST_DIRECTIONS and max(abs(unknowns[2]), abs(unknowns[3])) < 0.3)
-    return OutlineTilt(found, unknowns[2:].copy(), variance * inverse[2:, 2:])
+    eliminate(normal, range(2))
+    pp, pr, rr = normal[2, 2, 0], normal[3, 2, 0], normal[3, 3, 0]
+    area = pp * rr - pr * pr
+    covariance = np.array([[rr, -pr], [-pr, pp]]) * (variance / area)
+    small = max(abs(unknowns[2]), abs(unknowns[3])) < _MOST_TILT_RAD
+    found = bool(on >= LEAST_DIRECTIONS and small and area > 0.0)
+    return OutlineTilt(found, unknowns[2:].copy(), covariance)
 
 
 @kernel()
@@ -216,61 +195,13 @@ def _derivative_of_levelling(
     )
 
 
-@kernel()
 def mean_of_tilts(tilt: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of (N, 2) discs' tilts under Student's t distribution, and its covariance."""
-    count = len(tilt)
-    mean, of_mean, information = np.empty(2), np.empty((2, 2)), np.empty((count, 2, 2))
-    for i in range(2):
-        mean[i] = median(tilt[:, i].copy())
-    for k in range(count):
-        invert_positive(covariance[k], information[k])
+    information, mean = np.linalg.inv(covariance), np.median(tilt, axis=0)
     for _ in range(_ITERATIONS):
-        total, right = np.zeros((2, 2)), np.zeros(2)
-        for k in range(count):
-            a, b, c = information[k, 0, 0], information[k, 0, 1], information[k, 1, 1]
-            x, y = tilt[k, 0] - mean[0], tilt[k, 1] - mean[1]
-            weight = (_FREEDOM + 2.0) / (_FREEDOM + a * x * x + 2.0 * b * x * y + c * y * y)
-            for i in range(2):
-                for j in range(2):
-                    total[i, j] += weight * information[k, i, j]
-                    right[i] += weight * information[k, i, j] * tilt[k, j]
-        invert_positive(total, of_mean)
-        for i in range(2):
-            mean[i] = of_mean[i, 0] * right[0] + of_mean[i, 1] * right[1]
+        off = (tilt - mean)[..., None]
+        squared = off.swapaxes(1, 2) @ information @ off
+        weighted = (_FREEDOM + 2.0) / (_FREEDOM + squared) * information
+        of_mean = np.linalg.inv(weighted.sum(axis=0))
+        mean = of_mean @ (weighted @ tilt[..., None]).sum(axis=0)[:, 0]
     return mean, of_mean
-
-
-@kernel()
-def invert_positive(matrix: FloatArray, inverse: FloatArray) -> bool:
-    """Inverse of a positive definite matrix, by Cholesky's factor; False if it is not one.
-
-    With NumPy's function, Numba looks up LAPACK at the first call, which is not safe to interrupt.
-    """
-    n = matrix.shape[0]
-    lower = np.empty_like(matrix)
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= lower[i, k] * lower[j, k]
-            if i > j:
-                lower[i, j] = total / lower[j, j]
-            elif total > _LEAST_PIVOT * abs(matrix[i, i]):
-                lower[i, i] = math.sqrt(total)
-            else:
-                return False
-    for column in range(n):
-        for i in range(n):
-            total = 1.0 if i == column else 0.0
-            for k in range(i):
-                total -= lower[i, k] * inverse[k, column]
-            inverse[i, column] = total / lower[i, i]
-        for i in range(n - 1, -1, -1):
-            total = inverse[i, column]
-            for k in range(i + 1, n):
-                total -= lower[k, i] * inverse[k, column]
-            inverse[i, column] = total / lower[i, i]
-            if not math.isfinite(inverse[i, column]):
-                return False
-    return True

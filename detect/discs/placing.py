@@ -11,22 +11,27 @@ disc hardly separates radius from position, the other discs of the image provide
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from detect.discs.fit import NO_FIT, Fit, FitSettings, Scene, Start, fit_disc
+from detect.discs.fit import START, FitSettings, Scene, fit_discs
 from detect.discs.patch import Reach
-from detect.discs.rim import Rim, follow_rim, median, profiles
-from redetect.array_types import FloatArray
+from detect.discs.rim import follow_rim, median, profiles
+from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
     from detect.discs.judgement import JudgedCandidates
 
-#: Pixels that the fit of a whole disc uses, and those of the fit by parts.
-WHOLE = Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
-EDGE_ALONE = Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
+#: The fit of a whole disc, and that of its edge alone, by parts.
+WHOLE = FitSettings(
+    by_parts=False, reach=Reach(radii=1.45, px=3.0, blurs=2.0, nearest=0.0, farthest=math.inf)
+)
+BY_PARTS = FitSettings(
+    by_parts=True, reach=Reach(radii=0.0, px=3.0, blurs=2.5, nearest=0.5, farthest=1.5)
+)
 #: Relative standard deviations of radii:
 RADIUS_SIGMA = 0.08  #: Prior of a whole disc's fit.
 _CALIBRATED_SIGMA = 0.02  #: Mean radius of all discs against the nominal one.
@@ -42,176 +47,114 @@ _EXPLAINS_WHOLE, _EXPLAINS_PART = 0.9, 0.97
 _EXPLAINS_ALL = 0.99
 _AT_BOUND = 0.98  #: If the blur reaches this share of a patch's bound, the fit is repeated.
 _MOST_REFITS = 2  #: Largest number of repetitions, each in a wider patch.
-#: Stages of fits: whole discs, up to as often; then parts of discs; then again with a better size.
-_PARTS, _LAST = _MOST_REFITS + 1, _MOST_REFITS + 2
 _BLUR_PX = 1.0  #: Initial blur, pixels.
 #: Share of two rims' squared difference that is added to the covariance.
 _DISAGREEMENT = 0.5
 
 
-class Place(NamedTuple):
-    """Position of a disc, metres, and its covariance."""
-
-    x: float
-    y: float
-    cov_xx: float
-    cov_xy: float
-    cov_yy: float
+#: The rim of a disc by its points (`detect.discs.rim.Rim`); lengths in metres.
+RIM = np.dtype(
+    [("floor_xy", float, 2), ("radius", float), ("covariance", float, (2, 2)), ("doubt", float, 2)]
+)
 
 
-class Size(NamedTuple):
-    """Prior of a disc's radius, metres."""
-
-    radius: float
-    sigma: float
-
-
-@kernel()
 def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[FloatArray, FloatArray]:
     """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
     `work` is a working space (`detect.discs.fit`). Returns (N, 2) centres, metres, and their
     (N, 2, 2) covariances, square metres.
     """
-    count = len(discs.step)
-    whole = [NO_FIT for _ in range(count)]
-    parts, last = whole.copy(), whole.copy()
-    # Of each disc: its radius, and one over the variance of that.
-    radii = np.zeros((count, 2))
-    known = radii
-    # All stages share one call of the fit, whose code is inlined there: only then a kernel that has
-    # just been compiled and one loaded from the cache agree to the last digit.
-    for stage in range(_LAST + 1):
-        if stage == _PARTS:
-            for k, fit in enumerate(whole):
-                if _explains(fit, discs, k) and fit.explained >= _WELL_EXPLAINED:
-                    nominal = Size(scene.radius, RADIUS_SIGMA * scene.radius)
-                    # Assigning the row takes two seconds to compile.
-                    radii[k, 0], radii[k, 1] = _radius_without_prior(fit, nominal)
-            parts, known = whole.copy(), radii.copy()
-        elif stage == _LAST:
-            known = radii  # those of partly hidden discs included
-        for k in range(count):
-            wanted, start, size = _start_of(scene, discs, k, stage, (whole[k], parts[k]), known)
-            if not wanted:
-                continue
-            reach = WHOLE if stage < _PARTS else EDGE_ALONE
-            settings = FitSettings(stage >= _PARTS, size.radius, size.sigma / size.radius, reach)
-            fit = fit_disc(scene, start, settings, work)
-            if stage < _PARTS:
-                whole[k] = fit
-            elif stage == _PARTS:
-                parts[k] = fit
-                radii[k, 0], radii[k, 1] = _radius_without_prior(fit, size)
-            else:
-                last[k] = fit
-    floor_xy, covariance = np.empty((count, 2)), np.empty((count, 2, 2))
-    for k, fit in enumerate(whole):
-        if not _explains(fit, discs, k):
-            size = size_of_disc(scene.radius, radii, k)
-            place = _place_by_rim(scene, discs, k, last[k] if last[k].converged else parts[k], size)
-        else:
-            place = _place_of(fit)
-            if fit.explained < _EXPLAINS_ALL:
-                place = _more_certain(_place_of(last[k]), place)
-        floor_xy[k, 0], floor_xy[k, 1] = place.x, place.y
-        covariance[k, 0, 0], covariance[k, 1, 1] = place.cov_xx, place.cov_yy
-        covariance[k, 0, 1] = covariance[k, 1, 0] = place.cov_xy
+    start, nominal = np.zeros(len(discs.step), START), scene.radius
+    start["floor_xy"], start["radius"], start["blur"] = discs.floor_xy, discs.radius, _BLUR_PX
+    start["size"], start["size_sigma"] = nominal, RADIUS_SIGMA * nominal
+    whole = fit_discs(scene, start, WHOLE, work)
+    for _ in range(_MOST_REFITS):  # of discs too blurred for their patch, in a wider one
+        blurred = whole["converged"] & (whole["blur"] > _AT_BOUND * whole["blur_bound"])
+        wider = _continued(start, whole)[blurred]
+        wider["blur"] = whole["blur_bound"][blurred]
+        whole[blurred] = fit_discs(scene, wider, WHOLE, work)
+    explained, radii = _explained(whole, discs), np.zeros((len(whole), 2))
+    well = explained & (whole["explained"] >= _WELL_EXPLAINED)
+    radii[well] = _radii_without_prior(whole, start)[well]
+
+    hidden, by_parts = np.flatnonzero(~explained), whole.copy()
+    _state_sizes(start, hidden, nominal, radii)
+    rims = _rims_of(scene, discs, hidden, start["size"])
+    start["floor_xy"][hidden], start["radius"][hidden] = rims["floor_xy"], rims["radius"]
+    by_parts[hidden] = fit_discs(scene, start[hidden], BY_PARTS, work)
+    radii[hidden] = _radii_without_prior(by_parts, start)[hidden]
+
+    # Once more, given the sizes of partly hidden discs, too.
+    again = np.flatnonzero(~explained | (whole["explained"] < _EXPLAINS_ALL))
+    _state_sizes(start, again, nominal, radii)
+    start["floor_xy"], start["radius"] = discs.floor_xy, start["size"]
+    last, best = fit_discs(scene, _continued(start, by_parts)[again], BY_PARTS, work), by_parts
+    surer = np.linalg.det(last["covariance"]) < np.linalg.det(whole["covariance"][again])
+    better = last["converged"] & (surer | ~explained[again])
+    best[again[better]] = last[better]
+
+    floor_xy, covariance = best["floor_xy"], best["covariance"]
+    rims = _rims_of(scene, discs, hidden, start["size"])
+    lost = ~best["converged"][hidden]  # sectors disagree
+    by_rim = hidden[lost]
+    floor_xy[by_rim] = rims["floor_xy"][lost]
+    covariance[by_rim] = rims["covariance"][lost] + _DISAGREEMENT * _squares(discs.doubt[by_rim])
+    covariance[hidden] += _squares(rims["doubt"])
     return floor_xy, covariance
 
 
-@kernel(inline="always")
-def _start_of(
-    scene: Scene,
-    discs: JudgedCandidates,
-    k: int,
-    stage: int,
-    fits: tuple[Fit, Fit],
-    radii: FloatArray,
-) -> tuple[bool, Start, Size]:
-    """Whether a disc is fitted in a stage, from where, and its size; by its fits so far."""
-    fit, by_parts = fits
-    x, y, radius, blur_px = discs.floor_xy[k, 0], discs.floor_xy[k, 1], discs.radius[k], _BLUR_PX
-    size, wanted = Size(scene.radius, RADIUS_SIGMA * scene.radius), True
-    if stage < _PARTS:
-        if stage > 0:  # too blurred for its patch: once more, in a wider one
-            wanted = fit.converged and fit.blur > _AT_BOUND * fit.blur_bound
-            x, y, radius, blur_px = fit.x, fit.y, fit.radius, fit.blur_bound
-    elif stage == _PARTS:
-        wanted = not _explains(fit, discs, k)
-        if wanted:
-            size = size_of_disc(scene.radius, radii, k)
-            rim = _rim_of(scene, discs, k, size.radius)
-            x, y, radius = rim.x, rim.y, rim.radius
-    else:
-        explained = _explains(fit, discs, k)
-        wanted = not explained or fit.explained < _EXPLAINS_ALL
-        if wanted:
-            size = size_of_disc(scene.radius, radii, k)
-            before, radius = fit if explained else by_parts, size.radius
-            if before.converged:
-                x, y, radius, blur_px = before.x, before.y, before.radius, before.blur
-    return wanted, Start(x, y, radius, blur_px), size
+def _continued(start: Any, fits: Any) -> Any:
+    """(N,) `START` at the results of fits, or, where they have not converged, as they were."""
+    start, found = start.copy(), fits["converged"]
+    for name in ("floor_xy", "radius", "blur"):
+        start[name][found] = fits[name][found]
+    return start
 
 
-@kernel(inline="always")
-def _radius_without_prior(fit: Fit, expected: Size) -> tuple[float, float]:
-    """Radius of a fitted disc, metres, and its inverse variance, both with the prior removed."""
-    information = fit.radius_information
-    if not information > 0.0:
-        return 0.0, 0.0
-    pull = 1.0 / (expected.sigma**2 * information)
-    return fit.radius + pull * (fit.radius - expected.radius), information
+def _explained(fits: Any, discs: JudgedCandidates) -> BoolArray:
+    """(N,) mask of the discs whose fit as a whole explains the image."""
+    least = np.where(discs.agreeing >= _WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART)
+    same_sign = fits["contrast"] * discs.step > 0.0
+    return np.asarray(fits["converged"] & (fits["explained"] >= least) & same_sign)
 
 
-@kernel(inline="always")
-def _place_of(fit: Fit) -> Place:
-    return Place(fit.x, fit.y, fit.cov_xx, fit.cov_xy, fit.cov_yy)
+def _radii_without_prior(fits: Any, start: Any) -> FloatArray:
+    """(N, 2) radii of fits, metres, without the prior, and their inverse variances; or 0, 0."""
+    information = np.where(fits["radius_information"] > 0.0, fits["radius_information"], np.inf)
+    pull = 1.0 / (start["size_sigma"] ** 2 * information)
+    radius = fits["radius"] + pull * (fits["radius"] - start["size"])
+    return np.where(np.isfinite(information), [radius, information], 0.0).T
 
 
-@kernel(inline="always")
-def _more_certain(one: Place, other: Place) -> Place:
-    area = one.cov_xx * one.cov_yy - one.cov_xy**2
-    return one if area < other.cov_xx * other.cov_yy - other.cov_xy**2 else other
+def _state_sizes(start: Any, chosen: IntArray, nominal: float, radii: FloatArray) -> None:
+    """Write the size of some discs by that of the others as the prior of their fits."""
+    for k in chosen.tolist():
+        start["size"][k], start["size_sigma"][k] = size_of_disc(nominal, radii, k)
 
 
-@kernel(inline="always")
-def _plus_square(place: Place, share: float, x: float, y: float) -> Place:
-    """Add a share of the square of (x, y), metres, to the covariance of a place."""
-    xx, xy = place.cov_xx + share * x * x, place.cov_xy + share * x * y
-    return Place(place.x, place.y, xx, xy, place.cov_yy + share * y * y)
+def _rims_of(
+    scene: Scene, discs: JudgedCandidates, chosen: IntArray, radius: FloatArray
+) -> NDArray[Any]:
+    """Rims of some discs (`RIM`), traced for a radius of each disc, metres."""
+    rims = np.zeros(len(chosen), RIM)
+    for rim, k in zip(rims, chosen.tolist()):
+        x, y = discs.traced_from[k].tolist()
+        radial = profiles(scene.image, scene.camera_numbers, x, y, radius[k])
+        found = follow_rim(scene.image, scene.camera_numbers, radial, discs.step[k])
+        rim["floor_xy"], rim["radius"] = (found.x, found.y), found.radius
+        rim["covariance"] = (found.cov_xx, found.cov_xy), (found.cov_xy, found.cov_yy)
+        rim["doubt"] = found.doubt_x, found.doubt_y
+    return rims
 
 
-@kernel(inline="always")
-def _explains(fit: Fit, discs: JudgedCandidates, k: int) -> bool:
-    """Whether the fit of a whole disc explains the image."""
-    least = _EXPLAINS_WHOLE if discs.agreeing[k] >= _WHOLE_RIM else _EXPLAINS_PART
-    same_sign = fit.contrast * discs.step[k] > 0.0
-    return bool(fit.converged and fit.explained >= least and same_sign)
-
-
-@kernel(inline="always")
-def _place_by_rim(scene: Scene, discs: JudgedCandidates, k: int, fit: Fit, size: Size) -> Place:
-    """Place a disc by its sectors, or where they differ by the points of its rim."""
-    rim = _rim_of(scene, discs, k, size.radius)
-    if fit.converged:
-        place = _place_of(fit)
-    else:
-        place = Place(rim.x, rim.y, rim.cov_xx, rim.cov_xy, rim.cov_yy)
-        place = _plus_square(place, _DISAGREEMENT, discs.doubt[k, 0], discs.doubt[k, 1])
-    return _plus_square(place, 1.0, rim.doubt_x, rim.doubt_y)
-
-
-@kernel(inline="always")
-def _rim_of(scene: Scene, discs: JudgedCandidates, k: int, radius: float) -> Rim:
-    x, y = discs.traced_from[k, 0], discs.traced_from[k, 1]
-    radial = profiles(scene.image, scene.camera_numbers, x, y, radius)
-    return follow_rim(scene.image, scene.camera_numbers, radial, discs.step[k])
+def _squares(vectors: FloatArray) -> FloatArray:
+    """(N, 2, 2) products of (N, 2) vectors with themselves."""
+    return np.asarray(vectors[:, :, None] * vectors[:, None, :])
 
 
 @kernel()
-def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
-    """Estimate the radius of disc k from the other discs of its image.
+def size_of_disc(nominal: float, radii: FloatArray, k: int) -> tuple[float, float]:
+    """Radius of disc k by the other discs of its image, and its standard deviation, metres.
 
     If the camera is lower or higher than calibrated, all discs appear larger or smaller; single
     discs vary a little. A part of a disc hardly separates radius from position, so the radius has
@@ -240,4 +183,4 @@ def size_of_disc(nominal: float, radii: FloatArray, k: int) -> Size:
             total += weight * radius[i]
             squares += min(max(off - variance[i], 0.0), _MOST_SCATTER**2)
         mean, scatter = total / certainty, squares / (2.0 + count)
-    return Size(nominal * mean, nominal * math.sqrt(1.0 / certainty + scatter))
+    return nominal * mean, nominal * math.sqrt(1.0 / certainty + scatter)

@@ -107,9 +107,10 @@ def _join(
 @kernel()
 def _reach(pixel_rad: FloatArray, numbers: LineNumbers) -> FloatArray:
     """Bearings of lines with these widths of a pixel are joined if closer than this (rad)."""
-    reach = np.full(len(pixel_rad), numbers.join_rad)
-    if math.isnan(numbers.join_rad):
-        reach[:] = numbers.join_px * pixel_rad
+    per_pixel, constant = 0.0, numbers.join_rad
+    if math.isnan(constant):
+        per_pixel, constant = numbers.join_px, 0.0
+    reach: FloatArray = per_pixel * pixel_rad + constant
     return reach
 
 

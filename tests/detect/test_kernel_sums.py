@@ -67,6 +67,6 @@ def test_sums_in_any_order_are_inlined_up_to_the_kernel_that_python_calls(
     free = {kernel for kernel in kernels if kernel.any_order}
     while more := {k for k in kernels if any(c.inlined and c in free for c in called[k])} - free:
         free |= more
-    assert {"place_discs", "fit_disc", "gather", "edge_shares"} <= {each.name for each in free}
+    assert {"fit_discs", "_fit_disc", "gather", "edge_shares"} <= {each.name for each in free}
     called_ones = {other for others in called.values() for other in others}
     assert {str(kernel) for kernel in free & called_ones if not kernel.inlined} == set()

@@ -14,7 +14,7 @@ from detect.discs.placing import RADIUS_SIGMA, WHOLE
 from detect.discs.positions import refined_covariance
 from detect.projection import image_positions
 from lut import VoteTable
-from tests.detect.discs.single_fits import fit_discs
+from tests.detect.discs.single_fits import fits_at
 from tests.detect.painted_floor import PaintedFloor
 from tests.reference.discs import Expected, Pixels, fitted_disc, pixels_within_reach
 
@@ -42,21 +42,21 @@ def test_parameters_come_back(
 ) -> None:
     floor = PaintedFloor(published_camera, 60.0).disc(place, 210.0, 0.1, blur)
     pixel = nearest(published_camera, place) + (offset if place[1] > -3.0 else (0, 0))
-    fit = fit_discs(
+    fit = fits_at(
         published_camera, floor.image(0.5), table.floor_xy, pixel[None], 0.1, 0.6,
         blur_ratio=PAINTED_RATIO, blur_px=0.8 * blur,
     )  # fmt: skip
-    assert fit.fitted[0]
+    assert fit.converged[0]
     per_px = np.linalg.norm(published_camera.floor_jacobian(pixel.astype(float)), 2)
     # Where the blur is as large as the disc, or larger, perspective within it counts.
     tiny = blur > 2.0 and place[1] < -5.0
     within = 0.4 if tiny else 0.1 if blur > 2.0 else 0.05
     assert np.hypot(*(fit.floor_xy[0] - place)) < within * per_px
     within = 0.25 if tiny else 0.1 if blur > 2.0 else 0.02
-    assert fit.fits[0].radius == pytest.approx(0.1, rel=within)
+    assert fit.radius[0] == pytest.approx(0.1, rel=within)
     if blur < 2.0:
-        assert fit.fits[0].contrast == pytest.approx(150.0, rel=0.1)
-    assert fit.fits[0].explained > (0.9 if tiny else 0.97)
+        assert fit.contrast[0] == pytest.approx(150.0, rel=0.1)
+    assert fit.explained[0] > (0.9 if tiny else 0.97)
 
 
 def test_covariance_counts_noise(published_camera: Camera, table: VoteTable) -> None:
@@ -66,7 +66,7 @@ def test_covariance_counts_noise(published_camera: Camera, table: VoteTable) -> 
     pixel = nearest(published_camera, place)[None]
     normalised = []
     for seed in range(150):
-        fit = fit_discs(
+        fit = fits_at(
             published_camera, floor.image(4.0, seed), table.floor_xy, pixel, 0.1, 4.0,
             blur_ratio=PAINTED_RATIO,
         )  # fmt: skip
@@ -79,9 +79,9 @@ def test_candidates_at_the_image_border(published_camera: Camera, table: VoteTab
     image = PaintedFloor(published_camera).image(2.0)
     width, height = published_camera.width, published_camera.height
     pixels = np.array([[0, 150], [width - 1, 150], [0, height - 1], [width - 1, height - 1]])
-    fit = fit_discs(published_camera, image, table.floor_xy, pixels, 0.1, 2.0, blur_ratio=0.5)
-    assert fit.fitted.shape == (4,)
-    assert np.all(np.isfinite(fit.floor_xy[fit.fitted]))
+    fit = fits_at(published_camera, image, table.floor_xy, pixels, 0.1, 2.0, blur_ratio=0.5)
+    assert fit.converged.shape == (4,)
+    assert np.all(np.isfinite(fit.floor_xy[fit.converged]))
 
 
 def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: VoteTable) -> None:
@@ -89,12 +89,12 @@ def test_larger_discs_than_a_patch_are_fitted(published_camera: Camera, table: V
     place = (0.0, -1.5)
     image = PaintedFloor(published_camera, 60.0).disc(place, 200.0, 0.25, 0.8).image(1.0)
     pixel = nearest(published_camera, place)[None]
-    fit = fit_discs(
+    fit = fits_at(
         published_camera, image, table.floor_xy, pixel, 0.25, 1.0, blur_ratio=PAINTED_RATIO
     )
-    assert fit.fitted[0]
+    assert fit.converged[0]
     assert np.hypot(*(fit.floor_xy[0] - place)) < 2e-4
-    assert fit.fits[0].radius == pytest.approx(0.25, rel=2e-3)
+    assert fit.radius[0] == pytest.approx(0.25, rel=2e-3)
 
 
 @pytest.mark.parametrize("tangential", [(0.0, 0.0), (2e-3, -3e-3)])
@@ -141,15 +141,15 @@ def test_fits_are_the_least_squares_of_the_reference(
     if image_of == "shaded":
         image = (image * np.linspace(0.5, 1.0, image.shape[1])).astype(np.uint8)
     u, v = nearest(published_camera, place)
-    fit = fit_discs(
+    fit = fits_at(
         published_camera, image, table.floor_xy, np.array([[u, v]]), 0.1, noise, blur_ratio=0.5
     )
-    assert fit.fitted[0]
+    assert fit.converged[0]
     candidate = Candidate(int(u), int(v), 0.1, BLUR_PX)
     flat = view_of(table.floor_xy, candidate, 1.0, 0.5).shape != EDGE
     assert flat == (place[1] < -3.0)
     rows, columns = np.divmod(
-        pixels_within_reach(table.floor_xy, candidate, WHOLE, 0.5), image.shape[1]
+        pixels_within_reach(table.floor_xy, candidate, WHOLE.reach, 0.5), image.shape[1]
     )
     floor = table.floor_xy.astype(float) / 0.1
     x, y = (floor[rows, columns] - floor[v, u]).T
@@ -167,7 +167,7 @@ def test_fits_are_the_least_squares_of_the_reference(
     off = (fit.floor_xy[0] / 0.1 - floor[v, u]) - expected[:2]
     # Derivatives hold the curvature of the edge for constant, which costs a part of a deviation.
     assert np.all(np.abs(off) < 0.75 * sigma)
-    assert fit.fits[0].radius / 0.1 == pytest.approx(expected[2], abs=2.0 * sigma.max())
+    assert fit.radius[0] / 0.1 == pytest.approx(expected[2], abs=2.0 * sigma.max())
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
@@ -176,5 +176,5 @@ def test_nothing_is_fitted_where_there_is_nothing(
 ) -> None:
     image = np.full(table.floor_xy.shape[:2], grey, np.uint8)
     pixels = np.array([[400, 200], [300, 120]])
-    fit = fit_discs(published_camera, image, table.floor_xy, pixels, 0.1, 0.5)
-    assert not any(f.converged and f.explained > 0.5 for f in fit.fits)
+    fit = fits_at(published_camera, image, table.floor_xy, pixels, 0.1, 0.5)
+    assert not np.any(fit.converged & (fit.explained > 0.5))

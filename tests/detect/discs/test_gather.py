@@ -10,15 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
+from detect.discs import placing
 from detect.discs.model import Disc
 from detect.discs.patch import CAPACITY, EDGE, PATCH, SECTORS, Candidate, Reach, gather
-from detect.discs.placing import EDGE_ALONE, WHOLE
 from lut import VoteTable
 from lut.outlines import floor_positions
 from redetect.array_types import IntArray
 from tests.reference.discs import pixels_within_reach
 
-RADIUS = 0.1
+RADIUS, WHOLE = 0.1, placing.WHOLE.reach
 NOMINAL = Disc(0.0, 0.0, 1.0)
 
 
@@ -35,7 +35,7 @@ def gathered(
     return shape, ends, real, {name: patch[name][0] for name in PATCH.names or ()}
 
 
-@pytest.mark.parametrize("reach", [WHOLE, EDGE_ALONE])
+@pytest.mark.parametrize("reach", [WHOLE, placing.BY_PARTS.reach])
 @pytest.mark.parametrize(("u", "v"), [(400, 160), (200, 130), (500, 110), (3, 150), (765, 165)])
 def test_patches_are_the_pixels_within_reach(
     table: VoteTable, u: int, v: int, reach: Reach

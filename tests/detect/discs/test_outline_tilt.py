@@ -14,7 +14,6 @@ from detect.discs.outline_tilt import (
     DISC_SIGMA_RAD,
     FLOOR_SIGMA_RAD,
     fit_outline,
-    invert_positive,
     mean_of_tilts,
     tilt_of_outlines,
 )
@@ -112,14 +111,3 @@ def test_errors_of_discs_and_of_floors_are_stated(published_camera: Camera) -> N
     least = math.sqrt(FLOOR_SIGMA_RAD**2 + DISC_SIGMA_RAD**2 / len(DISCS) * 0.6)
     assert math.sqrt(found.cpp) > least
     assert math.sqrt(found.crr) > least
-
-
-def test_small_matrices_are_inverted_or_refused() -> None:
-    root = np.random.default_rng(2).normal(size=(9, 6))
-    matrix, inverse = root.T @ root, np.empty((6, 6))
-    assert invert_positive(matrix, inverse)
-    np.testing.assert_allclose(inverse @ matrix, np.eye(6), atol=1e-9)
-    matrix[:, 5] = matrix[:, 0]
-    matrix[5, :] = matrix[0, :]
-    assert not invert_positive(matrix, inverse)
-    assert not invert_positive(-np.eye(6), inverse)
