@@ -97,12 +97,6 @@ class JudgedCandidates(NamedTuple):
         return JudgedCandidates(*(values[chosen] for values in self))
 
 
-NO_CANDIDATES = JudgedCandidates._make(
-    [np.empty(0, np.int8), *np.empty((2, 0)), np.empty((0, len(FEATURES))), *np.empty((2, 0)),
-     *np.empty((3, 0, 2)), *np.empty((4, 0))]
-)  # fmt: skip
-
-
 @kernel()
 def judge(
     image: GreyImage,

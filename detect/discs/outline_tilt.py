@@ -63,7 +63,7 @@ def tilt_of_outlines(
     `floor_xy` (N, 2) are the positions of the discs, not levelled; the camera is higher than
     calibrated by `raised_m`. The tilt's prefix is empty.
     """
-    numbers = camera_numbers(camera)
+    numbers, centre = camera_numbers(camera), np.array(camera.centre)
     # If the camera is higher than calibrated, discs are larger than they seem.
     radius = radius_m / (1.0 + raised_m / float(camera.centre[2]))
     outlines = []
@@ -78,7 +78,7 @@ def tilt_of_outlines(
         if np.isfinite(rim).sum() >= LEAST_DIRECTIONS:
             point_xy = radius_m * rim[:, None] * _DIRECTIONS_XY
             px_per_m = radial.pixels_per_radius / radius_m
-            outline = fit_outline(point_xy, px_per_m, camera.centre, x, y, radius)
+            outline = fit_outline(point_xy, px_per_m, centre, x, y, radius)
             outlines += [outline] if outline.found else []
     if not outlines:
         return None

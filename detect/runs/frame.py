@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
-from detect.circles import CircleDetections, scene_of, vote_shape
+from detect.circles import CircleDetections, candidates_of, classify, scene_of, vote_shape
 from detect.discs.fit import working_space
-from detect.discs.judgement import NO_CANDIDATES
-from detect.discs.outline_tilt import tilt_of_outlines
+from detect.discs.hough import HoughCandidates
+from detect.discs.outline_tilt import fit_outline, tilt_of_outlines
 from detect.discs.placing import place_discs
 from detect.errors import FrameError
 from detect.identity import ids_of_rows
@@ -295,11 +295,10 @@ def _disc_rows(
     return tuple(replace(row, ids=own) for row, own in zip(rows, ids))
 
 
-def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
-    """Run the stages after the judgement of discs on empty input, so that they are compiled.
+def compile_discs(plan: FramePlan, tasks: Sequence[FrameTask], *, search: bool) -> None:
+    """Compile kernels for discs: those of the search and of outlines, or those of the other stages.
 
-    A process compiles kernels in the order of a frame's path. Another process calls this function
-    at the same time, and stores in the disk cache what the first one would have to compile later.
+    They are stored in the disk cache. Two processes compile one half each at the same time.
     """
     camera, settings = plan.camera, plan.circles
     if not (camera and settings and settings.refine):
@@ -307,7 +306,12 @@ def compile_later_stages(plan: FramePlan, tasks: Sequence[FrameTask]) -> None:
     image = read_image(tasks[0].frame, camera, plan.working_folder)
     table = cached_vote_table(camera, vote_shape(settings))
     scene = scene_of(image, camera, table, settings)
-    place_discs(scene, NO_CANDIDATES, working_space()[0])
+    if not search:
+        none = HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
+        place_discs(scene, classify(scene, settings, none), working_space()[0])
+        return
+    candidates_of(scene, table, settings)
     if plan.levelling == "run":
         tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
+        fit_outline(np.ones((3, 2)), np.ones(3), np.ones(3), 0.0, 0.0, 1.0)
         smooth_axis(np.zeros(1), np.ones(1), spread=1.0, correlation=0.0)

@@ -256,18 +256,18 @@ class _InProcess(Executor):
         if not self._shared or not self._chunk:  # or between tasks
             return
         self._shared = False  # only before the first kernel
-        from detect.runs.frame import compile_later_stages
+        from detect.runs.frame import compile_discs
 
         discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # If no process can be started, this one compiles all kernels.
         with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
             pools = (_ProcessPool(1, self._plan, show=False) for _ in range(2))
-            path, later = map(started.enter_context, pools)
-            # The stages after the judgement of discs take nearly as long to compile as all others.
+            one, other = map(started.enter_context, pools)
+            # Each process gets about half of what has to be compiled.
             done: list[Future[Any]] = [
-                path.submit(work_on_chunk, lines, self._chunk),
-                path.submit(work_on_chunk, discs, self._chunk),
-                later.submit(compile_later_stages, discs, self._chunk),
+                one.submit(work_on_chunk, lines, self._chunk),
+                one.submit(compile_discs, discs, self._chunk, search=True),
+                other.submit(compile_discs, discs, self._chunk, search=False),
             ]
             # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:

@@ -126,8 +126,8 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
 
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
             plan, chunk = args
-            process = processes.index(self)
-            began.append(f"{process} {fn.__name__} {bool(plan.lines)} {bool(plan.circles)} {chunk}")
+            process, words = processes.index(self), f"{bool(plan.lines)} {bool(plan.circles)}"
+            began.append(f"{process} {fn.__name__} {words} {chunk} {kwargs}")
             return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
 
     def work(plan: FramePlan, chunk: str) -> int:
@@ -142,9 +142,9 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
     with local_workers(1, shared=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
     assert began == [
-        "0 work_on_chunk True False images",
-        "0 work_on_chunk False True images",
-        "1 compile_later_stages False True images",
+        "0 work_on_chunk True False images {}",
+        "0 compile_discs False True images {'search': True}",
+        "1 compile_discs False True images {'search': False}",
         "compiled images",
         "compiled images",
     ]
