@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera.kernels import distance_of_floor_point, project_floor_point
+from detect.discs.candidates import suppress_close
 from detect.discs.hough import HoughCandidates
 from detect.discs.rim import (
     COS,
@@ -25,9 +26,7 @@ from detect.discs.rim import (
     SIN,
     STEPS,
     Profiles,
-    Rim,
-    follow_rim,
-    median,
+    follow_rims,
     profiles,
 )
 from detect.discs.rim_network import (
@@ -37,7 +36,7 @@ from detect.discs.rim_network import (
     network_inputs,
     network_log_odds,
 )
-from redetect.array_types import Float32Array, FloatArray, GreyImage
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
 #: Distances at which grey values are taken for the disc and for the floor, nominal radii.
@@ -51,7 +50,6 @@ _INNER, _OUTER = (1, 2), 5  #: The first of two neighbouring samples.
 _LEAST_STEPS = 0.3
 #: Distances of what the network sees about a rim, nominal radii: means of pairs of steps.
 DENSE_RADII = np.linspace(NEAREST, FARTHEST, STEPS).reshape(-1, 2).mean(axis=1)
-_AT_ONCE = 16  #: Candidates that are prescreened at a time.
 _LEAST_PRESCREENING = 0.0  #: Threshold of the prescreening.
 LEAST_RIM = 0.3  #: Least share of the rim that has to be on a circle.
 RIM_RADIUS = 0.98  #: Most likely radius of a rim, relative to the nominal one.
@@ -97,7 +95,6 @@ class JudgedCandidates(NamedTuple):
         return JudgedCandidates(*(values[chosen] for values in self))
 
 
-@kernel()
 def judge(
     image: GreyImage,
     candidates: HoughCandidates,
@@ -111,104 +108,69 @@ def judge(
     Discs have a `nominal` radius, metres, and at least `least_step` grey levels at their rims;
     `camera_numbers` are those of `camera.kernels.camera_numbers`.
     """
-    n = len(candidates.score)
-    features, place = np.zeros((n, len(FEATURES))), candidates.floor_xy.copy()
-    traced_from, doubt = candidates.floor_xy.copy(), np.zeros((n, 2))
-    step, floor_grey, quality, log_odds = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    outcome, value = np.full(n, Outcome.FEW_STEPS, np.int8), np.zeros(n)
-    agreeing, radius = np.zeros(n), np.zeros(n)
-    judged = np.empty((n, 3))  # places and signs of rims
-    count = 0
-    contrast, prescreened = _prescreening_odds(
-        image, candidates, nominal, least_step, camera_numbers, networks.prescreening
-    )
-    for i in range(n):
-        if contrast[i] == 0.0:
-            continue
-        outcome[i], value[i] = Outcome.PRESCREENING, prescreened[i]
-        if prescreened[i] < _LEAST_PRESCREENING:
-            continue
-        x, y, sign = candidates.floor_xy[i, 0], candidates.floor_xy[i, 1], candidates.sign[i]
-        score = candidates.score[i]
-        radial = profiles(image, camera_numbers, x, y, nominal)
-        rim = follow_rim(image, camera_numbers, radial, sign * contrast[i])
-        outcome[i], value[i] = Outcome.NO_RIM, rim.agreeing
-        if rim.agreeing < LEAST_RIM:
-            continue
-        outcome[i] = Outcome.SAME_RIM
-        if _is_known(judged[:count], rim, sign, nominal):
-            continue
-        radial = profiles(image, camera_numbers, rim.x, rim.y, nominal)
-        odds, rim_features = _rim_odds(radial, rim, score, sign, networks.classifier)
-        if HOPELESS <= odds < _CERTAIN:
-            # A rim is seen best from its own centre, but that may lead to another circle.
-            again = follow_rim(image, camera_numbers, radial, rim.step)
-            if again.agreeing >= rim.agreeing - _SLACK:
-                radial_again = profiles(image, camera_numbers, again.x, again.y, nominal)
-                more, features_again = _rim_odds(
-                    radial_again, again, score, sign, networks.classifier
-                )
-                doubt[i, 0], doubt[i, 1] = again.x - rim.x, again.y - rim.y
-                if more > odds and not _is_known(judged[:count], again, sign, nominal):
-                    x, y = rim.x, rim.y
-                    rim, odds, rim_features, radial = again, more, features_again, radial_again
-        outcome[i], value[i], log_odds[i], step[i] = Outcome.JUDGED, odds, odds, rim.step
-        agreeing[i], radius[i] = rim.agreeing, rim.radius
-        for k in range(len(FEATURES)):  # assigning the row takes seconds to compile
-            features[i, k] = rim_features[k]
-        quality[i], floor_grey[i] = _quality(radial.grey)
-        place[i, 0], place[i, 1] = rim.x, rim.y
-        traced_from[i, 0], traced_from[i, 1] = x, y
-        judged[count, 0], judged[count, 1], judged[count, 2] = rim.x, rim.y, sign
-        count += 1
+
+    def profiles_at(floor_xy: FloatArray) -> Profiles:
+        return profiles(image, camera_numbers, floor_xy, np.full(len(floor_xy), nominal))
+
+    count, sign = len(candidates.score), candidates.sign
+    outcome, value = np.full(count, Outcome.FEW_STEPS, np.int8), np.zeros(count)
+    grey, scale = sparse_profiles(image, camera_numbers, candidates.floor_xy, nominal)
+    contrast = _contrast(grey, sign, least_step)
+    seen, score = network_inputs(grey, scale, sign), candidates.score[:, None]
+    odds = network_log_odds(*seen, score, networks.prescreening)
+    k = np.flatnonzero(contrast > 0.0)
+    outcome[k], value[k] = Outcome.PRESCREENING, odds[k]
+
+    k = k[odds[k] >= _LEAST_PRESCREENING]
+    from_xy = candidates.floor_xy[k]
+    rims = follow_rims(image, camera_numbers, profiles_at(from_xy), sign[k] * contrast[k])
+    outcome[k], value[k] = Outcome.NO_RIM, rims["agreeing"]
+    found = rims["agreeing"] >= LEAST_RIM
+    outcome[k[found]] = Outcome.SAME_RIM
+    found[found] = _first_of_each(rims["floor_xy"][found], sign[k[found]], _SAME * nominal)
+    k, from_xy, rims = k[found], from_xy[found], rims[found]
+
+    radial, score = profiles_at(rims["floor_xy"]), candidates.score[k]
+    features = _features(rims, nominal, score)
+    odds = _rim_odds(radial, features, sign[k], networks.classifier)
+    # A rim is seen best from its own centre, but that may lead to another circle.
+    doubtful, doubt = np.flatnonzero((odds >= HOPELESS) & (odds < _CERTAIN)), np.zeros((len(k), 2))
+    step = rims["step"][doubtful]
+    again = follow_rims(image, camera_numbers, radial.where(doubtful), step)
+    kept = again["agreeing"] >= rims["agreeing"][doubtful] - _SLACK
+    doubtful, again = doubtful[kept], again[kept]
+    doubt[doubtful] = again["floor_xy"] - rims["floor_xy"][doubtful]
+    radial_again = profiles_at(again["floor_xy"])
+    features_again = _features(again, nominal, score[doubtful])
+    odds_again = _rim_odds(radial_again, features_again, sign[k[doubtful]], networks.classifier)
+    better = odds_again > odds[doubtful]
+    changed = doubtful[better]
+    from_xy[changed] = rims["floor_xy"][changed]
+    rims[changed], odds[changed] = again[better], odds_again[better]
+    features[changed], radial.grey[changed] = features_again[better], radial_again.grey[better]
+
+    outcome[k], value[k] = Outcome.JUDGED, odds
+    quality, floor_grey = _quality(radial.grey)
+
+    def of_all(judged: NDArray[Any], others: NDArray[Any] | float = 0.0) -> FloatArray:
+        values = np.zeros((count, *judged.shape[1:])) + others
+        values[k] = judged
+        return values
+
+    place = of_all(rims["floor_xy"], candidates.floor_xy)
     return JudgedCandidates(
-        outcome, value, candidates.sign, features, agreeing, radius, place, traced_from, doubt,
-        step, floor_grey, quality, log_odds,
+        outcome, value, sign, of_all(features), of_all(rims["agreeing"]), of_all(rims["radius"]),
+        place, of_all(from_xy, candidates.floor_xy), of_all(doubt), of_all(rims["step"]),
+        of_all(floor_grey), of_all(quality), of_all(odds),
     )  # fmt: skip
 
 
-@kernel()
-def _is_known(judged: FloatArray, rim: Rim, sign: float, radius: float) -> bool:
-    """Whether a rim is one of `judged`, rows (x, y, sign)."""
-    near = _SAME * radius
-    for k in range(len(judged)):
-        off_x, off_y = judged[k, 0] - rim.x, judged[k, 1] - rim.y
-        if off_x * off_x + off_y * off_y < near * near and judged[k, 2] == sign:
-            return True
-    return False
-
-
-@kernel()
-def _between(grey: Float32Array, bounds: tuple[float, float]) -> FloatArray:
-    """Mean grey value of each direction between two distances, nominal radii."""
-    per_step = (FARTHEST - NEAREST) / (STEPS - 1)
-    first = round((bounds[0] - NEAREST) / per_step)
-    last = round((bounds[1] - NEAREST) / per_step)
-    mean = np.empty(DIRECTIONS)
-    for k in range(DIRECTIONS):
-        mean[k] = np.mean(grey[k, first : last + 1])
-    return mean
-
-
-@kernel()
-def _prescreening_odds(
-    image: GreyImage, candidates: HoughCandidates, nominal: float, least_step: float,
-    camera_numbers: FloatArray, network: RimNetwork,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """(N,) contrasts of candidates, 0 if too few directions have any, and their log-odds."""
-    n = len(candidates.score)
-    contrast, odds = np.empty(n), np.empty(n)
-    for first in range(0, n, _AT_ONCE):
-        end = min(first + _AT_ONCE, n)
-        sign, score = candidates.sign[first:end], candidates.score[first:end]
-        floor_xy = candidates.floor_xy[first:end]
-        grey, scale = sparse_profiles(image, camera_numbers, floor_xy, nominal)
-        inputs, scales = network_inputs(grey, scale, sign)
-        log_odds = network_log_odds(inputs, scales, score.reshape(-1, 1), network)
-        for k in range(end - first):
-            contrast[first + k] = _contrast(grey[k], sign[k], least_step)
-            odds[first + k] = log_odds[k]
-    return contrast, odds
+def _first_of_each(floor_xy: FloatArray, sign: FloatArray, apart: float) -> BoolArray:
+    """(N,) mask of positions that are not the same as one before, of the same sign."""
+    first = np.zeros(len(sign), np.bool_)
+    for own in (1.0, -1.0):
+        first[suppress_close(floor_xy, np.flatnonzero(sign == own), apart)] = True
+    return first
 
 
 @kernel()
@@ -248,70 +210,59 @@ def sparse_profiles(
     return grey, scale
 
 
-@kernel()
 def pairs_of_steps(grey: Float32Array) -> Float32Array:
-    """Profiles as the network sees them: means of pairs of steps."""
-    # Loops, here and below: expressions of arrays take several times as long to compile.
-    pairs = np.empty((len(grey), grey.shape[1] // 2), np.float32)
-    for k in range(len(grey)):
-        for m in range(grey.shape[1] // 2):
-            pairs[k, m] = np.float32(0.5) * (grey[k, 2 * m] + grey[k, 2 * m + 1])
-    return pairs
+    """Profiles as the network sees them: means of pairs of steps, (..., STEPS / 2)."""
+    return np.asarray(np.float32(0.5) * (grey[..., ::2] + grey[..., 1::2]))
 
 
-@kernel()
-def _contrast(grey: Float32Array, sign: float, least_step: float) -> float:
-    """Median step over the directions with a sufficient step; 0 if these are too few."""
-    steps = np.empty(SPARSE_DIRECTIONS)
-    for inner in _INNER:
-        count = 0
-        for k in range(SPARSE_DIRECTIONS):
-            inside = grey[k, inner] + grey[k, inner + 1]
-            step = 0.5 * sign * (inside - (grey[k, _OUTER] + grey[k, _OUTER + 1]))
-            if step > least_step:
-                steps[count] = step
-                count += 1
-        if count >= _LEAST_STEPS * SPARSE_DIRECTIONS:
-            return median(steps[:count])
-    return 0.0
+def _contrast(grey: Float32Array, sign: FloatArray, least_step: float) -> FloatArray:
+    """(N,) median steps over the directions with a sufficient step; 0 if these are too few."""
+    contrast, rows = np.zeros(len(grey)), np.arange(len(grey))
+    half, none = np.float32(0.5) * sign.astype(np.float32), np.float32(np.inf)
+    for inner in reversed(_INNER):
+        inside, outside = (grey[..., i] + grey[..., i + 1] for i in (inner, _OUTER))
+        step = half[:, None] * (inside - outside)
+        steps = np.sort(np.where(step > least_step, step, none), axis=1)
+        count = (steps < none).sum(axis=1)
+        median = 0.5 * (steps[rows, (count - 1) // 2] + steps[rows, count // 2])
+        contrast = np.where(count >= _LEAST_STEPS * SPARSE_DIRECTIONS, median, contrast)
+    return contrast
 
 
-@kernel()
-def _quality(grey: Float32Array) -> tuple[float, float]:
+def _quality(grey: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Between-class over total variance of the grey values inside and outside; mean outside."""
-    inside, outside = _between(grey, _INSIDE), _between(grey, _OUTSIDE)
-    count = 0
-    for k in range(DIRECTIONS):
-        if math.isfinite(inside[k]) and math.isfinite(outside[k]):
-            inside[count], outside[count] = inside[k], outside[k]
-            count += 1
-    if count == 0:
-        return 0.0, 0.0
-    inside, outside = inside[:count], outside[:count]
-    floor_grey = np.mean(outside)
-    between = 0.25 * (np.mean(inside) - floor_grey) ** 2
-    total = between + 0.5 * (np.var(inside) + np.var(outside))
-    return (float(between / total) if total > 0.0 else 0.0), float(floor_grey)
+    at = np.linspace(NEAREST, FARTHEST, STEPS)
+    inside, outside = (
+        grey[..., np.abs(at - low).argmin() : np.abs(at - high).argmin() + 1].mean(
+            axis=2, dtype=float
+        )
+        for low, high in (_INSIDE, _OUTSIDE)
+    )
+    seen = np.isfinite(inside) & np.isfinite(outside)
+    count = np.maximum(seen.sum(axis=1), 1)
+    means, variance = [], 0.0
+    for values in (inside, outside):
+        mean = np.where(seen, values, 0.0).sum(axis=1) / count
+        off = np.where(seen, values - mean[:, None], 0.0)
+        variance = variance + (off * off).sum(axis=1) / count
+        means.append(mean)
+    between = 0.25 * (means[0] - means[1]) ** 2
+    total = between + 0.5 * variance
+    return between / np.where(total > 0.0, total, 1.0), means[1]
 
 
-@kernel()
+def _features(rims: Any, nominal: float, score: FloatArray) -> FloatArray:
+    """(N, len(FEATURES)) features of rims, each bounded, so that no single one decides."""
+    off = np.abs(np.log(np.clip(rims["radius"] / nominal, 0.3, 3.0) / RIM_RADIUS))
+    size = np.log(np.clip(rims["radius_px"], 3.0, 30.0) / 6.0)
+    runs, score = np.minimum(rims["runs"], 4.0), np.minimum(score, 12.0)
+    columns = [rims["agreeing"], runs, rims["scatter"], off, 10.0 * off * off, size, score]
+    return np.stack(columns, axis=1)
+
+
 def _rim_odds(
-    radial: Profiles, rim: Rim, score: float, sign: float, network: RimNetwork
-) -> tuple[float, FloatArray]:
-    """Log-odds that a rim, seen from its centre, is a disc's; and its features.
-
-    Each feature is bounded, so that no single one decides.
-    """
-    features = np.empty(len(FEATURES))
-    off = abs(math.log(min(max(rim.radius / radial.radius, 0.3), 3.0) / RIM_RADIUS))
-    features[0] = rim.agreeing
-    features[1] = min(rim.runs, 4)
-    features[2] = rim.scatter
-    features[3] = off
-    features[4] = 10.0 * off * off
-    features[5] = math.log(min(max(rim.radius_px, 3.0), 30.0) / 6.0)
-    features[6] = min(score, 12.0)
-    grey, scale = pairs_of_steps(radial.grey), radial.pixels_per_radius
-    signs = np.full(1, sign)
-    inputs, scales = network_inputs(grey.reshape(1, DIRECTIONS, -1), scale.reshape(1, -1), signs)
-    return network_log_odds(inputs, scales, features.reshape(1, -1), network)[0], features
+    radial: Profiles, features: FloatArray, sign: FloatArray, network: RimNetwork
+) -> FloatArray:
+    """(N,) log-odds that rims, seen from their centres, are those of discs."""
+    seen = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign)
+    return network_log_odds(*seen, features, network)

@@ -66,19 +66,15 @@ def tilt_of_outlines(
     numbers, centre = camera_numbers(camera), np.array(camera.centre)
     # If the camera is higher than calibrated, discs are larger than they seem.
     radius = radius_m / (1.0 + raised_m / float(camera.centre[2]))
-    outlines = []
-    for x, y in floor_xy.tolist():
-        radial = profiles(image, numbers, x, y, radius_m)
-        if not radial.pixels_per_radius.min() >= LEAST_AXIS_PX:
+    radial, outlines = profiles(image, numbers, floor_xy, np.full(len(floor_xy), radius_m)), []
+    for (x, y), grey, px_per_radius in zip(floor_xy, radial.grey, radial.pixels_per_radius):
+        contrast = _contrast(grey)
+        if not (px_per_radius.min() >= LEAST_AXIS_PX and abs(contrast) >= LEAST_CONTRAST):
             continue
-        contrast = _contrast(radial.grey)
-        if not abs(contrast) >= LEAST_CONTRAST:
-            continue
-        rim, _ = rim_points(radial, contrast)
+        rim, _ = rim_points(grey, px_per_radius, contrast)
         if np.isfinite(rim).sum() >= LEAST_DIRECTIONS:
             point_xy = radius_m * rim[:, None] * _DIRECTIONS_XY
-            px_per_m = radial.pixels_per_radius / radius_m
-            outline = fit_outline(point_xy, px_per_m, centre, x, y, radius)
+            outline = fit_outline(point_xy, px_per_radius / radius_m, centre, x, y, radius)
             outlines += [outline] if outline.found else []
     if not outlines:
         return None

@@ -14,11 +14,10 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from detect.discs.fit import START, FitSettings, Scene, fit_discs
 from detect.discs.patch import Reach
-from detect.discs.rim import follow_rim, median, profiles
+from detect.discs.rim import follow_rims, median, profiles
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
@@ -52,12 +51,6 @@ _BLUR_PX = 1.0  #: Initial blur, pixels.
 _DISAGREEMENT = 0.5
 
 
-#: The rim of a disc by its points (`detect.discs.rim.Rim`); lengths in metres.
-RIM = np.dtype(
-    [("floor_xy", float, 2), ("radius", float), ("covariance", float, (2, 2)), ("doubt", float, 2)]
-)
-
-
 def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[FloatArray, FloatArray]:
     """Locate N discs by fits: fully visible ones first, then the others, given the size of those.
 
@@ -79,7 +72,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
 
     hidden, by_parts = np.flatnonzero(~explained), whole.copy()
     _state_sizes(start, hidden, nominal, radii)
-    rims = _rims_of(scene, discs, hidden, start["size"])
+    rims = _rims_of(scene, discs, hidden, start["size"][hidden])
     start["floor_xy"][hidden], start["radius"][hidden] = rims["floor_xy"], rims["radius"]
     by_parts[hidden] = fit_discs(scene, start[hidden], BY_PARTS, work)
     radii[hidden] = _radii_without_prior(by_parts, start)[hidden]
@@ -94,7 +87,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
     best[again[better]] = last[better]
 
     floor_xy, covariance = best["floor_xy"], best["covariance"]
-    rims = _rims_of(scene, discs, hidden, start["size"])
+    rims = _rims_of(scene, discs, hidden, start["size"][hidden])
     lost = ~best["converged"][hidden]  # sectors disagree
     by_rim = hidden[lost]
     floor_xy[by_rim] = rims["floor_xy"][lost]
@@ -132,19 +125,11 @@ def _state_sizes(start: Any, chosen: IntArray, nominal: float, radii: FloatArray
         start["size"][k], start["size_sigma"][k] = size_of_disc(nominal, radii, k)
 
 
-def _rims_of(
-    scene: Scene, discs: JudgedCandidates, chosen: IntArray, radius: FloatArray
-) -> NDArray[Any]:
-    """Rims of some discs (`RIM`), traced for a radius of each disc, metres."""
-    rims = np.zeros(len(chosen), RIM)
-    for rim, k in zip(rims, chosen.tolist()):
-        x, y = discs.traced_from[k].tolist()
-        radial = profiles(scene.image, scene.camera_numbers, x, y, radius[k])
-        found = follow_rim(scene.image, scene.camera_numbers, radial, discs.step[k])
-        rim["floor_xy"], rim["radius"] = (found.x, found.y), found.radius
-        rim["covariance"] = (found.cov_xx, found.cov_xy), (found.cov_xy, found.cov_yy)
-        rim["doubt"] = found.doubt_x, found.doubt_y
-    return rims
+def _rims_of(scene: Scene, discs: JudgedCandidates, chosen: IntArray, radius: FloatArray) -> Any:
+    """Rims of some discs (`RIM`), traced for a radius of each, metres."""
+    near_xy, numbers = discs.traced_from[chosen], scene.camera_numbers
+    radial = profiles(scene.image, numbers, near_xy, radius)
+    return follow_rims(scene.image, numbers, radial, discs.step[chosen])
 
 
 def _squares(vectors: FloatArray) -> FloatArray:

@@ -17,9 +17,10 @@ fixed starts work as well as random samples, and are deterministic.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
 from detect.discs.model import F32
@@ -73,46 +74,60 @@ _BEGIN, _MIDDLE, _END = (
 )
 
 
-class Rim(NamedTuple):
-    """The rim of a candidate; lengths are in nominal radii."""
-
-    agreeing: float  #: Share of all directions in which the rim is on the circle.
-    #: Gaps: runs of two or more neighbouring directions in which it is not.
-    runs: int
-    scatter: float  #: Root mean square distance of the points on the circle from it, in tolerances.
-    step: float  #: Mean step of the grey value on the circle (grey levels, inside minus outside).
-    x: float  #: Centre on the floor, metres.
-    y: float
-    radius: float  #: Metres.
-    cov_xx: float  #: Covariance of the centre from the scatter of the points, square metres.
-    cov_xy: float
-    cov_yy: float
-    radius_px: float  #: Geometric mean of the radius over the directions, pixels.
-    #: Offset to another plausible circle, metres: its square has to be added to the covariance.
-    doubt_x: float
-    doubt_y: float
+#: The rim of a candidate.
+RIM = np.dtype(
+    [
+        ("agreeing", float),  # share of all directions in which the rim is on the circle
+        ("runs", float),  # gaps: two or more neighbouring directions in which it is not
+        # Root mean square distance of the points on the circle from it, in tolerances.
+        ("scatter", float),
+        ("step", float),  # mean step on the circle, grey levels inside minus outside
+        ("floor_xy", float, 2),  # centre, metres
+        ("radius", float),  # metres
+        ("covariance", float, (2, 2)),  # of the centre, from the scatter of the points
+        ("radius_px", float),  # geometric mean over the directions, pixels
+        # Offset to another plausible circle, metres: its square has to be added to the covariance.
+        ("doubt", float, 2),
+    ]
+)
 
 
 class Profiles(NamedTuple):
-    """Grey values along the directions from a point on the floor."""
+    """Grey values along the directions from N points on the floor."""
 
-    x: float  #: The point, metres.
-    y: float
-    radius: float  #: Nominal radius, metres.
-    grey: Float32Array  #: (DIRECTIONS, STEPS) NaN outside the image.
-    #: (DIRECTIONS,) Length of a radius in the image in each direction, pixels.
+    floor_xy: FloatArray  #: (N, 2) the points, metres.
+    radius: FloatArray  #: (N,) nominal radii, metres.
+    grey: Float32Array  #: (N, DIRECTIONS, STEPS) NaN outside the image.
+    #: (N, DIRECTIONS) Length of a radius in the image in each direction, pixels.
     pixels_per_radius: FloatArray
+
+    def where(self, chosen: NDArray[Any]) -> Profiles:
+        """Those that indices or a mask select."""
+        return Profiles(*(values[chosen] for values in self))
 
 
 @kernel()
 def profiles(
-    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float
+    image: GreyImage, camera_numbers: FloatArray, floor_xy: FloatArray, radius: FloatArray
 ) -> Profiles:
-    """Grey values along the directions from a point (x, y) on the floor, metres.
+    """Grey values along the directions from (N, 2) points on the floor, metres.
 
-    `radius` is the nominal one; `camera_numbers` as in `camera.kernels.camera_numbers`.
+    `radius` (N,) are nominal ones; `camera_numbers` as in `camera.kernels.camera_numbers`.
     """
-    grey, scale = np.empty((DIRECTIONS, STEPS), np.float32), np.empty(DIRECTIONS)
+    grey = np.empty((len(floor_xy), DIRECTIONS, STEPS), np.float32)
+    scale = np.empty((len(floor_xy), DIRECTIONS))
+    for i in range(len(floor_xy)):
+        x, y = floor_xy[i, 0], floor_xy[i, 1]
+        _sample(image, camera_numbers, x, y, radius[i], grey[i], scale[i])
+    return Profiles(floor_xy, radius, grey, scale)
+
+
+@kernel()
+def _sample(
+    image: GreyImage, camera_numbers: FloatArray, x: float, y: float, radius: float,
+    grey: Float32Array, scale: FloatArray,
+) -> None:  # fmt: skip
+    """Write the profiles from one point."""
     pixels, (height, width) = image.reshape(-1), image.shape
     right, bottom = F32(width - 1), F32(height - 1)
     inside, first = np.empty(STEPS, np.bool_), np.empty(STEPS, np.int32)
@@ -143,14 +158,16 @@ def profiles(
                 upper += across[m] * (F32(pixels[at + one]) - upper)
                 lower += across[m] * (F32(pixels[at + below + one]) - lower)
                 grey[k, m] = upper + down[m] * (lower - upper)
-    return Profiles(x, y, radius, grey, scale)
 
 
 @kernel()
-def rim_points(radial: Profiles, contrast: float) -> tuple[FloatArray, FloatArray]:
+def rim_points(
+    grey: Float32Array, pixels_per_radius: FloatArray, contrast: float
+) -> tuple[FloatArray, FloatArray]:
     """Find where the grey value changes most from the disc's to the floor's in each direction.
 
-    Returns (DIRECTIONS,) distances from the centre, nominal radii, NaN if no step reaches
+    From (DIRECTIONS, STEPS) grey values about one point and their (DIRECTIONS,) pixels per radius,
+    returns (DIRECTIONS,) distances from the centre, nominal radii, NaN if no step reaches
     `LEAST_STEP` of the contrast (grey levels inside minus outside), and the steps there.
     """
     distance, step = np.empty(DIRECTIONS), np.zeros(DIRECTIONS)
@@ -160,13 +177,13 @@ def rim_points(radial: Profiles, contrast: float) -> tuple[FloatArray, FloatArra
     for k in range(DIRECTIONS):
         distance[k] = math.nan
         # The step is taken over two pixels, and at least over a sixth of the radius.
-        reach = max(2, round(1.0 / (radial.pixels_per_radius[k] * per_step)))
+        reach = max(2, round(1.0 / (pixels_per_radius[k] * per_step)))
         reach = min(reach, STEPS // 4)
         best = -1
         for m in range(STEPS):
             change[m] = -math.inf
             if reach <= m < STEPS - reach:
-                value = sign * (radial.grey[k, m - reach] - radial.grey[k, m + reach])
+                value = sign * (grey[k, m - reach] - grey[k, m + reach])
                 if value == value:
                     change[m] = value
                     if best < 0 or value > change[best]:
@@ -333,15 +350,29 @@ def best_circle(
 
 
 @kernel()
-def follow_rim(
-    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: float
-) -> Rim:
-    """Trace the rim in profiles from about a candidate's centre; `agreeing` is 0 without a circle.
+def follow_rims(
+    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: FloatArray
+) -> Any:
+    """Trace the rims in profiles from about N candidates' centres: (N,) `RIM`.
 
-    `contrast` is approximately that of the disc to the floor, grey levels.
+    `contrast` (N,) is approximately that of discs to the floor, grey levels. Without a circle,
+    `agreeing` is 0.
     """
-    x, y, radius, scale = radial.x, radial.y, radial.radius, radial.pixels_per_radius
-    distance, step = rim_points(radial, contrast)
+    rims = np.zeros(len(contrast), RIM)
+    for i in range(len(contrast)):
+        _follow_rim(image, camera_numbers, radial, i, contrast[i], rims[i])
+    return rims
+
+
+@kernel()
+def _follow_rim(
+    image: GreyImage, camera_numbers: FloatArray, radial: Profiles, i: int, contrast: float,
+    rim: Any,
+) -> None:  # fmt: skip
+    """Trace the rim in profiles `i`, and write it into `rim`."""
+    x, y, radius = radial.floor_xy[i, 0], radial.floor_xy[i, 1], radial.radius[i]
+    scale = radial.pixels_per_radius[i]
+    distance, step = rim_points(radial.grey[i], scale, contrast)
     at_x, at_y = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     weight, tolerance = np.zeros(DIRECTIONS), np.zeros(DIRECTIONS)
     log_px = 0.0
@@ -353,9 +384,9 @@ def follow_rim(
             weight[k] = (scale[k] / POINT_SIGMA_PX) ** 2
     chosen = np.zeros(DIRECTIONS)
     best, best_count, doubt = best_circle(at_x, at_y, weight, tolerance, chosen)
-    radius_px = math.exp(log_px)
+    rim.floor_xy[0], rim.floor_xy[1], rim.radius, rim.radius_px = x, y, radius, math.exp(log_px)
     if best_count < LEAST_POINTS:
-        return Rim(0.0, 0, 0.0, 0.0, x, y, radius, 0.0, 0.0, 0.0, radius_px, 0.0, 0.0)
+        return
     height, width = image.shape
     squares = mean = 0.0
     outside = np.zeros(DIRECTIONS, np.bool_)
@@ -368,22 +399,19 @@ def follow_rim(
             rim_y = y + radius * (best.y + best.radius * SIN[k])
             u, v = project_floor_point(camera_numbers, rim_x, rim_y)
             outside[k] = not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0)
-    runs = 0
     for k in range(DIRECTIONS):
         # A gap follows a direction that agrees, and has at least two that do not.
         last, following = (k - 1) % DIRECTIONS, (k + 1) % DIRECTIONS
         hidden = chosen[k] == 0.0 and chosen[following] == 0.0 and not outside[k]
-        runs += 1 if hidden and chosen[last] > 0.0 else 0
-    scatter = math.sqrt(squares / best_count)
-    radius_found = radius * best.radius
+        rim.runs += 1.0 if hidden and chosen[last] > 0.0 else 0.0
+    rim.agreeing, rim.scatter = best_count / DIRECTIONS, math.sqrt(squares / best_count)
+    rim.step, rim.radius = mean / best_count, radius * best.radius
     best = _placed(at_x, at_y, chosen, best)
     area = _CORRELATED_POINTS * radius * radius
-    return Rim(
-        best_count / DIRECTIONS, runs, scatter, mean / best_count,
-        x + radius * best.x, y + radius * best.y, radius_found,
-        area * best.cov_xx, area * best.cov_xy, area * best.cov_yy, radius_px,
-        radius * doubt[0], radius * doubt[1],
-    )  # fmt: skip
+    rim.floor_xy[0], rim.floor_xy[1] = x + radius * best.x, y + radius * best.y
+    rim.covariance[0, 0], rim.covariance[1, 1] = area * best.cov_xx, area * best.cov_yy
+    rim.covariance[0, 1] = rim.covariance[1, 0] = area * best.cov_xy
+    rim.doubt[0], rim.doubt[1] = radius * doubt[0], radius * doubt[1]
 
 
 @kernel()

@@ -165,9 +165,9 @@ class _Gathering:
         numbers = camera_numbers(camera)
         for k, (dx, dy, size) in enumerate(off):
             radius = _RADIUS * (1.0 + size)
-            radial = profiles(image, numbers, place[0] + dx, place[1] + dy, radius)
-            grey[k] = _as_light(pairs_of_steps(radial.grey), sign)
-            scale[k] = radial.pixels_per_radius
+            radial = profiles(image, numbers, place[None] + (dx, dy), np.full(1, radius))
+            grey[k] = _as_light(pairs_of_steps(radial.grey[0]), sign)
+            scale[k] = radial.pixels_per_radius[0]
         return grey, scale
 
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from camera import Camera
 from camera.kernels import camera_numbers
-from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, Rim, fit_circle, follow_rim, profiles
+from detect.discs.rim import DIRECTIONS, RADIUS_SIGMA, Circle, fit_circle, follow_rims, profiles
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, PaintedFloor
 
 PLACES = np.array([(0.0, -1.2), (0.5, -1.5), (-0.6, -1.9), (0.4, -2.3)])
 RADIUS = 0.1
 
 
-def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Rim:
+def rim_of(camera: Camera, image: NDArray[np.uint8], near: NDArray[np.float64], grey: float) -> Any:
     numbers = camera_numbers(camera)
-    seen = profiles(image, numbers, near[0], near[1], RADIUS)
-    return follow_rim(image, numbers, seen, grey - FLOOR)
+    seen = profiles(image, numbers, near[None], np.full(1, RADIUS))
+    return follow_rims(image, numbers, seen, np.full(1, grey - FLOOR)).view(np.recarray)[0]
 
 
 @pytest.mark.parametrize("grey", [LIGHT, DARK])
@@ -28,7 +30,7 @@ def test_a_whole_rim_lies_on_one_circle(published_camera: Camera, grey: float) -
         rim = rim_of(published_camera, image, place + np.array([0.015, -0.01]), grey)
         assert rim.agreeing > 0.9
         assert rim.runs <= 1
-        assert np.hypot(rim.x - place[0], rim.y - place[1]) < 0.003
+        assert np.hypot(*(rim.floor_xy - place)) < 0.003
         assert rim.radius == pytest.approx(RADIUS, rel=0.06)
 
 
@@ -38,7 +40,7 @@ def test_a_door_takes_a_stretch_of_the_rim_and_leaves_the_circle(published_camer
         rim = rim_of(published_camera, floor.image(seed=seed), place + np.array([0.02, 0.0]), LIGHT)
         assert 0.5 < rim.agreeing < 0.9
         assert rim.runs <= 1
-        assert np.hypot(rim.x - place[0], rim.y - place[1]) < 0.008
+        assert np.hypot(*(rim.floor_xy - place)) < 0.008
 
 
 def test_what_is_no_disc_has_no_such_rim(published_camera: Camera) -> None:
@@ -91,8 +93,7 @@ def test_covariances_of_the_rim_cover_its_errors(published_camera: Camera) -> No
         place = PLACES[seed % len(PLACES)] + rng.uniform(-0.05, 0.05, 2)
         floor = PaintedFloor(published_camera).disc(place, LIGHT).door(place, 0.4)
         rim = rim_of(published_camera, floor.image(seed=seed), place, LIGHT)
-        error = np.array([rim.x, rim.y]) - place
-        covariance = np.array([[rim.cov_xx, rim.cov_xy], [rim.cov_xy, rim.cov_yy]])
-        squares.append(error @ np.linalg.solve(covariance, error) / 2.0)
+        error = rim.floor_xy - place
+        squares.append(error @ np.linalg.solve(rim.covariance, error) / 2.0)
     # They place discs only where sectors of the edge disagree: there they are worse than here.
     assert 0.1 < np.median(squares) / np.log(2.0) < 1.6
