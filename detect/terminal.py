@@ -31,7 +31,7 @@ def show_announcements() -> None:
 @cache
 def say_compiling() -> None:
     """Announce, once, that kernels are compiled."""
-    _log.info("compiling kernels, once: about a minute")
+    _log.info("compiling kernels, once: up to a minute")
 
 
 def on_compilation(call: Callable[[], object]) -> Callable[[], None]:

@@ -296,7 +296,7 @@ def _disc_rows(
 
 
 def compile_discs(plan: FramePlan, tasks: Sequence[FrameTask], *, search: bool) -> None:
-    """Compile kernels for discs: those of the search and of outlines, or those of the other stages.
+    """Compile the kernels that find candidates of discs, or those of all stages after that.
 
     They are stored in the disk cache. Two processes compile one half each at the same time.
     """
@@ -306,11 +306,11 @@ def compile_discs(plan: FramePlan, tasks: Sequence[FrameTask], *, search: bool) 
     image = read_image(tasks[0].frame, camera, plan.working_folder)
     table = cached_vote_table(camera, vote_shape(settings))
     scene = scene_of(image, camera, table, settings)
-    if not search:
-        none = HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
-        place_discs(scene, classify(scene, settings, none), working_space()[0])
+    if search:
+        candidates_of(scene, table, settings)
         return
-    candidates_of(scene, table, settings)
+    none = HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
+    place_discs(scene, classify(scene, settings, none), working_space()[0])
     if plan.levelling == "run":
         tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
         fit_outline(np.ones((3, 2)), np.ones(3), np.ones(3), 0.0, 0.0, 1.0)
