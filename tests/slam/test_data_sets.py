@@ -15,8 +15,9 @@ from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import read_map, read_path
 from redetect.plane import chain_steps
 from redetect.slam.cli import main
-from redetect.slam.formats.data_sets import read_utias, trees_of
 from redetect.slam.formats.ranges import discs_of_ranges
+from redetect.slam.formats.utias import read_run
+from redetect.slam.formats.victoria_park import trees_of
 from redetect.slam.recording import read_recording
 
 RANGE_SIGMA, BEARING_SIGMA = 0.05, 0.01
@@ -86,14 +87,14 @@ def utias(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_response_of_a_robot_to_its_commands_is_found(
     utias: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording, found, _ = read_utias(utias / "Robot1_Odometry.dat")
+    recording, found, _ = read_run(utias / "Robot1_Odometry.dat")
     assert found is not None
     assert abs(found.lag_s - LAG_S) < 0.02
     assert abs(found.speed - SPEED) < 0.01
     assert abs(found.turn - TURN) < 0.01
     assert abs(found.depth - DEPTH) < 0.004
     true = read_path(utias / "true.csv").poses
-    raw, *learned = read_utias(utias / "Robot1_Odometry.dat", calibrated=False)
+    raw, *learned = read_run(utias / "Robot1_Odometry.dat", calibrated=False)
     assert learned == [None, None]
     distance, depth = (np.hypot(*run.circles.xy.T) for run in (recording, raw))
     bearing = np.arctan2(raw.circles.xy[:, 0], -raw.circles.xy[:, 1])
@@ -118,7 +119,7 @@ def test_without_known_landmarks_depths_are_too_long_by_the_usual_factor(
     for file in utias.glob("*.dat"):
         if "Landmark" not in file.name:
             shutil.copy(file, tmp_path)
-    _, found, _ = read_utias(tmp_path / "Robot1_Odometry.dat")
+    _, found, _ = read_run(tmp_path / "Robot1_Odometry.dat")
     assert found is not None
     assert abs(found.depth - 1.033) < 0.005
     assert abs(found.speed / found.depth - SPEED / DEPTH) < 0.03
@@ -131,7 +132,7 @@ def test_a_robot_that_shows_nothing_of_its_response_has_the_usual_one(tmp_path: 
         ("Barcodes", "6 100\n"),
     ):
         (tmp_path / f"{name}.dat").write_text(rows)
-    found = read_utias(tmp_path / "Robot1_Odometry.dat")[1]
+    found = read_run(tmp_path / "Robot1_Odometry.dat")[1]
     assert found is not None
     np.testing.assert_allclose(found, (0.25, 1.0, 1.0, 1.033), atol=0.06)
 

@@ -14,7 +14,7 @@ from redetect.landmarks.map_file import Path2D, read_path, write_map, write_path
 from redetect.plane import chain_steps
 from redetect.slam.commands.files import recording_of
 from redetect.slam.errors import SlamError
-from redetect.slam.formats import data_sets
+from redetect.slam.formats import utias, victoria_park
 from redetect.slam.formats.g2o import graph_of_run, read_g2o, write_g2o
 from redetect.slam.formats.tables import bearing_table, disc_table, odometry_table
 from redetect.slam.formats.tum import read_tum, write_tum
@@ -128,41 +128,41 @@ def perform_import(command: Import) -> int:
 
 def _suffixes_of_results(file: Path) -> tuple[str, ...]:
     """Those of a run, and of a path or map, if a file contains such."""
-    if file.name == data_sets.DRIVE:
+    if file.name == victoria_park.DRIVE:
         return (".circles",)
-    if file.name == data_sets.LANDMARKS or file.suffix not in (".dat", ".mat", ".g2o"):
+    if file.name == utias.LANDMARKS or file.suffix not in (".dat", ".mat", ".g2o"):
         return (".csv",)
     return (".circles", ".csv")
 
 
 def _flags_used(command: Import) -> tuple[str, ...]:
     """Those of `_DATA_SET_FLAGS` that have an effect."""
-    if command.file.name.endswith(data_sets.ODOMETRY) and command.output.suffix != ".csv":
+    if command.file.name.endswith(utias.ODOMETRY) and command.output.suffix != ".csv":
         return _DATA_SET_FLAGS
-    return _DATA_SET_FLAGS[:2] if command.file.name == data_sets.DRIVE else ()
+    return _DATA_SET_FLAGS[:2] if command.file.name == victoria_park.DRIVE else ()
 
 
 def _import_data_set(command: Import) -> None:
     """Import a robot's run, true path or landmarks of UTIAS, or the run of Victoria Park."""
     file, sigmas = command.file, (command.range_sigma, command.bearing_sigma)
-    if file.name == data_sets.LANDMARKS:
-        landmark_map = data_sets.read_landmarks(file)
+    if file.name == utias.LANDMARKS:
+        landmark_map = utias.read_landmarks(file)
         write_map(command.output, landmark_map, [_made_by(file)], overwrite=command.force)
         print(f"{command.output}: {len(landmark_map.discs)} landmarks")
-    elif file.name.endswith(data_sets.ODOMETRY) and command.output.suffix == ".csv":
-        path, repeated = data_sets.read_truth(file)
+    elif file.name.endswith(utias.ODOMETRY) and command.output.suffix == ".csv":
+        path, repeated = utias.read_truth(file)
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
-    elif file.name.endswith(data_sets.ODOMETRY):
-        run, *found = data_sets.read_utias(file, *sigmas, calibrated=command.calibrated)
+    elif file.name.endswith(utias.ODOMETRY):
+        run, *found = utias.read_run(file, *sigmas, calibrated=command.calibrated)
         notes = [some.sentence() for some in found if some is not None]
         _write_run(command, run, "measurements", *notes)
-    elif file.name == data_sets.DRIVE:
-        _write_run(command, data_sets.read_victoria_park(file, *sigmas), "measurements")
+    elif file.name == victoria_park.DRIVE:
+        _write_run(command, victoria_park.read_run(file, *sigmas), "measurements")
     else:
         raise SlamError(
-            f"{file}: expected a RobotN{data_sets.ODOMETRY} or {data_sets.LANDMARKS} of the UTIAS "
-            f"data set, or the {data_sets.DRIVE} of Victoria Park"
+            f"{file}: expected a RobotN{utias.ODOMETRY} or {utias.LANDMARKS} of the UTIAS "
+            f"data set, or the {victoria_park.DRIVE} of Victoria Park"
         )
 
 

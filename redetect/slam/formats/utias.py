@@ -1,24 +1,15 @@
-"""Data sets of robots that measure ranges and bearings of landmarks, as runs, paths and maps.
+"""UTIAS (MRCLAM), robots that see barcodes of landmarks and each other: runs, paths and maps.
 
-UTIAS (MRCLAM): robots log velocities, and range and bearing to barcodes of landmarks and of each
-other. Victoria Park: a car between trees that its laser scanner sees; the robot frame is that of
-the scanner. Axes of both are X forward, Y left.
+Robots log velocities, and range and bearing. Their axes are X forward, Y left.
 
 References
 ----------
 K. Leung, Y. Halpern, T. Barfoot, H. Liu, "The UTIAS multi-robot cooperative localization and
 mapping dataset", International Journal of Robotics Research 30(8), 2011.
-J. E. Guivant, E. M. Nebot, "Optimization of the simultaneous localization and map-building
-algorithm for real-time implementation", IEEE Transactions on Robotics and Automation 17(3), 2001.
 """
 
 from __future__ import annotations
 
-import io
-import math
-import subprocess
-import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,13 +20,22 @@ from scipy.optimize import least_squares
 from redetect.array_types import FloatArray, IntArray
 from redetect.bounds import LARGEST_NUMBER
 from redetect.landmarks import wrap_angle
-from redetect.landmarks.axes import covariance_from_dataset, to_dataset
+from redetect.landmarks.axes import to_dataset
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D, no_landmarks
-from redetect.plane import apply, between, chain_steps, compose, invert
+from redetect.plane import apply, between, invert
 from redetect.slam.errors import SlamError
 from redetect.slam.formats import ranges
-from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, LineRows, Recording
-from redetect.storage.bounded import read_content, rows_of_numbers
+from redetect.slam.formats.motion_log import (
+    RAW_SIGMA_M,
+    RAW_SIGMA_RAD,
+    MotionLog,
+    demand_common_times,
+    demand_order,
+    names_of,
+    run_of,
+)
+from redetect.slam.recording import CircleRows, Recording
+from redetect.storage.bounded import rows_of_numbers
 
 #: Suffixes of the names of a robot's odometry and of the files beside it.
 ODOMETRY, MEASUREMENTS, TRUTH = "_Odometry.dat", "_Measurement.dat", "_Groundtruth.dat"
@@ -44,14 +44,10 @@ _ROBOTS = 5
 _LARGEST_ID = 2**31 - 1
 #: Most that the clock of a robot's log may go back, seconds.
 _SET_BACK_S = 1.0
-# A log has a gap if nothing is logged for this many of its usual intervals, and this time.
-_GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.5
 #: Largest bearing that a camera sees, radians.
 _WIDEST_RAD = 1.2
 #: Usual errors of these ranges, metres and as a share; of bearings.
 _USUAL_SIGMA_M, _USUAL_SHARE, _USUAL_SIGMA_RAD = 0.03, 0.02, 0.02
-#: The same without calibration, and of Victoria Park's trees.
-_RAW_SIGMA_M, _RAW_SIGMA_RAD = 0.1, 0.03
 #: Zeros between commands that last less than this are ignored, seconds.
 _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
@@ -61,74 +57,6 @@ _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
 _STEP = 1e-3
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
 _LATE_S = 0.08
-
-#: Dead reckoning (time in ms, speed, steering), and beside it scans (TLsr in ms, LASER in cm).
-DRIVE, SCANS = "aa3_dr.mat", "aa3_lsr2.mat"
-_LARGEST_BYTES = 1 << 28
-# Reads arrays of such a file, in a process of its own, which a damaged file may crash.
-_READER = """
-import io, sys, numpy, scipy.io
-found = scipy.io.loadmat(io.BytesIO(sys.stdin.buffer.read()), variable_names=sys.argv[1:])
-content = io.BytesIO()
-numpy.savez(content, **{name: found[name] for name in sys.argv[1:]})
-sys.stdout.buffer.write(content.getvalue())
-"""
-# The car: wheelbase, distance of the encoder from the middle, and the scanner's position (m).
-_AXLES_M, _ENCODER_M, _AHEAD_M, _LEFT_M = 2.83, 0.76, 3.78, 0.5
-_MOST_STEERING_RAD = 1.2
-_BEAMS = 361
-_RANGES_CM = 1 << 13
-_FARTHEST_M = 75.0
-# Largest range difference of neighbouring beams on a trunk, and least one to the background.
-_SAME_M, _BEHIND_M = 0.5, 1.5
-_LEAST_DIAMETER_M, _MOST_DIAMETER_M = 0.05, 1.0
-
-
-def _names(times: FloatArray) -> tuple[str, ...]:
-    """Names of frames: their times (s)."""
-    return tuple(f"{time:.3f}" for time in times)
-
-
-class _Log(NamedTuple):
-    """What a robot logged of its motion; each row holds until the next."""
-
-    times: FloatArray  # (k,): of the rows (s), ascending
-    #: Movements (n, 3), X forward, by rows (n,) that hold for some seconds (n,)
-    along: Callable[[IntArray, FloatArray], FloatArray]
-    late_s: float = 0.0  # standard deviation of the time at which the motion changes
-
-    def poses(self, times: FloatArray) -> FloatArray:
-        """Dead reckoning (n, 3) at some times (n,): the first row's pose is the origin."""
-        rows, since = self._held(times)
-        interval = np.diff(self.times)
-        poses = chain_steps(self.along(np.arange(len(interval)), interval))
-        return compose(poses[rows], self.along(rows, since))
-
-    def steps(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Movements (N, 3) between times (N + 1,).
-
-        Those in gaps of the log, before and after it, or with a change of motion, are more
-        uncertain than odometry is assumed to be and have a covariance (N, 3, 3); others zero.
-        """
-        poses, (rows, since) = self.poses(times), self._held(times)
-        steps = between(poses[:-1], poses[1:])
-        interval = np.append(np.diff(self.times), math.inf)
-        gap = interval > max(_GAP_INTERVALS * float(np.median(interval)), _LEAST_GAP_S)
-        silence_s = np.concatenate([[0.0], np.cumsum(np.where(gap, interval, 0.0)[:-1])])
-        early_s = np.minimum(times - self.times[0] + _LEAST_GAP_S, 0.0)
-        silent_s = np.diff(early_s + silence_s[rows] + since * gap[rows])[:, None]
-        rates = self.along(np.arange(len(gap)), np.ones(len(gap)))
-        # Before the first row there is no motion.
-        late = self.late_s * np.diff(rates[rows] * (times >= self.times[0])[:, None], axis=0)
-        more = silent_s**2 * np.var(rates, axis=0) + late**2
-        usual = ASSUMED.covariance(steps)
-        stated = np.any(more > np.diagonal(usual, axis1=1, axis2=2), axis=1)
-        return steps, (usual + more[:, None] * np.eye(3)) * stated[:, None, None]
-
-    def _held(self, times: FloatArray) -> tuple[IntArray, FloatArray]:
-        """The rows (n,) that hold at some times, and since how many seconds; 0 before the first."""
-        rows = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, None)
-        return rows, np.maximum(times - self.times[rows], 0.0)
 
 
 def _seen_by_robot(odometry: Path, *, calibrated: bool) -> ranges.Sightings:
@@ -187,7 +115,7 @@ class Response(NamedTuple):
 _RESPONSE_SIGMA = Response(0.25, 0.1, 0.1, 0.02)
 
 
-def read_utias(
+def read_run(
     odometry: Path,
     sigma_m: float | None = None,
     sigma_rad: float | None = None,
@@ -206,9 +134,9 @@ def read_utias(
     """
     velocity = _log(odometry, "time v omega")
     seen = _seen_by_robot(odometry, calibrated=calibrated)
-    _demand_together(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
-    usual_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m) if calibrated else _RAW_SIGMA_M
-    usual_rad = _USUAL_SIGMA_RAD if calibrated else _RAW_SIGMA_RAD
+    demand_common_times(odometry, velocity[:, 0], _beside(odometry, MEASUREMENTS), seen.times)
+    usual_m = np.hypot(_USUAL_SIGMA_M, _USUAL_SHARE * seen.range_m) if calibrated else RAW_SIGMA_M
+    usual_rad = _USUAL_SIGMA_RAD if calibrated else RAW_SIGMA_RAD
     sigma = np.empty((len(seen.ids), 2))
     sigma[:, 0] = usual_m if sigma_m is None else sigma_m
     sigma[:, 1] = usual_rad if sigma_rad is None else sigma_rad
@@ -224,7 +152,7 @@ def read_utias(
         log = _robot_log(velocity, response)
     steps, spread = log.steps(np.append(min(velocity[0, 0], seen.times[0]), seen.times))
     rows = ranges.discs_of_ranges(seen.range_m, seen.bearing_rad, *sigma.T)
-    run = _run(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
+    run = run_of(seen.times, steps, spread, CircleRows(seen.frame, *rows, seen.ids))
     if calibrated and sigma_m is None and sigma_rad is None:
         run, noise = ranges.estimate_noise(run, seen, sigma)
     elif calibrated and sigma_m is None:
@@ -297,26 +225,18 @@ def _in_succession(order: IntArray, time: FloatArray) -> tuple[IntArray, IntArra
     return order[:-1][near], order[1:][near]
 
 
-def _run(
-    times: FloatArray, steps: FloatArray, covariance: FloatArray, rows: CircleRows
-) -> Recording:
-    """A run of movements (N, 3), X forward, before frames at some times (N,)."""
-    spread = covariance_from_dataset(covariance, back=True)
-    return Recording(_names(times), to_dataset(steps), spread, rows, LineRows.of())
-
-
 def read_truth(odometry: Path) -> tuple[Path2D, int]:
     """True poses at a robot's start and its frames; how many lie outside: these are the nearest."""
     times = _seen_by_robot(odometry, calibrated=False).times
     logged = _log(odometry, "time v omega")
     truth = _log(_beside(odometry, TRUTH), "time x y theta")
-    _demand_together(odometry, logged[:, 0], _beside(odometry, MEASUREMENTS), times)
-    _demand_together(odometry, times, _beside(odometry, TRUTH), truth[:, 0])
+    demand_common_times(odometry, logged[:, 0], _beside(odometry, MEASUREMENTS), times)
+    demand_common_times(odometry, times, _beside(odometry, TRUTH), truth[:, 0])
     at = np.concatenate([[min(logged[0, 0], times[0])], times])
     repeated = int(np.count_nonzero((at < truth[0, 0]) | (at > truth[-1, 0])))
     columns = (truth[:, 1], truth[:, 2], np.unwrap(truth[:, 3]))
     poses = np.stack([np.interp(at, truth[:, 0], column) for column in columns], axis=1)
-    return Path2D(("start", *_names(times)), to_dataset(poses)), repeated
+    return Path2D(("start", *names_of(times)), to_dataset(poses)), repeated
 
 
 def read_landmarks(path: Path) -> LandmarkMap:
@@ -343,7 +263,7 @@ def _without_short_stops(velocity: FloatArray) -> FloatArray:
     return np.asarray(velocity[~np.repeat(dropped, end - first)])
 
 
-def _robot_log(velocity: FloatArray, response: Response | None = None) -> _Log:
+def _robot_log(velocity: FloatArray, response: Response | None = None) -> MotionLog:
     """The log of commands (k, 3), as the robot follows them; arcs are approximated by chords."""
     lag_s, speed_share, turn_share, _ = response or (0.0, 1.0, 1.0, 1.0)
     time, speed, turn_rate = (velocity * [1.0, speed_share, turn_share]).T
@@ -353,31 +273,17 @@ def _robot_log(velocity: FloatArray, response: Response | None = None) -> _Log:
         chord = speed[held] * duration * np.sinc(turn / (2.0 * np.pi))
         return np.stack([chord * np.cos(turn / 2.0), chord * np.sin(turn / 2.0), turn], axis=1)
 
-    return _Log(time + lag_s, along, 0.0 if response is None else _LATE_S)
+    return MotionLog(time + lag_s, along, 0.0 if response is None else _LATE_S)
 
 
 def _beside(odometry: Path, ending: str) -> Path:
     return odometry.with_name(odometry.name.removesuffix(ODOMETRY) + ending)
 
 
-def _demand_order(path: Path, times: FloatArray, slack: float = 0.0) -> None:
-    """Raise `SlamError` if times go back by more than some slack."""
-    for k in np.flatnonzero(np.diff(times) < -slack)[:1]:
-        found = f"{times[k + 1]:.3f} follows {times[k]:.3f}"
-        raise SlamError(f"{path}: {found}: expected ascending times")
-
-
-def _demand_together(one: Path, first: FloatArray, other: Path, second: FloatArray) -> None:
-    """Raise `SlamError` unless the times in two files, in order, overlap."""
-    parts = [f"{t[0]:.3f} to {t[-1]:.3f}" if len(t) else "none" for t in (first, second)]
-    if "none" in parts or max(first[0], second[0]) > min(first[-1], second[-1]):
-        raise SlamError(f"{one}: times {parts[0]}, {other.name}: {parts[1]}: expected common ones")
-
-
 def _log(path: Path, names: str) -> FloatArray:
     """The numbers of a file, by time. A clock that a network sets may go back by some of it."""
     table = _table(path, names)
-    _demand_order(path, table[:, 0], _SET_BACK_S)
+    demand_order(path, table[:, 0], _SET_BACK_S)
     return table[np.argsort(table[:, 0], kind="stable")]
 
 
@@ -394,82 +300,3 @@ def _whole(path: Path, name: str, numbers: FloatArray) -> IntArray:
     for number in numbers[(numbers % 1.0 != 0.0) | (numbers < 0.0) | (numbers > _LARGEST_ID)][:1]:
         raise SlamError(f"{path}: {name} {number:g}: expected a whole number, 0 to {_LARGEST_ID}")
     return numbers.astype(np.int64)
-
-
-def read_victoria_park(
-    drive: Path, sigma_m: float | None = None, sigma_rad: float | None = None
-) -> Recording:
-    """The car's log, with the trees found in its scans as discs; see `read_utias`."""
-    time, speed, steering = _arrays(drive, ("time", "speed", "steering"))
-    scanned, laser = _arrays(drive.with_name(SCANS), ("TLsr", "LASER"))
-    time, speed, steering, scanned = (a.ravel() for a in (time, speed, steering, scanned))
-    if len({len(time), len(speed), len(steering)}) != 1 or laser.shape != (len(scanned), _BEAMS):
-        raise SlamError(f"{drive}: expected rows of equal number, and scans of {_BEAMS} beams")
-    if np.any(np.abs(steering) > _MOST_STEERING_RAD):
-        raise SlamError(f"{drive}: steering: expected angles within +-{_MOST_STEERING_RAD:g} rad")
-    _demand_order(drive, time)
-    _demand_order(drive.with_name(SCANS), scanned)
-    _demand_together(drive, time, drive.with_name(SCANS), scanned)
-    usable = scanned >= time[0]
-    # The upper bits of a range are the intensity.
-    times, scans = scanned[usable] / 1000.0, (laser[usable] % _RANGES_CM) / 100.0
-    found = [trees_of(scan) for scan in scans]
-    trees = np.concatenate([np.zeros((0, 2)), *found])
-    frame = np.repeat(np.arange(len(found)), [len(some) for some in found])
-    of_ranges = _RAW_SIGMA_M if sigma_m is None else sigma_m
-    of_bearings = _RAW_SIGMA_RAD if sigma_rad is None else sigma_rad
-    rows = ranges.discs_of_ranges(trees[:, 0], trees[:, 1], of_ranges, of_bearings)
-    log = _car_log(time / 1000.0, speed, steering)
-    steps = log.steps(np.append(log.times[0], times))
-    return _run(times, *steps, CircleRows(frame, *rows, np.full(len(trees), UNKNOWN_ID)))
-
-
-def trees_of(scan: FloatArray) -> FloatArray:
-    """Ranges and bearings (n, 2) of trunks in a scan (361,): runs of beams of nearly equal range
-    with a distant background.
-    """
-    edges = np.flatnonzero(np.abs(np.diff(scan)) > _SAME_M) + 1
-    starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(scan)]])
-    # Trunks at the scan's border are skipped, since their width is unknown.
-    before = np.concatenate([[0.0], scan[starts[1:] - 1]])
-    after = np.concatenate([scan[ends[:-1]], [0.0]])
-    found = []
-    for first, last, right, left in zip(starts, ends, before, after):
-        reach = float(np.mean(scan[first:last]))
-        diameter = reach * np.radians(0.5 * (last - first))
-        alone = min(right, left) > reach + _BEHIND_M
-        if alone and reach < _FARTHEST_M and _LEAST_DIAMETER_M < diameter < _MOST_DIAMETER_M:
-            bearing_rad = np.radians(0.25 * (first + last - 1) - 90.0)
-            found.append((reach + 0.125 * np.pi * diameter, bearing_rad))
-    return np.array(found, dtype=np.float64).reshape(-1, 2)
-
-
-def _car_log(time: FloatArray, speed: FloatArray, steering: FloatArray) -> _Log:
-    """The scanner's log, from times (s), the speed of a rear wheel and the steering."""
-
-    def along(held: IntArray, duration: FloatArray) -> FloatArray:
-        slope = np.tan(steering[held])
-        distance = speed[held] / (1.0 - slope * _ENCODER_M / _AXLES_M) * duration
-        turn = distance / _AXLES_M * slope
-        return np.stack([distance - turn * _LEFT_M, turn * _AHEAD_M, turn], axis=1)
-
-    return _Log(time, along)
-
-
-def _arrays(path: Path, names: tuple[str, ...]) -> list[FloatArray]:
-    content = read_content(path, _LARGEST_BYTES, "MATLAB file", SlamError)
-    reader = subprocess.run(
-        [sys.executable, "-c", _READER, *names], input=content, capture_output=True, check=False
-    )
-    try:
-        found = np.load(io.BytesIO(reader.stdout))
-        arrays = [np.asarray(np.real_if_close(found[name]), np.float64) for name in names]
-    except Exception as error:  # damage can raise almost any
-        why = reader.stderr.decode(errors="replace").strip().rpartition("\n")[2] or error
-        raise SlamError(
-            f"{path}: cannot be read ({why}): expected a MATLAB file with {', '.join(names)}"
-        ) from None
-    for name, values in zip(names, arrays):
-        if not np.all(np.abs(values) <= LARGEST_NUMBER):
-            raise SlamError(f"{path}: {name}: expected numbers within +-{LARGEST_NUMBER:g}")
-    return arrays
