@@ -20,8 +20,8 @@ from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
 from redetect.least_squares import LossKind
 from redetect.messages import excerpt, keywords_named, path_of
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import FilterRun
 from redetect.slam.filters.localizer import localize_by_flags
+from redetect.slam.filters.run import FilterRun
 from redetect.slam.mapping.run_map import MappedRun, map_run_by_flags
 from redetect.slam.models import OdometryNoise
 from redetect.slam.options import Localize, Map

@@ -13,9 +13,9 @@ from scipy.stats import chi2
 from redetect.array_types import FloatArray
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks
-from redetect.slam.filters.base import FilterRun, run_filter
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import Localizer
+from redetect.slam.filters.run import FilterRun, run_filter
 from redetect.slam.models import common_tilt_jacobian, disc_in_robot
 from redetect.slam.recording import LineRows
 from tests.slam.small_run import CAMERA_XY, SmallRun, small_run

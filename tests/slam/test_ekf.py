@@ -11,8 +11,9 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.plane import apply
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Associator, Prediction
+from redetect.slam.filters.base import Prediction
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.run import Associator
 from redetect.slam.models import disc_in_robot, disc_jacobians, move, move_jacobians
 from redetect.slam.recording import LineRows, Recording
 from tests.slam.ekf_rows import circle_rows, localizer, rows_of, spd

@@ -8,8 +8,9 @@ from scipy.linalg import block_diag
 
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Associator, FrameRows
+from redetect.slam.filters.base import FrameRows
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
+from redetect.slam.filters.run import Associator
 from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,

@@ -20,7 +20,8 @@ from redetect.landmarks.map_file import (
 from redetect.slam.cli import main
 from redetect.slam.commands.filters import lost_lines
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import FilterRun, RowCount
+from redetect.slam.filters.base import RowCount
+from redetect.slam.filters.run import FilterRun
 from redetect.slam.recording import LineRows, Recording
 from redetect.slam.scoring import map_distance, path_distance
 from tests.slam.ekf_rows import circle_rows

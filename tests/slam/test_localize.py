@@ -12,8 +12,8 @@ from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Associator, frames_of, run_filter
 from redetect.slam.filters.localizer import Localizer
+from redetect.slam.filters.run import Associator, frames_of, run_filter
 from redetect.slam.models import (
     bearing_jacobians,
     bearing_of_vertical,

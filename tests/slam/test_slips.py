@@ -12,9 +12,9 @@ from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, no_landmarks
 from redetect.slam.association.run import associate_run
 from redetect.slam.association.scoring import score_association
-from redetect.slam.filters.base import Associator
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_run
+from redetect.slam.filters.run import Associator
 from tests.slam.small_run import SmallRun, small_run
 
 _DISCS = 20

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray, IntArray
 from redetect.slam.association.compatibility import compatible
-from redetect.slam.filters.base import FrameRows, after_slip, frames_of, known_discs
+from redetect.slam.filters.base import FrameRows
 from redetect.slam.filters.ekf_slam import EkfSlam
+from redetect.slam.filters.run import after_slip, frames_of, known_discs
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import AssociateSettings
 

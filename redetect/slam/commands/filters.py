@@ -13,9 +13,9 @@ from redetect import __version__
 from redetect.landmarks import map_file
 from redetect.slam.commands import files
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Associator, FilterRun
 from redetect.slam.filters.ekf_slam import EkfSlam, run_ekf
 from redetect.slam.filters.localizer import localize_by_flags
+from redetect.slam.filters.run import Associator, FilterRun
 from redetect.slam.options import Ekf, Localize
 from redetect.slam.pictures import demand_windows, draw_errors, draw_map
 from redetect.slam.recording import Recording, camera_xy_of

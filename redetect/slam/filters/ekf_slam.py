@@ -29,6 +29,7 @@ from redetect.landmarks.map_file import LandmarkMap, MapLandmarks
 from redetect.plane import apply, rotation
 from redetect.slam.errors import SlamError
 from redetect.slam.filters import base
+from redetect.slam.filters.run import BY_IDENTIFIERS, Associator, FilterRun, frames_of, run_filter
 from redetect.slam.models import common_tilt_jacobian, move, tilt_jacobian
 from redetect.slam.recording import NO_CAMERA, LineRows, Recording
 
@@ -221,9 +222,7 @@ def _first_rows(ids: Sequence[tuple[int, ...]]) -> BoolArray:
     return chosen
 
 
-def run_ekf(
-    recording: Recording, ekf: EkfSlam, pairing: base.Associator = base.BY_IDENTIFIERS
-) -> base.FilterRun:
+def run_ekf(recording: Recording, ekf: EkfSlam, pairing: Associator = BY_IDENTIFIERS) -> FilterRun:
     """`run_filter` with EKF-SLAM, which contains the map afterwards.
 
     If identities have to be found, discs far from all others are new ones, numbered from 1. Lines
@@ -234,7 +233,7 @@ def run_ekf(
             f"association {pairing.method} with lines: EKF-SLAM finds identities of discs only: "
             "expected known association, or a run without lines"
         )
-    return base.run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
+    return run_filter(recording, ekf, replace(pairing, new_id=count(1).__next__))
 
 
 def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -252,7 +251,7 @@ def filtered_poses(recording: Recording, start: ArrayLike = (0.0, 0.0, 0.0)) -> 
     poses = np.empty((len(recording) + 1, 3))
     poses[0] = start
     ekf, seen = EkfSlam(poses[0]), dict[int, int]()
-    for k, rows in enumerate(base.frames_of(recording)):
+    for k, rows in enumerate(frames_of(recording)):
         if k in lost:
             ekf, seen = EkfSlam(move(poses[k], recording.steps[k])), {}
         else:

@@ -21,15 +21,8 @@ from scipy.linalg import block_diag
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import (
-    BY_IDENTIFIERS,
-    POSE_SIZE,
-    Associator,
-    Filter,
-    FilterRun,
-    FrameRows,
-    run_filter,
-)
+from redetect.slam.filters.base import POSE_SIZE, Filter, FrameRows
+from redetect.slam.filters.run import BY_IDENTIFIERS, Associator, FilterRun, run_filter
 from redetect.slam.options import Localize
 from redetect.slam.recording import NO_CAMERA, Recording, camera_xy_of
 
