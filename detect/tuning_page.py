@@ -33,7 +33,8 @@ from detect.runs.frame import detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings
 from detect.settings_files import checked_settings, settings_text
-from detect.sources.interface import Run, RunFrame, read_image
+from detect.sources.grey_images import read_image
+from detect.sources.interface import Run, RunFrame
 from redetect.array_types import GreyImage
 from redetect.json_text import json_text
 from redetect.landmarks import CircleLandmark, Frame

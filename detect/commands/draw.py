@@ -19,8 +19,9 @@ from detect.options import Draw
 from detect.row_files import RunRows, open_rows
 from detect.runs.frame import detect_batch, vertical_table_of
 from detect.runs.plan import FramePlan, FrameTask
+from detect.sources.grey_images import read_image
 from detect.sources.image_files import demand_pictures, picture_name
-from detect.sources.interface import ImageRun, Run, RunFrame, SomeFrames, read_image
+from detect.sources.interface import ImageRun, Run, RunFrame, SomeFrames
 from detect.sources.opening import demand_recording, open_source
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import ByteArray, GreyImage

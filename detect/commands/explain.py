@@ -12,7 +12,8 @@ from detect.errors import DetectError
 from detect.explanation import DiscExplanation, explain_discs
 from detect.options import Explain
 from detect.runs.outputs import lean_sentence
-from detect.sources.interface import RunFrame, read_image, still
+from detect.sources.grey_images import read_image
+from detect.sources.interface import RunFrame, still
 from redetect.messages import counted
 from redetect.storage import demand_place, write_bytes
 

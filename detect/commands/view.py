@@ -15,7 +15,8 @@ from detect.errors import DetectError, FrameError
 from detect.options import View
 from detect.projection import circle_on_floor, summed_steps
 from detect.row_files import ImageRows, open_rows
-from detect.sources.interface import SomeFrames, read_image
+from detect.sources.grey_images import read_image
+from detect.sources.interface import SomeFrames
 from detect.sources.opening import demand_recording, open_run
 from detect.terminal import progress_bar, report_failures
 from redetect.array_types import FloatArray

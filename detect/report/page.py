@@ -19,8 +19,9 @@ from detect.options import RowFiles
 from detect.projection import DiscProjection, summed_steps
 from detect.report import figures
 from detect.row_files import ImageRows, RunRows, open_rows
+from detect.sources.grey_images import read_image
 from detect.sources.image_files import image_name, picture_name
-from detect.sources.interface import ImageRun, Run, RunFrame, read_image
+from detect.sources.interface import ImageRun, Run, RunFrame
 from redetect import __version__
 from redetect.landmarks import circle_arrays
 from redetect.messages import counted

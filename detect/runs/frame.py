@@ -36,7 +36,7 @@ from detect.runs.plan import (
     time_row,
 )
 from detect.settings import CircleSettings
-from detect.sources.interface import read_image
+from detect.sources.grey_images import read_image
 from lut import VerticalTable, cached_vertical_table, cached_vote_table
 from redetect.array_types import GreyImage
 from redetect.interrupts import interrupts_deferred

@@ -12,7 +12,8 @@ from detect.errors import DetectError, FrameError
 from detect.projection import leaning_camera
 from detect.runs.plan import Job, Priors, RunSummary
 from detect.settings import UNREFINED, CircleSettings
-from detect.sources.interface import Run, read_image, spread_frames
+from detect.sources.grey_images import read_image
+from detect.sources.interface import Run, spread_frames
 from redetect.array_types import ByteArray, GreyImage
 from redetect.messages import counted
 

@@ -26,7 +26,8 @@ from camera.errors import ConversionError
 from camera.formats.conversion import convert_to_camera
 from camera.formats.yaml_files import camera_of_info
 from detect.errors import DetectError, FrameError
-from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
+from detect.sources.grey_images import grey_of_pixels
+from detect.sources.interface import RunFrame, Source, numbered_prefix, still
 from detect.sources.poses import FARTHEST, PoseStream, TimedPose, carried, heading_rad
 from redetect.array_types import FloatArray
 from redetect.landmarks import wrap_angle
@@ -177,7 +178,7 @@ def pixels_of_message(message: Any, name: object) -> NDArray[Any]:
 def content_of_message(message: Any, name: object) -> bytes | NDArray[Any]:
     """The grey values of a `sensor_msgs/Image`, or the file in a `sensor_msgs/CompressedImage`."""
     if not hasattr(message, "format"):
-        return gray_of_pixels(pixels_of_message(message, name), name)
+        return grey_of_pixels(pixels_of_message(message, name), name)
     if "compressedDepth" in message.format:
         raise FrameError(f"{name}: format {excerpt(message.format)}: expected jpeg, png or tiff")
     return bytes(message.data)

@@ -11,8 +11,9 @@ from pathlib import Path
 from camera import Camera, read_camera
 from detect.errors import DetectError
 from detect.options import SourceOptions
+from detect.sources.grey_images import bit_depth_of
 from detect.sources.image_files import WILDCARDS, ImageFiles
-from detect.sources.interface import Frames, ImageRun, Run, SomeFrames, Source, bit_depth_of
+from detect.sources.interface import Frames, ImageRun, Run, SomeFrames, Source
 from detect.sources.poses import FramesAlongPoses, PoseStream, tick_poses, tum_poses, velocity_poses
 from detect.sources.video import LiveCamera, VideoFile
 from redetect.landmarks import LandmarkError, read_steps

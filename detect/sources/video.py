@@ -19,7 +19,8 @@ from pathlib import Path
 import cv2
 
 from detect.errors import DetectError
-from detect.sources.interface import RunFrame, Source, gray_of_pixels, numbered_prefix, still
+from detect.sources.grey_images import grey_of_pixels
+from detect.sources.interface import RunFrame, Source, numbered_prefix, still
 from redetect.interrupts import interrupts_call
 from redetect.storage.images import opened_video, quiet_opencv
 
@@ -51,8 +52,8 @@ class VideoFile(Source):
                 if time_s <= last_s and per_second > 0.0:  # a container without timestamps
                     time_s = number / per_second
                 prefix = numbered_prefix(self.path.stem, number)
-                gray = gray_of_pixels(pixels, f"{self.name}: {prefix}")
-                yield RunFrame(still(prefix), None, gray, time_s)
+                grey = grey_of_pixels(pixels, f"{self.name}: {prefix}")
+                yield RunFrame(still(prefix), None, grey, time_s)
                 last_s = time_s
         if self.expected is not None and number < self.expected:
             _log.info(f"{self.name}: only {number} of {self.expected} frames can be read")
@@ -97,7 +98,7 @@ class LiveCamera(Source):
                         _log.info("the camera yields no more images: writing the results so far")
                         return
                     prefix = numbered_prefix(f"camera{self._index}", number)
-                    yield RunFrame(still(prefix), None, gray_of_pixels(pixels, prefix), time_s)
+                    yield RunFrame(still(prefix), None, grey_of_pixels(pixels, prefix), time_s)
         finally:
             capture.release()
 

@@ -24,7 +24,8 @@ from detect.row_files import ImageRows
 from detect.runs.frame import FrameDetections, detect_batch
 from detect.runs.plan import FramePlan, FrameTask
 from detect.settings import CircleSettings, Polarity
-from detect.sources.interface import RunFrame, frame_prefix, read_image, still
+from detect.sources.grey_images import read_image
+from detect.sources.interface import RunFrame, frame_prefix, still
 from redetect.array_types import FloatArray
 from redetect.json_text import json_text
 from redetect.landmarks import Frame, FrameTilt, Step

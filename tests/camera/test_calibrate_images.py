@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from camera import Camera, CameraError
 from camera.boards.board import Board
 from camera.commands.calibrate import calibration_images
-from detect.sources.interface import decode_gray
+from detect.sources.grey_images import decode_grey
 from detect.sources.video import VideoFile
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, view_of_board
@@ -43,7 +43,7 @@ def test_how_a_telephone_was_held_turns_no_picture(tmp_path: Path, orientation: 
     assert turned is not None
     assert not np.array_equal(turned, upright)  # what OpenCV does unless told
     np.testing.assert_array_equal(read_grey(path, CameraError), upright)
-    np.testing.assert_array_equal(decode_gray(path.read_bytes(), path), upright)
+    np.testing.assert_array_equal(decode_grey(path.read_bytes(), path), upright)
 
 
 def held_tiff(picture: NDArray[Any], orientation: int, order: str, kind: int = 3) -> bytes:
@@ -74,7 +74,7 @@ def test_nor_does_what_a_tiff_says_of_it(
     picture = grey.astype(np.uint16) * 256 if deep else grey
     path = tmp_path / "a.tif"
     path.write_bytes(held_tiff(picture, orientation, order))
-    np.testing.assert_array_equal(decode_gray(path.read_bytes(), path, (32, 24)), picture)
+    np.testing.assert_array_equal(decode_grey(path.read_bytes(), path, (32, 24)), picture)
     if not deep:  # those are stretched to the full range
         np.testing.assert_array_equal(read_grey(path, CameraError), grey)
 

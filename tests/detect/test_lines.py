@@ -23,7 +23,7 @@ from detect.line_settings import DEFAULT, PUBLISHED, REPORT, LineSettings
 from detect.lines import ACCEPTED, JOINED, detect_lines
 from detect.projection import DiscProjection, leaning_camera
 from detect.row_files import ImageRows
-from detect.sources.interface import decode_gray
+from detect.sources.grey_images import decode_grey
 from lut.verticals import build_vertical_table
 from redetect.landmarks import Frame, LineLandmark, Step
 from tests.detect.line_scene import (
@@ -259,7 +259,7 @@ def test_the_rows_that_the_report_prints(shared_data: Path) -> None:
     assert len(printed) == 8
     for entry in printed:
         path = folder / "images" / f"dlr-spatial_cognition-{entry['step']}.jpg"
-        found = detect_lines(decode_gray(path.read_bytes(), path), table, PUBLISHED)
+        found = detect_lines(decode_grey(path.read_bytes(), path), table, PUBLISHED)
         row = parse_record(entry["row"])
         assert isinstance(row, LineLandmark)
         nearest = int(np.argmin([abs(line.alpha - row.alpha) for line in found.landmarks()]))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from camera import Camera, CameraError
 from detect.errors import FrameError
-from detect.sources.interface import RunFrame, read_image
+from detect.sources.grey_images import read_image
+from detect.sources.interface import RunFrame
 from detect.sources.opening import open_run
 from redetect.landmarks import Step
 

@@ -19,7 +19,7 @@ from tests.groundtruth.comparison import compare_streams
 def test_the_demo_sessions_poses_are_true(project_root: Path, tmp_path: Path) -> None:
     from detect.markers.detect import detect_markers
     from detect.settings import MarkerSettings
-    from detect.sources.interface import read_image
+    from detect.sources.grey_images import read_image
     from detect.sources.opening import open_run
 
     session = tmp_path / "m"

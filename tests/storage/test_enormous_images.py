@@ -13,7 +13,7 @@ import pytest
 from camera import Camera, CameraError
 from camera.boards.board import Board
 from detect.errors import FrameError
-from detect.sources.interface import decode_gray
+from detect.sources.grey_images import decode_grey
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.markers.boards import BoardImage, view_of_board
 from redetect.storage.images import MOST_PIXELS, claimed_size, read_grey
@@ -52,7 +52,7 @@ def test_chunks_of_a_png_that_claim_gigabytes(tmp_path: Path, chunk: bytes, deep
     with pytest.raises(CameraError, match="cannot be decoded: expected an image"):
         read_grey(path, CameraError)
     with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
-        decode_gray(bytes(content), path, (8, 8))
+        decode_grey(bytes(content), path, (8, 8))
 
 
 def test_pictures_of_other_kinds_of_numbers(tmp_path: Path) -> None:

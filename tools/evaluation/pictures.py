@@ -21,7 +21,7 @@ from detect.markers.candidates import closing, dark_pixels
 from detect.markers.detect import detect_markers
 from detect.projection import circle_on_floor, summed_steps
 from detect.settings import CircleSettings, MarkerSettings
-from detect.sources.interface import read_image
+from detect.sources.grey_images import read_image
 from detect.sources.opening import open_run
 from lut import cached_disc_table, cached_vertical_table
 from lut.outlines import floor_positions, row_step_m

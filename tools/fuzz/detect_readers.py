@@ -19,7 +19,7 @@ from detect.errors import DetectError, FrameError
 from detect.row_files import circle_settings_of
 from detect.runs.journal import Journal
 from detect.sources.bag import pixels_of_message
-from detect.sources.interface import bounded_content, decode_gray, eight_bits, gray_of_pixels
+from detect.sources.grey_images import bounded_content, decode_grey, eight_bits, grey_of_pixels
 from detect.sources.poses import TimedPose, step_between, tick_poses, tum_poses, velocity_poses
 from lut import build_vertical_table
 from lut.cache import cached_vertical_table
@@ -54,7 +54,7 @@ def _header(path: Path) -> object:
 def _image(path: Path) -> object:
     """As frames are decoded."""
     content = bounded_content(path, path, _SIZE)
-    image = eight_bits(decode_gray(content, path, _SIZE), path)
+    image = eight_bits(decode_grey(content, path, _SIZE), path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image
@@ -94,7 +94,7 @@ def _image_message(path: Path) -> object:
         height=height, width=width, step=step, is_bigendian=big,
         encoding=encoding.decode("utf-8", "replace"), data=np.frombuffer(data, np.uint8),
     )  # fmt: skip
-    image = eight_bits(gray_of_pixels(pixels_of_message(message, path), path), path)
+    image = eight_bits(grey_of_pixels(pixels_of_message(message, path), path), path)
     assert image.dtype == np.uint8
     assert image.ndim == 2
     return image

@@ -24,7 +24,8 @@ from detect.options import SourceOptions
 from detect.ros_messages import TOPICS, Values, header_of, ros_messages, transform_of
 from detect.settings_files import SettingsFile, read_settings
 from detect.sources.bag import content_of_message
-from detect.sources.interface import RunFrame, read_image, still
+from detect.sources.grey_images import read_image
+from detect.sources.interface import RunFrame, still
 from redetect.landmarks.axes import from_dataset
 from redetect.landmarks.columns import TableName, values_of
 

@@ -13,7 +13,8 @@ import pytest
 
 from camera import Camera
 from detect.errors import FrameError
-from detect.sources.interface import RunFrame, bounded_content, decode_gray, read_image
+from detect.sources.grey_images import bounded_content, decode_grey, read_image
+from detect.sources.interface import RunFrame
 from redetect.landmarks import Step
 from redetect.storage.images import MOST_PIXELS, claimed_size
 from tests.detect.commands import output_of
@@ -76,7 +77,8 @@ _PEAK = """
 import re, sys
 from pathlib import Path
 from detect.errors import FrameError
-from detect.sources.interface import RunFrame, read_image
+from detect.sources.interface import RunFrame
+from detect.sources.grey_images import read_image
 from redetect.landmarks import Step
 import cv2
 
@@ -135,13 +137,13 @@ def test_a_folder_leaves_no_descriptor_behind(tmp_path: Path) -> None:
 def test_an_image_with_its_sides_exchanged_is_refused_by_its_header() -> None:
     # None is turned, whatever it says of how its camera was held.
     sides = cv2.imencode(".png", np.resize(TEXTURE, (288, 768)))[1].tobytes()
-    assert decode_gray(sides, "a", (768, 288)).shape == (288, 768)
+    assert decode_grey(sides, "a", (768, 288)).shape == (288, 768)
     for size in ((288, 768), (288, 767)):
         with pytest.raises(FrameError, match=f"is 288x{size[1]} px: expected 768x288"):
-            decode_gray(png(*size), "a", (768, 288))
+            decode_grey(png(*size), "a", (768, 288))
 
 
 @pytest.mark.parametrize("content", [b"RIFF0000WEBPVP8 ", b"GIF89a", b"\0\0\0\x0cjP  ", b"P6 junk"])
 def test_other_kinds_are_no_images_of_a_run(content: bytes) -> None:
     with pytest.raises(FrameError, match="cannot be decoded: expected an image"):
-        decode_gray(content + bytes(100), "a", None)
+        decode_grey(content + bytes(100), "a", None)

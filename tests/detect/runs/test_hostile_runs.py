@@ -12,7 +12,7 @@ import pytest
 from camera import Camera
 from detect.cli import main
 from detect.errors import FrameError
-from detect.sources.interface import read_image
+from detect.sources.grey_images import read_image
 from detect.sources.opening import open_run
 from redetect.landmarks import read_frames
 from tests.detect.commands import Captured

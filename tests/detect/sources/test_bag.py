@@ -22,7 +22,7 @@ from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.options import SourceOptions
 from detect.sources.bag import pixels_of_message
-from detect.sources.interface import eight_bits, gray_of_pixels, read_image
+from detect.sources.grey_images import eight_bits, grey_of_pixels, read_image
 from detect.sources.opening import open_source
 from detect.sources.poses import TimedPose, step_between
 from redetect.landmarks import Frame, Step, format_frame, read_frames, read_steps
@@ -111,7 +111,7 @@ def test_steps_and_covariances_of_odometry_come_back(tmp_path: Path) -> None:
     """A drive of known steps, whose covariance has grown as odometry's does."""
     rng = np.random.default_rng(4)
     ros = Ros()
-    gray = np.zeros((4, 6), np.uint8)
+    grey = np.zeros((4, 6), np.uint8)
     pose, covariance = np.array([3.0, -2.0, 1.0]), 1e-3 * np.diag([1.0, 2.0, 3.0])
     said, moves = [], []
     for k in range(12):
@@ -129,7 +129,7 @@ def test_steps_and_covariances_of_odometry_come_back(tmp_path: Path) -> None:
         said.append(
             Said("/odom", time_s, ros.odometry(pose[0], pose[1], pose[2], time_s, covariance))
         )
-        said.append(Said("/image", time_s, ros.image(gray, "mono8", time_s)))
+        said.append(Said("/image", time_s, ros.image(grey, "mono8", time_s)))
     frames = list(open_source(ros.write(tmp_path / "drive", said)).frames)
     assert len(frames) == 12
     c = STEP_COVARIANCE
@@ -305,9 +305,9 @@ def test_encodings(
         padding = 4
     message = Ros().image(pixels, encoding, 1.0, padding=padding)
     found = pixels_of_message(message, "image")
-    gray = eight_bits(gray_of_pixels(found, "image"), "image")
-    assert gray.dtype == np.uint8
-    assert np.abs(gray.astype(int) - expected).max() <= (1 if encoding == "rgb16" else 0)
+    grey = eight_bits(grey_of_pixels(found, "image"), "image")
+    assert grey.dtype == np.uint8
+    assert np.abs(grey.astype(int) - expected).max() <= (1 if encoding == "rgb16" else 0)
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
@@ -320,9 +320,9 @@ def test_bayer_patterns(pattern: str, deep: bool) -> None:
     if deep:
         mosaic <<= 8
     message = Ros().image(mosaic, f"bayer_{pattern}{16 if deep else 8}", 1.0)
-    gray = eight_bits(gray_of_pixels(pixels_of_message(message, "image"), "image"), "image")
+    grey = eight_bits(grey_of_pixels(pixels_of_message(message, "image"), "image"), "image")
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 50
-    assert np.abs(gray[2:-2, 2:-2] - expected).max() <= 1.0
+    assert np.abs(grey[2:-2, 2:-2] - expected).max() <= 1.0
 
 
 @pytest.mark.parametrize("encoding", ["32FC1", "nv21", "bayer_xyzw8", "", "mono"])

@@ -12,7 +12,7 @@ import pytest
 from detect.cli import main
 from detect.errors import DetectError, FrameError
 from detect.options import SourceOptions
-from detect.sources.interface import read_image
+from detect.sources.grey_images import read_image
 from detect.sources.opening import open_source
 from tests.detect.commands import Captured
 from tools.ros_bags import Ros, Said

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from detect.cli import main
 from detect.options import SourceOptions
 from detect.sources import video as live
-from detect.sources.interface import read_image
+from detect.sources.grey_images import read_image
 from detect.sources.opening import open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.frame_files import read_times

@@ -14,7 +14,8 @@ from camera import Camera
 from detect.cli import main
 from detect.errors import DetectError
 from detect.options import SourceOptions
-from detect.sources.interface import Run, read_image
+from detect.sources.grey_images import read_image
+from detect.sources.interface import Run
 from detect.sources.opening import open_run, open_source
 from redetect.landmarks import read_frames
 from redetect.landmarks.frame_files import read_times

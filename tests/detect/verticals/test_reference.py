@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from camera import read_camera
 from detect.line_settings import DEFAULT, PUBLISHED, LineSettings
 from detect.projection import leaning_camera
-from detect.sources.interface import decode_gray
+from detect.sources.grey_images import decode_grey
 from detect.verticals.refinement import Crossings, newton_step, step_filters
 from detect.verticals.starts import LineStarts
 from detect.verticals.tracking import LineTracks
@@ -154,5 +154,5 @@ def test_steps_of_the_refinement_are_those_of_the_reference(step: int, sign: flo
 @pytest.mark.parametrize("number", [3, 40])
 def test_responses_to_frames_of_the_demo_run_are_those_of_the_reference(number: int) -> None:
     table = build_vertical_table(read_camera(DEMO / "e.cam"))
-    image = decode_gray((DEMO / "images" / f"e.{number:04d}.jpg").read_bytes(), number)
+    image = decode_grey((DEMO / "images" / f"e.{number:04d}.jpg").read_bytes(), number)
     assert_responses(image, table)

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from detect.errors import FrameError
-from detect.sources.interface import eight_bits, gray_of_pixels
+from detect.sources.grey_images import eight_bits, grey_of_pixels
 
 COLOURS = np.random.default_rng(3).integers(0, 256, (6, 8, 4)).astype(np.uint8)
 GRAY = COLOURS[:, :, 0]
@@ -44,12 +44,12 @@ def read_only(pixels: NDArray[Any]) -> NDArray[Any]:
 )
 def test_arrays_that_are_taken(pixels: NDArray[Any], expected: NDArray[np.uint8]) -> None:
     before = pixels.copy()
-    gray = eight_bits(gray_of_pixels(pixels, "image"), "image")
-    np.testing.assert_array_equal(gray, expected)
+    grey = eight_bits(grey_of_pixels(pixels, "image"), "image")
+    np.testing.assert_array_equal(grey, expected)
     np.testing.assert_array_equal(pixels, before)
-    assert gray.dtype == np.uint8
-    assert gray.flags.c_contiguous
-    assert gray.flags.writeable
+    assert grey.dtype == np.uint8
+    assert grey.flags.c_contiguous
+    assert grey.flags.writeable
 
 
 @pytest.mark.parametrize(
@@ -66,5 +66,5 @@ def test_arrays_that_are_taken(pixels: NDArray[Any], expected: NDArray[np.uint8]
 )
 def test_arrays_that_are_refused(pixels: NDArray[Any], told: str) -> None:
     with pytest.raises(FrameError, match=told) as caught:
-        gray_of_pixels(pixels, "image")
+        grey_of_pixels(pixels, "image")
     assert "\n" not in str(caught.value)
