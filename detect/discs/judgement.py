@@ -27,6 +27,7 @@ from detect.discs.rim import (
     STEPS,
     Profiles,
     follow_rims,
+    median,
     profiles,
 )
 from detect.discs.rim_network import (
@@ -39,8 +40,9 @@ from detect.discs.rim_network import (
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Distances at which grey values are taken for the disc and for the floor, nominal radii.
-_INSIDE, _OUTSIDE = (0.4, 0.75), (1.25, 1.6)
+#: Steps of the rim's profiles within the disc, from 0.4 to 0.75 nominal radii, and on the floor
+#: around it, from 1.25 to 1.6.
+_INSIDE, _OUTSIDE = slice(1, 11), slice(21, 31)
 #: Directions of sparse profiles (some of the rim's), distances of their samples, which of these are
 #: inside and outside, and the least share of directions in which the disc differs from the floor.
 _EVERY = 2
@@ -112,49 +114,52 @@ def judge(
     def profiles_at(floor_xy: FloatArray) -> Profiles:
         return profiles(image, camera_numbers, floor_xy, np.full(len(floor_xy), nominal))
 
+    # Prescreening, of all candidates.
     count, sign = len(candidates.score), candidates.sign
     outcome, value = np.full(count, Outcome.FEW_STEPS, np.int8), np.zeros(count)
     grey, scale = sparse_profiles(image, camera_numbers, candidates.floor_xy, nominal)
     contrast = _contrast(grey, sign, least_step)
     seen, score = network_inputs(grey, scale, sign), candidates.score[:, None]
     odds = network_log_odds(*seen, score, networks.prescreening)
-    k = np.flatnonzero(contrast > 0.0)
-    outcome[k], value[k] = Outcome.PRESCREENING, odds[k]
+    left = np.flatnonzero(contrast > 0.0)
+    outcome[left], value[left] = Outcome.PRESCREENING, odds[left]
+    left = left[odds[left] >= _LEAST_PRESCREENING]
 
-    k = k[odds[k] >= _LEAST_PRESCREENING]
-    from_xy = candidates.floor_xy[k]
-    rims = follow_rims(image, camera_numbers, profiles_at(from_xy), sign[k] * contrast[k])
-    outcome[k], value[k] = Outcome.NO_RIM, rims["agreeing"]
+    # Rims of those left.
+    from_xy, step = candidates.floor_xy[left], sign[left] * contrast[left]
+    rims = follow_rims(image, camera_numbers, profiles_at(from_xy), step)
+    outcome[left], value[left] = Outcome.NO_RIM, rims["agreeing"]
     found = rims["agreeing"] >= LEAST_RIM
-    outcome[k[found]] = Outcome.SAME_RIM
-    found[found] = _first_of_each(rims["floor_xy"][found], sign[k[found]], _SAME * nominal)
-    k, from_xy, rims = k[found], from_xy[found], rims[found]
+    outcome[left[found]] = Outcome.SAME_RIM
+    found[found] = _first_of_each(rims["floor_xy"][found], sign[left[found]], _SAME * nominal)
+    left, from_xy, rims = left[found], from_xy[found], rims[found]
 
-    radial, score = profiles_at(rims["floor_xy"]), candidates.score[k]
+    radial, score = profiles_at(rims["floor_xy"]), candidates.score[left]
     features = _features(rims, nominal, score)
-    odds = _rim_odds(radial, features, sign[k], networks.classifier)
+    odds = _rim_odds(radial, features, sign[left], networks.classifier)
+
     # A rim is seen best from its own centre, but that may lead to another circle.
-    doubtful, doubt = np.flatnonzero((odds >= HOPELESS) & (odds < _CERTAIN)), np.zeros((len(k), 2))
+    doubtful = np.flatnonzero((odds >= HOPELESS) & (odds < _CERTAIN))
     step = rims["step"][doubtful]
     again = follow_rims(image, camera_numbers, radial.where(doubtful), step)
-    kept = again["agreeing"] >= rims["agreeing"][doubtful] - _SLACK
-    doubtful, again = doubtful[kept], again[kept]
+    found = again["agreeing"] >= rims["agreeing"][doubtful] - _SLACK
+    doubtful, again, doubt = doubtful[found], again[found], np.zeros((len(left), 2))
     doubt[doubtful] = again["floor_xy"] - rims["floor_xy"][doubtful]
     radial_again = profiles_at(again["floor_xy"])
     features_again = _features(again, nominal, score[doubtful])
-    odds_again = _rim_odds(radial_again, features_again, sign[k[doubtful]], networks.classifier)
+    odds_again = _rim_odds(radial_again, features_again, sign[left[doubtful]], networks.classifier)
     better = odds_again > odds[doubtful]
     changed = doubtful[better]
     from_xy[changed] = rims["floor_xy"][changed]
     rims[changed], odds[changed] = again[better], odds_again[better]
     features[changed], radial.grey[changed] = features_again[better], radial_again.grey[better]
 
-    outcome[k], value[k] = Outcome.JUDGED, odds
+    outcome[left], value[left] = Outcome.JUDGED, odds
     quality, floor_grey = _quality(radial.grey)
 
     def of_all(judged: NDArray[Any], others: NDArray[Any] | float = 0.0) -> FloatArray:
         values = np.zeros((count, *judged.shape[1:])) + others
-        values[k] = judged
+        values[left] = judged
         return values
 
     place = of_all(rims["floor_xy"], candidates.floor_xy)
@@ -215,40 +220,36 @@ def pairs_of_steps(grey: Float32Array) -> Float32Array:
     return np.asarray(np.float32(0.5) * (grey[..., ::2] + grey[..., 1::2]))
 
 
+@kernel()
 def _contrast(grey: Float32Array, sign: FloatArray, least_step: float) -> FloatArray:
     """(N,) median steps over the directions with a sufficient step; 0 if these are too few."""
-    contrast, rows = np.zeros(len(grey)), np.arange(len(grey))
-    half, none = np.float32(0.5) * sign.astype(np.float32), np.float32(np.inf)
-    for inner in reversed(_INNER):
-        inside, outside = (grey[..., i] + grey[..., i + 1] for i in (inner, _OUTER))
-        step = half[:, None] * (inside - outside)
-        steps = np.sort(np.where(step > least_step, step, none), axis=1)
-        count = (steps < none).sum(axis=1)
-        median = 0.5 * (steps[rows, (count - 1) // 2] + steps[rows, count // 2])
-        contrast = np.where(count >= _LEAST_STEPS * SPARSE_DIRECTIONS, median, contrast)
+    contrast, steps = np.zeros(len(grey)), np.empty(SPARSE_DIRECTIONS)
+    for i in range(len(grey)):
+        for inner in _INNER:
+            count = 0
+            for k in range(SPARSE_DIRECTIONS):
+                inside = grey[i, k, inner] + grey[i, k, inner + 1]
+                outside = grey[i, k, _OUTER] + grey[i, k, _OUTER + 1]
+                step = 0.5 * sign[i] * (inside - outside)
+                if step > least_step:
+                    steps[count] = step
+                    count += 1
+            if count >= _LEAST_STEPS * SPARSE_DIRECTIONS:
+                contrast[i] = median(steps[:count])
+                break
     return contrast
 
 
 def _quality(grey: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Between-class over total variance of the grey values inside and outside; mean outside."""
-    at = np.linspace(NEAREST, FARTHEST, STEPS)
-    inside, outside = (
-        grey[..., np.abs(at - low).argmin() : np.abs(at - high).argmin() + 1].mean(
-            axis=2, dtype=float
-        )
-        for low, high in (_INSIDE, _OUTSIDE)
-    )
-    seen = np.isfinite(inside) & np.isfinite(outside)
+    both = np.stack([grey[..., steps].mean(axis=2, dtype=float) for steps in (_INSIDE, _OUTSIDE)])
+    seen = np.isfinite(both).all(axis=0)
     count = np.maximum(seen.sum(axis=1), 1)
-    means, variance = [], 0.0
-    for values in (inside, outside):
-        mean = np.where(seen, values, 0.0).sum(axis=1) / count
-        off = np.where(seen, values - mean[:, None], 0.0)
-        variance = variance + (off * off).sum(axis=1) / count
-        means.append(mean)
-    between = 0.25 * (means[0] - means[1]) ** 2
-    total = between + 0.5 * variance
-    return between / np.where(total > 0.0, total, 1.0), means[1]
+    mean = np.where(seen, both, 0.0).sum(axis=2) / count
+    off = np.where(seen, both - mean[..., None], 0.0)
+    between = 0.25 * (mean[0] - mean[1]) ** 2
+    total = between + 0.5 * (off * off).sum(axis=(0, 2)) / count
+    return between / np.where(total > 0.0, total, 1.0), mean[1]
 
 
 def _features(rims: Any, nominal: float, score: FloatArray) -> FloatArray:
