@@ -131,7 +131,7 @@ class FitSettings(NamedTuple):
     reach: Reach
 
 
-#: Initial values of a fit, and the prior of the disc's radius; metres and pixels.
+#: Initial values of a fit, and the prior of the disc's radius (`size`); metres and pixels.
 START = np.dtype(
     [("floor_xy", float, 2), ("radius", float), ("blur", float), ("size", float),
      ("size_sigma", float)]
@@ -151,7 +151,8 @@ FIT = np.dtype(
         ("covariance", float, (2, 2)),  # of the centre
         # Inverse variance of the radius from the grey values alone, without the prior.
         ("radius_information", float),
-    ]
+    ],
+    align=True,
 )
 
 
@@ -193,14 +194,14 @@ def eliminate(matrices: FloatArray, unknowns: range) -> None:
 
 @kernel()
 def fit_discs(scene: Scene, starts: Any, settings: FitSettings, work: Any) -> Any:
-    """(N,) `FIT`: fits from (N,) `START`; `work` is the working space, a `WORK`."""
+    """Fit N discs, from (N,) `START`: (N,) `FIT`. `work` is the working space, a `WORK`."""
     fits = np.zeros(len(starts), FIT)
     for k in range(len(starts)):
         _fit_disc(scene, starts[k], settings, work, fits[k])
     return fits
 
 
-# Inlined by Numba: only then a kernel that was just compiled and one that was loaded from the
+# Inlined by Numba: only then do a kernel that was just compiled and one that was loaded from the
 # cache agree to the last digit.
 @kernel(inline="always")
 def _fit_disc(scene: Scene, start: Any, settings: FitSettings, work: Any, fit: Any) -> None:
@@ -476,9 +477,9 @@ def _add_up(
 
 @kernel()
 def solve(normal: FloatArray, unknowns: FloatArray) -> None:
-    """Solve normal equations (T, T, 1), the last row of which is the right side.
+    """Solve normal equations (T, T, 1), lower half, whose last row is the right side.
 
-    They are overwritten. Unknowns that nothing depends on are 0.
+    They are overwritten. Of the T - 1 unknowns, those on which no observation depends become 0.
     """
     last = len(unknowns)
     eliminate(normal, range(last))

@@ -60,7 +60,7 @@ def hough_candidates(
     signs = np.array([1.0, -1.0] if sign == 0 else [float(sign)])
     found = []
     for of_sign, votes in zip(signs, count_votes(image, table, radius * signs, least_step)):
-        place, score = peaks(votes, table)
+        place, score = _peaks(votes, table)
         order = np.argsort(-score, kind="stable")
         order = order[: max(_MOST_COMPARED, np.count_nonzero(score >= _CLEAR_SCORE))]
         best = suppress_close(place, order, _APART * radius)
@@ -163,7 +163,7 @@ def _vote(
 
 
 @kernel(fastmath={"reassoc", "nsz"})
-def peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
+def _peaks(votes: Float32Array, table: VoteTable) -> tuple[FloatArray, FloatArray]:
     """Positions (across, ahead) and scores of cells that no neighbour exceeds."""
     rows, columns = votes.shape
     first, last, ahead = table.first, table.last, table.ahead

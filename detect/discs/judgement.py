@@ -40,8 +40,8 @@ from detect.discs.rim_network import (
 from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
 from redetect.compiled import kernel
 
-#: Steps of the rim's profiles within the disc, from 0.4 to 0.75 nominal radii, and on the floor
-#: around it, from 1.25 to 1.6.
+#: Steps of the rim's profiles within the disc, about 0.4 to 0.75 nominal radii, and on the floor
+#: around it, about 1.25 to 1.6.
 _INSIDE, _OUTSIDE = slice(1, 11), slice(21, 31)
 #: Directions of sparse profiles (some of the rim's), distances of their samples, which of these are
 #: inside and outside, and the least share of directions in which the disc differs from the floor.
@@ -112,7 +112,8 @@ def judge(
     """
 
     def profiles_at(floor_xy: FloatArray) -> Profiles:
-        return profiles(image, camera_numbers, floor_xy, np.full(len(floor_xy), nominal))
+        at = np.ascontiguousarray(floor_xy)
+        return profiles(image, camera_numbers, at, np.full(len(at), nominal))
 
     # Prescreening, of all candidates.
     count, sign = len(candidates.score), candidates.sign
@@ -154,7 +155,10 @@ def judge(
     rims[changed], odds[changed] = again[better], odds_again[better]
     features[changed], radial.grey[changed] = features_again[better], radial_again.grey[better]
 
-    outcome[left], value[left] = Outcome.JUDGED, odds
+    # Some may have moved to the rim of another one.
+    first = _first_of_each(rims["floor_xy"], sign[left], _SAME * nominal)
+    odds = np.where(first, odds, 0.0)
+    outcome[left[first]], value[left[first]] = Outcome.JUDGED, odds[first]
     quality, floor_grey = _quality(radial.grey)
 
     def of_all(judged: NDArray[Any], others: NDArray[Any] | float = 0.0) -> FloatArray:
@@ -172,9 +176,9 @@ def judge(
 
 def _first_of_each(floor_xy: FloatArray, sign: FloatArray, apart: float) -> BoolArray:
     """(N,) mask of positions that are not the same as one before, of the same sign."""
-    first = np.zeros(len(sign), np.bool_)
+    first, at = np.zeros(len(sign), np.bool_), np.ascontiguousarray(floor_xy)
     for own in (1.0, -1.0):
-        first[suppress_close(floor_xy, np.flatnonzero(sign == own), apart)] = True
+        first[suppress_close(at, np.flatnonzero(sign == own), apart)] = True
     return first
 
 

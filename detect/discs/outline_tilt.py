@@ -168,7 +168,8 @@ def fit_outline(
     area = pp * rr - pr * pr
     covariance = np.array([[rr, -pr], [-pr, pp]]) * (variance / area)
     small = max(abs(unknowns[2]), abs(unknowns[3])) < _MOST_TILT_RAD
-    found = bool(on >= LEAST_DIRECTIONS and small and area > 0.0)
+    definite = pp > 0.0 and area > 0.0
+    found = bool(on >= LEAST_DIRECTIONS and small and definite)
     return OutlineTilt(found, unknowns[2:].copy(), covariance)
 
 

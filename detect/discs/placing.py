@@ -86,7 +86,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
     better = last["converged"] & (surer | ~explained[again])
     best[again[better]] = last[better]
 
-    floor_xy, covariance = best["floor_xy"], best["covariance"]
+    floor_xy, covariance = best["floor_xy"].copy(), best["covariance"].copy()
     rims = _rims_of(scene, discs, hidden, start["size"][hidden])
     lost = ~best["converged"][hidden]  # sectors disagree
     by_rim = hidden[lost]
@@ -120,7 +120,7 @@ def _radii_without_prior(fits: Any, start: Any) -> FloatArray:
 
 
 def _state_sizes(start: Any, chosen: IntArray, nominal: float, radii: FloatArray) -> None:
-    """Write the size of some discs by that of the others as the prior of their fits."""
+    """Set the prior of some discs' fits to the size that the other discs suggest."""
     for k in chosen.tolist():
         start["size"][k], start["size_sigma"][k] = size_of_disc(nominal, radii, k)
 

@@ -74,11 +74,11 @@ _BEGIN, _MIDDLE, _END = (
 )
 
 
-#: The rim of a candidate.
+#: The rim of a candidate; without a circle, place and radius are those of the profiles.
 RIM = np.dtype(
     [
         ("agreeing", float),  # share of all directions in which the rim is on the circle
-        ("runs", float),  # gaps: two or more neighbouring directions in which it is not
+        ("runs", float),  # number of gaps: two or more neighbouring directions in which it is not
         # Root mean square distance of the points on the circle from it, in tolerances.
         ("scatter", float),
         ("step", float),  # mean step on the circle, grey levels inside minus outside
@@ -102,7 +102,7 @@ class Profiles(NamedTuple):
     pixels_per_radius: FloatArray
 
     def where(self, chosen: NDArray[Any]) -> Profiles:
-        """Those that indices or a mask select."""
+        """The profiles that indices or a mask select."""
         return Profiles(*(values[chosen] for values in self))
 
 
@@ -112,7 +112,7 @@ def profiles(
 ) -> Profiles:
     """Grey values along the directions from (N, 2) points on the floor, metres.
 
-    `radius` (N,) are nominal ones; `camera_numbers` as in `camera.kernels.camera_numbers`.
+    `radius` (N,) holds the nominal radii; `camera_numbers` as in `camera.kernels.camera_numbers`.
     """
     grey = np.empty((len(floor_xy), DIRECTIONS, STEPS), np.float32)
     scale = np.empty((len(floor_xy), DIRECTIONS))
@@ -353,7 +353,7 @@ def best_circle(
 def follow_rims(
     image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: FloatArray
 ) -> Any:
-    """Trace the rims in profiles from about N candidates' centres: (N,) `RIM`.
+    """Trace the rims in profiles from points near the centres of N candidates: (N,) `RIM`.
 
     `contrast` (N,) is approximately that of discs to the floor, grey levels. Without a circle,
     `agreeing` is 0.

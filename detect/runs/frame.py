@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from camera import Camera
+from camera.kernels import project_floor_points
 from detect.circles import CircleDetections, candidates_of, classify, scene_of, vote_shape
 from detect.discs.fit import working_space
 from detect.discs.hough import HoughCandidates
 from detect.discs.outline_tilt import fit_outline, tilt_of_outlines
-from detect.discs.placing import place_discs
+from detect.discs.placing import place_discs, size_of_disc
 from detect.errors import FrameError
 from detect.identity import ids_of_rows
 from detect.lean import detect_leaning, detect_tilted, search_of, with_exact_tilt
@@ -295,7 +296,7 @@ def _disc_rows(
     return tuple(replace(row, ids=own) for row, own in zip(rows, ids))
 
 
-def compile_discs(plan: FramePlan, tasks: Sequence[FrameTask], *, search: bool) -> None:
+def compile_discs(plan: FramePlan, *, search: bool) -> None:
     """Compile the kernels that find candidates of discs, or those of all stages after that.
 
     They are stored in the disk cache. Two processes compile one half each at the same time.
@@ -303,15 +304,18 @@ def compile_discs(plan: FramePlan, tasks: Sequence[FrameTask], *, search: bool) 
     camera, settings = plan.camera, plan.circles
     if not (camera and settings and settings.refine):
         return
-    image = read_image(tasks[0].frame, camera, plan.working_folder)
+    image = np.zeros((camera.height, camera.width), np.uint8)
     table = cached_vote_table(camera, vote_shape(settings))
     scene = scene_of(image, camera, table, settings)
     if search:
         candidates_of(scene, table, settings)
         return
+    somewhere = np.array([[0.0, -1.0]])
     none = HoughCandidates(np.empty((0, 2)), np.empty(0), np.empty(0))
     place_discs(scene, classify(scene, settings, none), working_space()[0])
+    size_of_disc(settings.radius_m, np.zeros((1, 2)), 0)
+    project_floor_points(scene.camera_numbers, somewhere)
     if plan.levelling == "run":
-        tilt_of_outlines(image, camera, np.array([[0.0, -1.0]]), settings.radius_m)
+        tilt_of_outlines(image, camera, somewhere, settings.radius_m)
         fit_outline(np.ones((3, 2)), np.ones(3), np.ones(3), 0.0, 0.0, 1.0)
         smooth_axis(np.zeros(1), np.ones(1), spread=1.0, correlation=0.0)

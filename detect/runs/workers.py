@@ -191,7 +191,7 @@ def local_workers(jobs: int, *, large: bool = False, shared: bool = False) -> Wo
     """Processes on this machine; 1 is this process itself.
 
     Chunks of `large` tasks, which contain images, have one frame. With `shared`, a single process
-    lets two or three others compile missing kernels at the same time.
+    lets two others compile missing kernels at the same time.
     """
     if not 1 <= jobs <= _MOST_JOBS:
         raise WorkerError(f"jobs is {excerpt(jobs)}: expected 1 to {_MOST_JOBS}")
@@ -266,8 +266,8 @@ class _InProcess(Executor):
             # Each process gets about half of what has to be compiled.
             done: list[Future[Any]] = [
                 one.submit(work_on_chunk, lines, self._chunk),
-                one.submit(compile_discs, discs, self._chunk, search=True),
-                other.submit(compile_discs, discs, self._chunk, search=False),
+                one.submit(compile_discs, discs, search=True),
+                other.submit(compile_discs, discs, search=False),
             ]
             # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:

@@ -2,9 +2,9 @@
 
 Colour is 0.299 R + 0.587 G + 0.114 B, as in OpenCV (for a JPEG, its luminance). Of values with 16
 bits, the 8 highest of a bit depth are kept: those of a 12-bit camera would be nearly black
-otherwise. It is one for the whole run: else discs would have another contrast in each image, by the
-brightest things beside them. No image takes more memory than the images of its run do, whatever its
-file contains or claims.
+otherwise. One depth is used for the whole run: else discs would have another contrast in each
+image, by the brightest things beside them. No image takes more memory than the images of its run
+do, whatever its file contains or claims.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The loop of a filter over a run: rows are paired with landmarks, slips of the wheels noticed.
+"""The loop of a filter over a run: rows are paired with landmarks, and wheel slips are noticed.
 
 Rows without identifiers are paired with landmarks of the filter's state, discs and lines
 separately, frame by frame, by `redetect.slam.association.compatibility`.

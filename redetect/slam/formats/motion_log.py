@@ -1,4 +1,4 @@
-"""What a robot logged of its motion, and the run that it makes with what was seen meanwhile."""
+"""Logs of a robot's motion, and runs made from them and from what was seen meanwhile."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from redetect.slam.recording import ASSUMED, CircleRows, LineRows, Recording
 
 # A log has a gap if nothing is logged for this many of its usual intervals, and this time.
 _GAP_INTERVALS, _LEAST_GAP_S = 10.0, 0.5
-#: Errors of ranges (m) and bearings (rad) that nobody calibrated.
+#: Standard deviations of uncalibrated ranges (m) and bearings (rad).
 RAW_SIGMA_M, RAW_SIGMA_RAD = 0.1, 0.03
 
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from camera import Camera
 from camera.kernels import camera_numbers
 from camera.model_checks import checked_pose
-from detect.circles import CircleDetections, detect_circles
+from detect.circles import CircleDetections, candidates_of, classify, detect_circles, scene_of
 from detect.discs.evidence import paleness_penalty, sign_penalty
-from detect.discs.judgement import SPARSE_RADII, sparse_profiles
+from detect.discs.hough import HoughCandidates
+from detect.discs.judgement import SPARSE_RADII, Outcome, sparse_profiles
 from detect.settings import CircleSettings
 from lut import VoteTable
 from tests.detect.painted_floor import DARK, FLOOR, LIGHT, SHAPES, PaintedFloor, Shape
@@ -190,3 +191,31 @@ def test_sparse_profiles_of_a_near_disc_follow_perspective(published_camera: Cam
     assert scale.min() > 20.0  # pixels
     assert np.all(grey[:, SPARSE_RADII < 1.0] > 0.5 * (LIGHT + FLOOR))
     assert np.all(grey[:, SPARSE_RADII > 1.0] < 0.5 * (LIGHT + FLOOR))
+
+
+def test_candidates_that_lead_to_one_rim_are_one_disc(
+    published_camera: Camera, table: VoteTable
+) -> None:
+    """Each candidate again, shifted; in cluttered images some meet only when traced again."""
+    rng = np.random.default_rng(1)
+    judged = 0
+    for seed in range(6):
+        floor = PaintedFloor(published_camera)
+        for place in PLACES:
+            floor.disc(place, LIGHT)
+        for place in rng.uniform([-1.2, -3.6], [1.2, -1.0], (60, 2)):
+            floor.disc(place, rng.uniform(0.0, 255.0), rng.uniform(0.03, 0.13))
+        scene = scene_of(floor.image(seed=seed), published_camera, table, SETTINGS)
+        found = candidates_of(scene, table, SETTINGS)
+        shifted = found.floor_xy + rng.uniform(-0.03, 0.03, found.floor_xy.shape)
+        twice = HoughCandidates(
+            np.concatenate([found.floor_xy, shifted]), np.tile(found.score, 2),
+            np.tile(found.sign, 2),
+        )  # fmt: skip
+        rims = classify(scene, SETTINGS, twice)
+        assert (rims.outcome == Outcome.SAME_RIM).any()
+        place = rims.floor_xy[rims.outcome == Outcome.JUDGED]
+        apart = np.hypot(*(place[:, None] - place).transpose(2, 0, 1))
+        assert (apart[~np.eye(len(place), dtype=bool)] >= 0.01).all()
+        judged += len(place)
+    assert judged > 60

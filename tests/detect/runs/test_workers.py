@@ -125,7 +125,7 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
             processes.append(self)
 
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
-            plan, chunk = args
+            plan, *chunk = args
             process, words = processes.index(self), f"{bool(plan.lines)} {bool(plan.circles)}"
             began.append(f"{process} {fn.__name__} {words} {chunk} {kwargs}")
             return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
@@ -142,9 +142,9 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
     with local_workers(1, shared=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
     assert began == [
-        "0 work_on_chunk True False images {}",
-        "0 compile_discs False True images {'search': True}",
-        "1 compile_discs False True images {'search': False}",
+        "0 work_on_chunk True False ['images'] {}",
+        "0 compile_discs False True [] {'search': True}",
+        "1 compile_discs False True [] {'search': False}",
         "compiled images",
         "compiled images",
     ]
