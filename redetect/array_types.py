@@ -11,3 +11,4 @@ Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 GreyImage = NDArray[np.uint8]
 IntArray = NDArray[np.int64]
+Records = NDArray[np.void]  #: Of a structured type.

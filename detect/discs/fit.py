@@ -63,7 +63,7 @@ from detect.discs.patch import (
     gather,
 )
 from detect.discs.rim import median, within
-from redetect.array_types import Float32Array, FloatArray, GreyImage, IntArray
+from redetect.array_types import Float32Array, FloatArray, GreyImage, IntArray, Records
 from redetect.compiled import kernel
 
 #: Terms of the normal equations: light common to all pixels, light of each sector, the disc, and
@@ -193,7 +193,7 @@ def eliminate(matrices: FloatArray, unknowns: range) -> None:
 
 
 @kernel()
-def fit_discs(scene: Scene, starts: Any, settings: FitSettings, work: Any) -> Any:
+def fit_discs(scene: Scene, starts: Records, settings: FitSettings, work: Any) -> Records:
     """Fit N discs, from (N,) `START`: (N,) `FIT`. `work` is the working space, a `WORK`."""
     fits = np.zeros(len(starts), FIT)
     for k in range(len(starts)):
@@ -241,10 +241,9 @@ def _fit_disc(scene: Scene, start: Any, settings: FitSettings, work: Any, fit: A
         if by_parts:
             if _weigh(levels, step < _EARLY, scene.noise) < _LEAST_SECTORS:
                 return
+            _trust(patch, rows, ends, grouped, levels, scene.noise)
         elif not abs(levels.contrast[0]) > 0.0:
             return
-        if by_parts:
-            _trust(patch, rows, ends, grouped, levels, scene.noise)
         _scale(grouped, levels)
         _add_up(grouped, edge, usual, radius_sigma, normal)
         solve(normal.copy(), movement)

@@ -33,11 +33,10 @@ from detect.discs.rim import (
 from detect.discs.rim_network import (
     HOPELESS,
     Networks,
-    RimNetwork,
     network_inputs,
     network_log_odds,
 )
-from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage
+from redetect.array_types import BoolArray, Float32Array, FloatArray, GreyImage, IntArray, Records
 from redetect.compiled import kernel
 
 #: Steps of the rim's profiles within the disc, about 0.4 to 0.75 nominal radii, and on the floor
@@ -115,13 +114,19 @@ def judge(
         at = np.ascontiguousarray(floor_xy)
         return profiles(image, camera_numbers, at, np.full(len(at), nominal))
 
+    def classified(rims: Records, of: IntArray) -> tuple[Profiles, FloatArray, FloatArray]:
+        """Profiles, features and log-odds of the rims of some candidates."""
+        radial, features = profiles_at(rims["floor_xy"]), _features(rims, nominal, score[of])
+        seen = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign[of])
+        return radial, features, network_log_odds(*seen, features, networks.classifier)
+
     # Prescreening, of all candidates.
-    count, sign = len(candidates.score), candidates.sign
+    count, sign, score = len(candidates.score), candidates.sign, candidates.score
     outcome, value = np.full(count, Outcome.FEW_STEPS, np.int8), np.zeros(count)
     grey, scale = sparse_profiles(image, camera_numbers, candidates.floor_xy, nominal)
     contrast = _contrast(grey, sign, least_step)
-    seen, score = network_inputs(grey, scale, sign), candidates.score[:, None]
-    odds = network_log_odds(*seen, score, networks.prescreening)
+    seen = network_inputs(grey, scale, sign)
+    odds = network_log_odds(*seen, score[:, None], networks.prescreening)
     left = np.flatnonzero(contrast > 0.0)
     outcome[left], value[left] = Outcome.PRESCREENING, odds[left]
     left = left[odds[left] >= _LEAST_PRESCREENING]
@@ -135,10 +140,7 @@ def judge(
     found[found] = _first_of_each(rims["floor_xy"][found], sign[left[found]], _SAME * nominal)
     left, from_xy, rims = left[found], from_xy[found], rims[found]
 
-    radial, score = profiles_at(rims["floor_xy"]), candidates.score[left]
-    features = _features(rims, nominal, score)
-    odds = _rim_odds(radial, features, sign[left], networks.classifier)
-
+    radial, features, odds = classified(rims, left)
     # A rim is seen best from its own centre, but that may lead to another circle.
     doubtful = np.flatnonzero((odds >= HOPELESS) & (odds < _CERTAIN))
     step = rims["step"][doubtful]
@@ -146,9 +148,7 @@ def judge(
     found = again["agreeing"] >= rims["agreeing"][doubtful] - _SLACK
     doubtful, again, doubt = doubtful[found], again[found], np.zeros((len(left), 2))
     doubt[doubtful] = again["floor_xy"] - rims["floor_xy"][doubtful]
-    radial_again = profiles_at(again["floor_xy"])
-    features_again = _features(again, nominal, score[doubtful])
-    odds_again = _rim_odds(radial_again, features_again, sign[left[doubtful]], networks.classifier)
+    radial_again, features_again, odds_again = classified(again, left[doubtful])
     better = odds_again > odds[doubtful]
     changed = doubtful[better]
     from_xy[changed] = rims["floor_xy"][changed]
@@ -256,18 +256,10 @@ def _quality(grey: Float32Array) -> tuple[FloatArray, FloatArray]:
     return between / np.where(total > 0.0, total, 1.0), mean[1]
 
 
-def _features(rims: Any, nominal: float, score: FloatArray) -> FloatArray:
+def _features(rims: Records, nominal: float, score: FloatArray) -> FloatArray:
     """(N, len(FEATURES)) features of rims, each bounded, so that no single one decides."""
     off = np.abs(np.log(np.clip(rims["radius"] / nominal, 0.3, 3.0) / RIM_RADIUS))
     size = np.log(np.clip(rims["radius_px"], 3.0, 30.0) / 6.0)
     runs, score = np.minimum(rims["runs"], 4.0), np.minimum(score, 12.0)
     columns = [rims["agreeing"], runs, rims["scatter"], off, 10.0 * off * off, size, score]
     return np.stack(columns, axis=1)
-
-
-def _rim_odds(
-    radial: Profiles, features: FloatArray, sign: FloatArray, network: RimNetwork
-) -> FloatArray:
-    """(N,) log-odds that rims, seen from their centres, are those of discs."""
-    seen = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign)
-    return network_log_odds(*seen, features, network)

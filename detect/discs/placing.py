@@ -18,7 +18,7 @@ import numpy as np
 from detect.discs.fit import START, FitSettings, Scene, fit_discs
 from detect.discs.patch import Reach
 from detect.discs.rim import follow_rims, median, profiles
-from redetect.array_types import BoolArray, FloatArray, IntArray
+from redetect.array_types import BoolArray, FloatArray, IntArray, Records
 from redetect.compiled import kernel
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
     whole = fit_discs(scene, start, WHOLE, work)
     for _ in range(_MOST_REFITS):  # of discs too blurred for their patch, in a wider one
         blurred = whole["converged"] & (whole["blur"] > _AT_BOUND * whole["blur_bound"])
+        if not blurred.any():
+            break
         wider = _continued(start, whole)[blurred]
         wider["blur"] = whole["blur_bound"][blurred]
         whole[blurred] = fit_discs(scene, wider, WHOLE, work)
@@ -96,7 +98,7 @@ def place_discs(scene: Scene, discs: JudgedCandidates, work: Any) -> tuple[Float
     return floor_xy, covariance
 
 
-def _continued(start: Any, fits: Any) -> Any:
+def _continued(start: Records, fits: Records) -> Records:
     """(N,) `START` at the results of fits, or, where they have not converged, as they were."""
     start, found = start.copy(), fits["converged"]
     for name in ("floor_xy", "radius", "blur"):
@@ -104,14 +106,14 @@ def _continued(start: Any, fits: Any) -> Any:
     return start
 
 
-def _explained(fits: Any, discs: JudgedCandidates) -> BoolArray:
+def _explained(fits: Records, discs: JudgedCandidates) -> BoolArray:
     """(N,) mask of the discs whose fit as a whole explains the image."""
     least = np.where(discs.agreeing >= _WHOLE_RIM, _EXPLAINS_WHOLE, _EXPLAINS_PART)
     same_sign = fits["contrast"] * discs.step > 0.0
     return np.asarray(fits["converged"] & (fits["explained"] >= least) & same_sign)
 
 
-def _radii_without_prior(fits: Any, start: Any) -> FloatArray:
+def _radii_without_prior(fits: Records, start: Records) -> FloatArray:
     """(N, 2) radii of fits, metres, without the prior, and their inverse variances; or 0, 0."""
     information = np.where(fits["radius_information"] > 0.0, fits["radius_information"], np.inf)
     pull = 1.0 / (start["size_sigma"] ** 2 * information)
@@ -119,13 +121,15 @@ def _radii_without_prior(fits: Any, start: Any) -> FloatArray:
     return np.where(np.isfinite(information), [radius, information], 0.0).T
 
 
-def _state_sizes(start: Any, chosen: IntArray, nominal: float, radii: FloatArray) -> None:
+def _state_sizes(start: Records, chosen: IntArray, nominal: float, radii: FloatArray) -> None:
     """Set the prior of some discs' fits to the size that the other discs suggest."""
     for k in chosen.tolist():
         start["size"][k], start["size_sigma"][k] = size_of_disc(nominal, radii, k)
 
 
-def _rims_of(scene: Scene, discs: JudgedCandidates, chosen: IntArray, radius: FloatArray) -> Any:
+def _rims_of(
+    scene: Scene, discs: JudgedCandidates, chosen: IntArray, radius: FloatArray
+) -> Records:
     """Rims of some discs (`RIM`), traced for a radius of each, metres."""
     near_xy, numbers = discs.traced_from[chosen], scene.camera_numbers
     radial = profiles(scene.image, numbers, near_xy, radius)

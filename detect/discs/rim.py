@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from camera.kernels import project_floor_point
 from detect.discs.model import F32
-from redetect.array_types import Float32Array, FloatArray, GreyImage
+from redetect.array_types import Float32Array, FloatArray, GreyImage, Records
 from redetect.compiled import kernel
 
 DIRECTIONS = 32  #: Directions from the centre of a candidate.
@@ -352,7 +352,7 @@ def best_circle(
 @kernel()
 def follow_rims(
     image: GreyImage, camera_numbers: FloatArray, radial: Profiles, contrast: FloatArray
-) -> Any:
+) -> Records:
     """Trace the rims in profiles from points near the centres of N candidates: (N,) `RIM`.
 
     `contrast` (N,) is approximately that of discs to the floor, grey levels. Without a circle,

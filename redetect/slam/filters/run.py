@@ -29,10 +29,10 @@ from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import DEFAULT_GATE_PROBABILITY, Association
 
 _XY = np.arange(2)
-#: A row shows a new disc if its distance from all known discs is this many times the gate.
-NEW_DISC_GATES = 4.0
-#: Largest distance at which lines are expected to be visible (m), since walls hide others.
-FARTHEST_LINE_M = 15.0
+# A row shows a new disc if its distance from all known discs is this many times the gate.
+_NEW_DISC_GATES = 4.0
+# Largest distance at which lines are expected to be visible (m), since walls hide others.
+_FARTHEST_LINE_M = 15.0
 # Least number of discs by which a slip is noticed; factors on the covariance of its step.
 _SEVERAL, _SLIPS = 3, (10.0, 100.0, 1000.0)
 # Largest distance of a disc from its row: metres, plus this many standard deviations of the pose.
@@ -82,7 +82,7 @@ class Associator(Bounded, error=SlamError):
         found = np.append(names, UNKNOWN_ID)[landmark]
         if self.new_id is not None:
             closest = np.min(individual_distances(*compared), axis=1, initial=np.inf)
-            far = NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
+            far = _NEW_DISC_GATES * chi_squared_gates(self.gate_probability, 2, 1)[1]
             for k in np.flatnonzero((found == UNKNOWN_ID) & (closest > far)):
                 found[k] = self.new_id()
         return found
@@ -90,7 +90,7 @@ class Associator(Bounded, error=SlamError):
     def _lines(self, rows: LineRows, estimate: Filter) -> tuple[tuple[int, ...], ...]:
         names, slots = np.array([*estimate.line_slots.items()], dtype=np.int64).reshape(-1, 2).T
         away = np.linalg.norm(estimate.state[slots[:, None] + _XY] - estimate.state[:2], axis=1)
-        names = names[away < FARTHEST_LINE_M]
+        names = names[away < _FARTHEST_LINE_M]
         landmark = compatible(self.method, *estimate.compared(rows, names), self.gate_probability)
         return tuple((int(names[j]),) if j >= 0 else () for j in landmark)
 
