@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from detect.errors import FrameError
@@ -71,8 +73,9 @@ def _median_response(image: GreyImage, rows: IntArray) -> float:
 def steep_gradient(image: GreyImage, most_rows: int) -> float:
     """90 % quantile of the gradient along some rows, grey levels per pixel."""
     rows = image[:: max(len(image) // most_rows, 1)].astype(np.int16)
-    steps = np.abs(rows[:, 2:] - rows[:, :-2])
-    return 0.5 * float(np.quantile(steps, 0.9, method="inverted_cdf")) if steps.size else 0.0
+    # For 16 bits this is a radix sort, faster than np.quantile.
+    steps = np.sort(np.abs(rows[:, 2:] - rows[:, :-2]), axis=None, kind="stable")
+    return 0.5 * float(steps[math.ceil(0.9 * len(steps)) - 1]) if len(steps) else 0.0
 
 
 def blank_margins(image: GreyImage) -> tuple[int, int]:
