@@ -96,9 +96,10 @@ class WakingUp(Study):
             turned.append(abs(np.degrees(difference[2])))
             taken.append(located.frames)
             squared.append(difference @ np.linalg.solve(located.covariance, difference) / 3.0)
+        demand_some(off, f"{self.run}: places that were recognised, of {len(starts)}")
         table = Table({"": "<6", "off m": ".2f", "turned deg": ".1f", "after frames": ".0f"})
         for name, of in (("median", np.median), ("most", np.max)):
-            table.row(name, *(of(values) if values else np.nan for values in (off, turned, taken)))
+            table.row(name, *(of(values) for values in (off, turned, taken)))
         known = {"known": len(off), "times": len(starts), "normalised": np.mean(squared)}
         print_figures(known)
         return {**known, **table.figures}
