@@ -25,7 +25,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.synchronize import RLock
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, ParamSpec, TypeVar, cast
 
 import cv2
 
@@ -54,8 +54,10 @@ _CLUSTER_ANSWER_S = 10.0
 _CLUSTER_PATIENCE_S = 60.0
 _GRACE_S = 1.0  #: Time after which processes are killed.
 _PATIENCE_S = 0.2  #: Interval of checks for an interrupt.
-#: The lock that a process holds while it compiles kernels, until the end of that task.
+#: The lock that a process of a pool holds while it compiles kernels.
 _compiling: list[RLock] = []
+#: Locks of the parts of missing kernels, until this process has compiled, or waited for, each.
+_parts: list[RLock] = []
 
 
 @dataclass(frozen=True)
@@ -223,8 +225,8 @@ def cluster_workers(address: str, *, large: bool = False) -> Workers:
     return Workers(lambda _: _cluster(address, clients), chunk, window, died=(KilledWorker,))
 
 
-class _CompiledElsewhereError(Exception):
-    """Other processes have compiled the kernel: it can be loaded from the disk cache."""
+class _MissingKernelsError(Exception):
+    """Kernels are not in the disk cache: the task begins again when other processes have them."""
 
 
 class _InProcess(Executor):
@@ -232,7 +234,7 @@ class _InProcess(Executor):
 
     def __init__(self, plan: FramePlan, *, shared: bool) -> None:
         self._plan = plan
-        self._shared = shared and plan.lines and plan.circles and _cores() > 1
+        self._shared = shared and plan.circles is not None and _cores() > 1
         self._chunk: Chunk = ()
         self._forget = on_compilation(self._before_compilation)
 
@@ -241,7 +243,7 @@ class _InProcess(Executor):
         future: Future[R] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
-        except _CompiledElsewhereError:
+        except _MissingKernelsError:
             future.set_result(fn(*args, **kwargs))
         finally:
             self._chunk = ()
@@ -256,23 +258,14 @@ class _InProcess(Executor):
         if not self._shared or not self._chunk:  # or between tasks
             return
         self._shared = False  # only before the first kernel
-        from detect.runs.frame import compile_discs
-
-        discs, lines = replace(self._plan, lines=None), replace(self._plan, circles=None)
         # If no process can be started, this one compiles all kernels.
         with suppress(OSError, ImportError, BrokenExecutor), ExitStack() as started:
-            pools = (_ProcessPool(1, self._plan, show=False) for _ in range(2))
-            one, other = map(started.enter_context, pools)
-            # Each process gets about half of what has to be compiled.
-            done: list[Future[Any]] = [
-                one.submit(work_on_chunk, lines, self._chunk),
-                one.submit(compile_discs, discs, search=True),
-                other.submit(compile_discs, discs, search=False),
-            ]
+            pool = started.enter_context(_ProcessPool(2, self._plan, show=False))
+            done = [pool.submit(work_on_chunk, self._plan, self._chunk) for _ in range(2)]
             # Any error there recurs here, and is reported.
             while concurrent.futures.wait(done, _PATIENCE_S).not_done:
                 raise_if_interrupt_waits()
-            raise _CompiledElsewhereError
+            raise _MissingKernelsError
 
 
 # Processes are spawned, not forked: compiled kernels, OpenCV and linear algebra libraries have
@@ -288,7 +281,7 @@ class _ProcessPool(ProcessPoolExecutor):
 
     def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
         context = multiprocessing.get_context("spawn")
-        arguments = (plan, context.RLock(), show)
+        arguments = (plan, [context.RLock() for _ in range(3)], show)
         super().__init__(count, mp_context=context, initializer=_begin, initargs=arguments)
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
@@ -315,27 +308,32 @@ class _ProcessPool(ProcessPoolExecutor):
                 manager.join(_GRACE_S)
 
 
-def _begin(plan: FramePlan, lock: RLock, show: bool) -> None:
-    """Initialise a worker process; the first one that needs the caches fills them for all."""
+def _begin(plan: FramePlan, locks: list[RLock], show: bool) -> None:
+    """Initialise a worker process; the first one that needs the tables makes them for all."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if show:
         show_announcements()
     cv2.setNumThreads(1)
-    on_compilation(lambda: _compile_or_wait(lock))
+    tables, *parts = locks
+    on_compilation(lambda: _before_compilation(tables))
     with suppress(Exception):  # any error recurs, and is reported, with the first task
         from detect.runs.frame import prepare  # loads detectors, which only workers need
 
-        with lock:
+        with tables:
             _in_worker(prepare, plan)
+    _parts[:] = parts
 
 
-def _compile_or_wait(lock: RLock) -> None:
-    if not _compiling and lock.acquire(block=False):
+def _before_compilation(lock: RLock) -> None:
+    if _compiling:
+        return
+    if _parts:
+        raise _MissingKernelsError
+    if lock.acquire(block=False):
         _compiling.append(lock)
         say_compiling()
-    elif not _compiling:
-        # All further kernels will be loaded: the other process has cached them.
+    else:  # further kernels will be loaded: the other process caches them
         with lock:
             pass
 
@@ -343,9 +341,31 @@ def _compile_or_wait(lock: RLock) -> None:
 def _in_worker(fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
     try:
         return fn(*args, **kwargs)
+    except _MissingKernelsError:
+        _compile_part(*cast("tuple[FramePlan, Chunk]", args))
+        return fn(*args, **kwargs)
     finally:
         while _compiling:
             _compiling.pop().release()
+
+
+def _compile_part(plan: FramePlan, chunk: Chunk) -> None:
+    """Compile the kernels of a plan, but those that other processes compile at the same time."""
+    from detect.runs.frame import compile_discs
+
+    locks = _parts.copy()
+    _parts.clear()
+    for lock, search in zip(locks, (True, False)):
+        if lock.acquire(block=False):
+            _compiling.append(lock)
+            if search:
+                say_compiling()
+                work_on_chunk(replace(plan, circles=None), chunk)
+            compile_discs(plan, search=search)
+            _compiling.pop().release()
+    for lock in locks:  # wait for the others
+        with lock:
+            pass
 
 
 def _end_with_parent() -> None:

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -36,6 +37,7 @@ from detect.runs.workers import (
 )
 from detect.settings import CircleSettings
 from detect.sources.opening import open_run
+from detect.terminal import on_compilation
 from tests.detect.commands import Captured
 from tests.detect.demo_frames import demo_frames
 from tests.detect.forked_runs import started
@@ -114,20 +116,16 @@ def test_impossible_numbers_of_workers_are_refused(jobs: int) -> None:
 
 
 def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any) -> None:
-    """By two processes, one for the later stages; the task that was interrupted begins again."""
+    """By two processes; the task that was interrupted begins again."""
     began: list[str] = []
-    processes: list[ThreadPoolExecutor] = []
 
-    class Process(ThreadPoolExecutor):
+    class Processes(ThreadPoolExecutor):
         def __init__(self, count: int, plan: FramePlan, *, show: bool) -> None:
             assert not show
             super().__init__(count)
-            processes.append(self)
 
         def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
-            plan, *chunk = args
-            process, words = processes.index(self), f"{bool(plan.lines)} {bool(plan.circles)}"
-            began.append(f"{process} {fn.__name__} {words} {chunk} {kwargs}")
+            began.append(f"{self._max_workers} {fn.__name__} {args[1]}")
             return super().submit(lambda: 1 / 0)  # what fails there is nothing to this process
 
     def work(plan: FramePlan, chunk: str) -> int:
@@ -136,22 +134,59 @@ def test_kernels_are_compiled_once_and_first(run_folder: Path, monkeypatch: Any)
                 began.append(f"compiled {chunk}")
         return 7
 
-    monkeypatch.setattr(workers_module, "_ProcessPool", Process)
+    monkeypatch.setattr(workers_module, "_ProcessPool", Processes)
     monkeypatch.setattr(workers_module, "_cores", lambda: 2)
     plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
     with local_workers(1, shared=True).start(plan) as executor:
         assert executor.submit(work, plan, "images").result() == 7
-    assert began == [
-        "0 work_on_chunk True False ['images'] {}",
-        "0 compile_discs False True [] {'search': True}",
-        "1 compile_discs False True [] {'search': False}",
-        "compiled images",
-        "compiled images",
-    ]
+    assert began == ["2 work_on_chunk images"] * 2 + ["compiled images"] * 2
     only_lines = replace(plan, circles=None)
     with local_workers(1, shared=True).start(only_lines) as executor:
         executor.submit(work, only_lines, "more")
-    assert began[-2:] == ["compiled more", "compiled more"]
+    assert began[4:] == ["compiled more", "compiled more"]
+
+
+def test_each_process_of_a_pool_compiles_a_part(run_folder: Path, monkeypatch: Any) -> None:
+    """And waits for the other one's, before its task begins again."""
+    began: list[str] = []
+    plan = FramePlan(open_run(run_folder).camera, LineSettings(), CircleSettings())
+    taken_elsewhere, waited_for = threading.Event(), threading.Event()
+    mine, other, tables = (multiprocessing.get_context("spawn").RLock() for _ in range(3))
+
+    def occupy() -> None:
+        with other:
+            taken_elsewhere.set()
+            waited_for.wait(10.0)
+            began.append("the other process is ready")
+
+    def compile_discs(plan: FramePlan, *, search: bool) -> None:
+        began.append(f"discs, search {search}")
+        with event.trigger_event("numba:compile"):  # is this process's own
+            began.append("compiled")
+        waited_for.set()
+
+    def work(plan: FramePlan, chunk: str) -> str:
+        began.append(f"{chunk}, discs {plan.circles is not None}")
+        with event.trigger_event("numba:compile"):
+            began.append("compiled")
+        return chunk
+
+    monkeypatch.setattr(workers_module, "work_on_chunk", work)
+    monkeypatch.setattr("detect.runs.frame.compile_discs", compile_discs)
+    monkeypatch.setattr(workers_module, "_parts", [mine, other])
+    forget = on_compilation(lambda: workers_module._before_compilation(tables))
+    thread = threading.Thread(target=occupy)
+    thread.start()
+    taken_elsewhere.wait(10.0)
+    assert workers_module._in_worker(work, plan, "images") == "images"
+    forget()
+    thread.join()
+    assert began == [
+        "images, discs True", "images, discs False", "compiled", "discs, search True", "compiled",
+        "the other process is ready", "images, discs True", "compiled",
+    ]  # fmt: skip
+    assert not workers_module._parts
+    assert not workers_module._compiling
 
 
 @pytest.mark.long
