@@ -25,10 +25,6 @@ FilePath = str | os.PathLike[str]
 
 _LARGEST_TEXT_BYTES = 1 << 28
 _DRIVE = re.compile(r"[A-Za-z]:")
-#: Names that denote a device on Windows, in any folder and with any ending.
-_DEVICE = re.compile(
-    r"(?:\A|/)(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?: *\.[^/]*)?(?:/|\Z)", re.IGNORECASE
-)
 
 
 def read_bounded(path: FilePath, largest_bytes: int, *, own: bool = False) -> bytes:
@@ -137,8 +133,6 @@ def leads_out(name: str, *folders: str) -> str | None:
         _within(posixpath.normpath(f"{home}/{parts}"), home) for home in folders or ("/any/folder",)
     ):
         return "leads out of the folder"
-    if _DEVICE.search(parts):
-        return "is the name of a device"
     return None
 
 

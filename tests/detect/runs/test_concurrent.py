@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,10 +16,7 @@ from tools.soak.short_runs import repeat_short_runs
 PATIENCE_S = 400.0
 DETECT = ("-m", "detect")
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(sys.platform == "win32", reason="files are locked as Unix does"),
-]
+pytestmark = pytest.mark.long
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
