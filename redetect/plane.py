@@ -51,6 +51,13 @@ def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
     return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
 
 
+def pose_differences(poses: FloatArray, others: FloatArray) -> FloatArray:
+    """(..., 3) poses minus others, component by component, headings wrapped."""
+    difference = poses - others
+    difference[..., 2] = wrap_angle(difference[..., 2])
+    return difference
+
+
 def chain_steps(steps: ArrayLike, start: ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:
     """Poses from odometry alone: the start, and the pose after each step.
 

@@ -26,6 +26,7 @@ from detect.verticals.refinement import LineFits
 from detect.verticals.response import Strip
 from detect.verticals.tilt import levelling_rotation, strongest_first
 from detect.verticals.tracking import LineTracks
+from redetect.angles import wrapped
 from redetect.array_types import FloatArray, IntArray
 from redetect.compiled import kernel
 
@@ -115,11 +116,6 @@ def _reach(pixel_rad: FloatArray, numbers: LineNumbers) -> FloatArray:
 
 
 @kernel()
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@kernel()
 def _bearings(
     fits: LineFits, tracks: IntArray, tilt: tuple[float, float], numbers: LineNumbers
 ) -> tuple[FloatArray, FloatArray]:
@@ -157,7 +153,7 @@ def _leave_out(
         for s in tracks[:k]:
             if outcome[s] != Outcome.ACCEPTED:
                 continue
-            off = abs(_wrapped(alpha[t] - alpha[s]))
+            off = abs(wrapped(alpha[t] - alpha[s]))
             near_px = off / pixel[t]
             if polarity[t] == polarity[s] and near_px < numbers.same_edge_px:
                 outcome[t] = Outcome.SAME_EDGE
@@ -197,12 +193,12 @@ def join_mixtures(
         total = off = square = 0.0
         for k in range(begin, end):
             total += weight[k]
-            off += weight[k] * _wrapped(alpha[k] - alpha[begin])
+            off += weight[k] * wrapped(alpha[k] - alpha[begin])
         off /= total
         for k in range(begin, end):
-            own = _wrapped(alpha[k] - alpha[begin]) - off
+            own = wrapped(alpha[k] - alpha[begin]) - off
             square += weight[k] * (sigma[k] * sigma[k] + own * own)
-        mean[n], deviation[n] = _wrapped(alpha[begin] + off), math.sqrt(square / total)
+        mean[n], deviation[n] = wrapped(alpha[begin] + off), math.sqrt(square / total)
     return mean, deviation
 
 

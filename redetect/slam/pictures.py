@@ -18,10 +18,11 @@ from matplotlib import pyplot
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from scipy.special import chdtri
 
 from redetect import plane
 from redetect.array_types import FloatArray, IntArray
-from redetect.landmarks import is_positive_definite, squared_mahalanobis, wrap_angle
+from redetect.landmarks import is_positive_definite, squared_mahalanobis
 from redetect.landmarks.map_file import LandmarkMap, MapLandmarks, Path2D
 from redetect.reporting.page import figure_file
 from redetect.slam.errors import SlamError
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 #: Central 95 % of chi squared with 3 degrees of freedom.
-NEES_BAND = (0.21579528262389785, 9.348403604496145)
+NEES_BAND = tuple(chdtri(3, [0.975, 0.025]).tolist())
 
 _WITHOUT_WINDOWS = ("agg", "cairo", "pdf", "pgf", "ps", "svg", "template")
 _PATH, _REFERENCE, _DISC, _LINE, _BAND = "#1f5f99", "#777777", "#c8501e", "#3a8f4c", "#2a78b5"
@@ -81,8 +82,7 @@ def pose_errors(path: Path2D, reference: FloatArray) -> tuple[FloatArray, FloatA
     `nees` (N,), NaN where a pose is given exactly.
     """
     assert path.covariance is not None
-    error = path.poses - reference
-    error[:, 2] = wrap_angle(error[:, 2])
+    error = plane.pose_differences(path.poses, reference)
     nees = np.full(len(error), np.nan)
     usable = is_positive_definite(path.covariance)
     nees[usable] = squared_mahalanobis(error[usable], path.covariance[usable])

@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from redetect.landmarks import squared_mahalanobis, wrap_angle
+from redetect.landmarks import squared_mahalanobis
 from redetect.landmarks.map_file import LandmarkMap, Path2D
+from redetect.plane import pose_differences
 from redetect.slam.errors import SlamError
 
 
@@ -21,8 +22,8 @@ def path_distance(path: Path2D, reference: ArrayLike, name: str = "") -> dict[st
     other = np.asarray(reference, dtype=np.float64)
     if len(other) != len(path.poses):
         raise SlamError(f"{name}{len(other)} poses: expected {len(path.poses)}, as in this run")
-    position = np.hypot(*(path.poses[:, :2] - other[:, :2]).T)
-    heading = np.abs(wrap_angle(path.poses[:, 2] - other[:, 2]))
+    x, y, turn = pose_differences(path.poses, other).T
+    position, heading = np.hypot(x, y), np.abs(turn)
     return {
         f"{name}_{figure}_{unit}": float(value)
         for name, unit, distance in (("position", "m", position), ("heading", "rad", heading))

@@ -60,7 +60,14 @@ def demand_writable(path: Path) -> None:
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
     """Reject outputs that could not be written later; folders may be created later."""
+    taken = set[Path]()
     for path in paths:
+        if path.resolve() in taken:
+            reason = (
+                "two of the outputs would be written there: expected different names or endings"
+            )
+            raise OSError(errno.EINVAL, reason, str(path))
+        taken.add(path.resolve())
         if path.parent.is_dir():
             demand_place(path, overwrite=overwrite)
         else:

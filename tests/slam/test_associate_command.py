@@ -106,7 +106,7 @@ def test_existing_files_and_settings_without_sense_are_refused(
         assert not target.exists()
     report = tmp_path / "found.json"
     assert main(["associate", run, "-o", str(report), "--force"]) == 1
-    assert "the scores are written there" in capsys.readouterr().err
+    assert "two of the outputs would be written there" in capsys.readouterr().err
     assert not report.exists()
 
 

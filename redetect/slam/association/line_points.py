@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from redetect.angles import wrapped
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 from redetect.landmarks import wrap_angle
@@ -73,11 +74,6 @@ class Rays(NamedTuple):
 
 
 @kernel()
-def _wrapped(angle: float) -> float:
-    return float((angle + math.pi) % (2.0 * math.pi) - math.pi)
-
-
-@kernel()
 def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
     """Points (k, 2) where rays of frames some steps apart cross, ahead of both, and the frames."""
     centre, angle, sigma, frame, start = rays.centre, rays.angle, rays.sigma, rays.frame, rays.start
@@ -90,7 +86,7 @@ def _crossings(rays: Rays) -> tuple[FloatArray, IntArray]:
             if other >= len(start) - 1:
                 continue
             for j in range(start[other], start[other + 1]):
-                parallax = abs(_wrapped(angle[j] - angle[i]))
+                parallax = abs(wrapped(angle[j] - angle[i]))
                 if parallax < _LEAST_PARALLAX_SIGMAS * math.hypot(sigma[i], sigma[j]):
                     continue
                 vx, vy = math.sin(angle[j]), -math.cos(angle[j])
@@ -159,7 +155,7 @@ def _meeting_point(rays: Rays, used: IntArray, point: FloatArray) -> FloatArray:
         a, b, c, d, e = 1e-6, 0.0, 1e-6, 0.0, 0.0
         for i in used:
             x, y = point[0] - rays.centre[i, 0], point[1] - rays.centre[i, 1]
-            off = _wrapped(math.atan2(x, -y) - rays.angle[i])
+            off = wrapped(math.atan2(x, -y) - rays.angle[i])
             squared = x * x + y * y
             by_x, by_y = -y / squared, x / squared
             variance = rays.sigma[i] ** 2

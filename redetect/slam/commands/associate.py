@@ -47,8 +47,6 @@ def perform(options: Associate) -> int:
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
     report = (options.output or targets[0]).with_suffix(".json")
-    if report in targets:
-        raise SlamError(f"{report}: the scores are written there: expected another suffix")
     demand_free([*targets, report], overwrite=options.force)
     runs = files.recordings_of(options)
     recording = joined(runs)

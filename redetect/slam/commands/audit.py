@@ -13,7 +13,6 @@ from redetect import __version__
 from redetect.landmarks import CircleLandmark, Row, read_frames, read_rows, write_rows
 from redetect.landmarks.map_file import write_table
 from redetect.slam.commands.files import recording_of
-from redetect.slam.errors import SlamError
 from redetect.slam.mapping.audit import Audit, audit_run, audited_rows
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
@@ -31,8 +30,6 @@ def perform(options: Options) -> int:
     (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")
     listed = target.with_suffix(".csv")
-    if listed == target:
-        raise SlamError(f"{target}: the rows are listed there: expected another suffix")
     demand_free((target, listed), overwrite=options.force)
     recording = recording_of(options)
     camera = None

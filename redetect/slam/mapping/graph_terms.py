@@ -11,7 +11,7 @@ from redetect.bounds import Bounded, Positive
 from redetect.landmarks import wrap_angle
 from redetect.least_squares import LossKind
 from redetect.least_squares.solver import Block, Linear, Loss, robust_cost, stack
-from redetect.plane import between
+from redetect.plane import between, pose_differences
 from redetect.slam import models
 from redetect.slam.errors import SlamError
 from redetect.slam.mapping.graph import Estimate, Graph
@@ -70,8 +70,7 @@ class Errors:
 
 def errors(graph: Graph, estimate: Estimate, weighting: Weighting) -> Errors:
     """Whitened errors at an estimate: predicted minus measured, in standard deviations."""
-    step = between(estimate.poses[:-1], estimate.poses[1:]) - graph.steps
-    step[:, 2] = wrap_angle(step[:, 2])
+    step = pose_differences(between(estimate.poses[:-1], estimate.poses[1:]), graph.steps)
     near, place = graph.line_prior, np.zeros((0, 2))
     if estimate.mounting is not None and graph.camera is not None:
         place = (estimate.mounting[None, :2, 3] - graph.camera.centre[:2]) / PLACE_PRIOR_M
