@@ -29,11 +29,11 @@ from redetect.groundtruth.lasers.tracking import (
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
     matched_streams,
-    pose_differences,
     read_planar_poses,
 )
 from redetect.groundtruth.validation.scoring import score_poses
 from redetect.landmarks import squared_mahalanobis
+from redetect.plane import pose_differences
 from tools.evaluation.figures import Figures, Study, StudyError, run_program
 from tools.evaluation.tables import Table
 from tools.simulator.laser.session_files import write_session

@@ -41,7 +41,9 @@ _REVERSAL_RAD = np.radians(150.0)
 class DriveStyle:
     """How the robot drives."""
 
-    step_m: float = 0.172  # Mean way between frames on a straight stretch (m); turning shortens it.
+    step_m: float = (
+        0.172  # Mean distance between frames when driving straight (m); shorter in turns.
+    )
     step_spread: float = 0.08  # Slow change of the speed, as a share (standard deviation).
     weave_m: float = 0.12  # Slow sideways deviation from the route (m, standard deviation).
     corner_m: float = 0.8  # Radius of rounded corners (m).
@@ -53,9 +55,9 @@ class DriveStyle:
 def drive(route: ArrayLike, steps: int, style: DriveStyle, rng: np.random.Generator) -> FloatArray:
     """Drive along a route. `route` (K, 2); returns (steps + 1, 3)."""
     dense = _weaving(_rounded(np.asarray(route, dtype=np.float64), style.corner_m), style, rng)
-    way = np.hypot(*np.diff(dense[:, :2], axis=0).T)
+    distance = np.hypot(*np.diff(dense[:, :2], axis=0).T)
     turn = np.abs(np.diff(dense[:, 2]))
-    cost = np.concatenate([[0.0], np.cumsum(way + _TURNING_COST_M * turn)])
+    cost = np.concatenate([[0.0], np.cumsum(distance + _TURNING_COST_M * turn)])
     pace = style.step_m * np.exp(style.step_spread * smooth_noise(steps, 25.0, rng))
     at = np.concatenate([[0.0], np.cumsum(pace)])
     if at[-1] > cost[-1]:
@@ -134,7 +136,7 @@ def _arc(start: FloatArray, heading: float, turn: float, radius: float) -> Float
 
 
 def _weaving(dense: FloatArray, style: DriveStyle, rng: np.random.Generator) -> FloatArray:
-    """Shift the way slowly sideways; the robot keeps looking along it."""
+    """Add a slow lateral offset to the path; headings stay tangential."""
     length = 1.6 / _DENSE_M
     off = style.weave_m * smooth_noise(len(dense), length, rng)
     slope = np.gradient(off) / _DENSE_M
@@ -159,14 +161,14 @@ _GAUSS_NODES = 4
 def step_covariance(steps: ArrayLike) -> FloatArray:
     """Covariance of steps as the data set has it. `steps` (..., 3); returns (..., 3, 3)."""
     step = np.asarray(steps, dtype=np.float64)
-    way = np.hypot(step[..., 0], step[..., 1])
-    heading = HEADING_VARIANCE_PER_M * way + HEADING_VARIANCE_PER_RAD * np.abs(step[..., 2])
+    distance = np.hypot(step[..., 0], step[..., 1])
+    heading = HEADING_VARIANCE_PER_M * distance + HEADING_VARIANCE_PER_RAD * np.abs(step[..., 2])
     position = heading / HEADING_OVER_POSITION
     covariance = np.zeros((*step.shape[:-1], 3, 3))
     covariance[..., 0, 0] = covariance[..., 1, 1] = position
     nodes, weights = np.polynomial.legendre.leggauss(_GAUSS_NODES)
     for node, weight in zip(0.5 * (nodes + 1.0), 0.5 * weights):
-        # A heading error at this share of the way turns the rest of the step.
+        # A heading error at this share of the step turns the rest of the step.
         rest_x, rest_y = _rest_of_arc(step, float(node))
         lever = np.stack([-rest_y, rest_x, np.ones_like(rest_x)], axis=-1)
         outer = lever[..., :, None] * lever[..., None, :]
@@ -175,7 +177,7 @@ def step_covariance(steps: ArrayLike) -> FloatArray:
 
 
 def _rest_of_arc(step: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-    """The rest of steps after a share of their way (an arc), in the frame before them."""
+    """The rest of steps after a share of their arc, in the frame before them."""
     dphi = step[..., 2]
     # Chord of the first `share` of an arc: its direction turns back by half of what is missing.
     small = np.abs(dphi) < 1e-9

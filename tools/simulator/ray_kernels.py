@@ -148,7 +148,7 @@ _PARQUET, _PAVING = int(Flooring.PARQUET), int(Flooring.PAVING)
 _DISC, _RING, _ELLIPSE, _PLATE = int(Mark.DISC), int(Mark.RING), int(Mark.ELLIPSE), int(Mark.PLATE)
 _LIGHT_SPOT, _PRINTED = int(Mark.LIGHT_SPOT), int(Mark.PRINTED)
 
-#: What a ray met where that is not a parallelogram (those count from 0).
+#: Codes for hits on other things than parallelograms, which count from 0.
 FLOOR, CEILING, SKY = -1, -2, -3
 
 _HORIZON_LIMIT = 400.0
@@ -397,7 +397,7 @@ def radiance(
     dx: float, dy: float, dz: float,
     met: int, distance: float, pixel_angle: float,
 ) -> tuple[float, int, float]:  # fmt: skip
-    """Light that comes back along a ray."""
+    """Radiance along a ray."""
     x, y, z = ox + distance * dx, oy + distance * dy, oz + distance * dz
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     footprint = pixel_angle * distance * length
@@ -501,7 +501,7 @@ _UPRIGHT_HEIGHT_M = 1.2
 
 @nb.njit(cache=True, error_model="numpy")
 def _returned(scene: Scene, met: int) -> float:
-    """Light that comes back from a thing, roughly: what its own light is is not known yet."""
+    """Approximate radiance of a surface, before its own illumination is known."""
     if met == SKY:
         return scene.sky
     if met == CEILING:

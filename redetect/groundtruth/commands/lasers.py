@@ -23,8 +23,9 @@ from redetect.groundtruth.lasers.tracking_kernels import BeamCounts
 from redetect.groundtruth.lasers.walls import averaged_scan
 from redetect.groundtruth.options import Laser, Lasers
 from redetect.groundtruth.report.pictures import draw_alignment
-from redetect.groundtruth.trajectories.streams import pose_differences, write_planar_poses
+from redetect.groundtruth.trajectories.streams import write_planar_poses
 from redetect.json_text import json_text
+from redetect.plane import pose_differences
 from redetect.storage import write_bytes
 
 #: Scanners this many standard deviations from their measured pose are reported.

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.progress import track
 
 from redetect import __version__
-from redetect.groundtruth.errors import GroundTruthError
 from redetect.storage import demand_free
 
 T = TypeVar("T")
@@ -21,15 +20,7 @@ T = TypeVar("T")
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Raise an error if an output exists and must not be replaced, or two are the same file."""
-    given = [path for path in paths if path is not None]
-    demand_free(given, overwrite=force)
-    places = [path.resolve() for path in given]
-    for i, path in enumerate(given):
-        if places[i] in places[:i]:
-            raise GroundTruthError(
-                f"{path}: two of the outputs would be written there: expected different names or "
-                "endings"
-            )
+    demand_free([path for path in paths if path is not None], overwrite=force)
 
 
 def remove_old(paths: Sequence[Path | None], force: bool) -> None:

@@ -208,7 +208,7 @@ def on_one_line(segments: Sequence[ClockSegment]) -> list[ClockSegment]:
     if len(determined) < 2 or others:
         return list(segments)
     middle = float(np.mean([segment.reference_s for segment in determined]))
-    rows: list[tuple[float, ...]] = []  # Derivatives by the line, value, deviation
+    rows: list[tuple[float, ...]] = []  # Derivatives by the line, value, sigma
     for s in determined:
         rows.append((1.0, s.reference_s - middle, s.offset_s, s.sigma_offset_s))
         rows.append((0.0, 1.0, s.rate - 1.0, s.sigma_rate))

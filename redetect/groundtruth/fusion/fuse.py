@@ -20,7 +20,12 @@ from scipy.special import chdtri
 
 from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
-from redetect.groundtruth.fusion.inputs import noise_of, pauses_of, systematic_sigmas, with_sag
+from redetect.groundtruth.fusion.inputs import (
+    noise_of,
+    pauses_of,
+    systematic_sigmas,
+    with_interpolation_error,
+)
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
@@ -33,13 +38,13 @@ from redetect.groundtruth.trajectories.streams import (
     last_of_each_time,
     moved_poses,
     planar_alignment,
-    pose_differences,
     segments_between_gaps,
 )
 from redetect.landmarks import squared_mahalanobis, wrap_angle
 from redetect.messages import counted
+from redetect.plane import pose_differences
 
-# Factors on odometry's deviations that are tried, and the number of nodes used.
+# Factors on odometry's standard deviations that are tried, and the number of nodes used.
 _NOISE_FACTORS = (0.01, 20.0)
 _MOST_NODES_TO_LEARN_FROM = 30_000
 _LONGEST_GAP_TO_LEARN_FROM_S = 20.0
@@ -50,7 +55,7 @@ _LOOSENING_ROUNDS = 3
 _DOUBT = 0.001
 # Akaike's criterion: by chance, an estimate fits its own measurements better by this.
 _COST_OF_TERM = 2.0
-# Share of its prior deviation below which an estimate counts as measured.
+# Share of its prior standard deviation below which an estimate counts as measured.
 _MEASURED = 0.5
 # A longer pause in the ground truth begins another segment; fused poses and odometry are not
 # interpolated over a longer one.
@@ -118,7 +123,7 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
 
 
 def useful_terms(
-    problem: MovementProblem, noise: FloatArray, means: FloatArray, deviations: FloatArray
+    problem: MovementProblem, noise: FloatArray, means: FloatArray, sigmas: FloatArray
 ) -> BoolArray:
     """(3,) mask of odometry's systematic errors whose estimates improve predictions over seconds.
 
@@ -127,15 +132,15 @@ def useful_terms(
     over gaps, such an estimate makes predictions worse.
     """
     thin = problem.thinned().split(math.inf)
-    kept = deviations > 0.0
+    kept = sigmas > 0.0
 
     def aic(terms: BoolArray) -> float:
-        found = (part.innovations(noise, (means * terms, deviations * terms)) for part in thin)
+        found = (part.innovations(noise, (means * terms, sigmas * terms)) for part in thin)
         return sum(part.deviance for part in found) + _COST_OF_TERM * np.count_nonzero(terms)
 
     best = aic(kept)
     # Terms that were hardly measured keep their uncertainty.
-    measured = deviations < _MEASURED * systematic_sigmas(problem.settings)
+    measured = sigmas < _MEASURED * systematic_sigmas(problem.settings)
     while np.any(kept & measured):
         fewer = [kept & (np.arange(3) != term) for term in np.flatnonzero(kept & measured)]
         tried = [aic(terms) for terms in fewer]
@@ -210,8 +215,8 @@ class Fusion:
     odometry: OdometryErrors  # The estimated errors of odometry
     localisation: LocalisationErrors | None  # Errors of odometry treated as a localisation
     repaired: dict[str, int]  # Number of covariances that were not positive definite, by stream
-    # Jitter of the poses in their stated deviations, by stream, 1 if these can be right. Those that
-    # are too small were raised; of those too large, odometry's noise was learned as if lowered.
+    # Short-term scatter of the poses over their stated standard deviations, by stream; 1 if these
+    # may be right. Smaller ones were raised, larger ones lowered to learn odometry's noise.
     jitter: dict[str, float]
     # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
     # wheels or a reset, and its pauses: the covariances do not rely on it there.
@@ -241,7 +246,7 @@ def fuse(
     usable = {name: with_usable_covariances(name, one) for name, one in streams.items()}
     covered = {name: with_jitter_covered(stream) for name, (stream, _) in usable.items()}
     own = last_of_each_time(odometry)
-    streams = {name: with_sag(stream, own) for name, (stream, _) in covered.items()}
+    streams = {name: with_interpolation_error(stream, own) for name, (stream, _) in covered.items()}
     problem = movement_problem(odometry, streams, settings)
     wrong = wrong_starts(problem)
     rejected = _rejected(problem, wrong, wrong > 0.0)
@@ -272,7 +277,7 @@ def fuse(
     smoothed, spread, innovations = problem.smooth(noise, inflation)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
-    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], _systematic_deviations(spread))
+    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], _systematic_sigmas(spread))
     if not np.all(kept):
         names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
         fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
@@ -292,7 +297,7 @@ def fuse(
             path, localisation = found
             restarted[:] = False
     rejected += _rejected(problem, innovations.squared, ~innovations.accepted)
-    numbers = [smoothed[-1, 3:], _systematic_deviations(spread), noise, np.array([inflation])]
+    numbers = [smoothed[-1, 3:], _systematic_sigmas(spread), noise, np.array([inflation])]
     pauses = pauses_of(own)
     return Fusion(
         poses=path,
@@ -312,7 +317,7 @@ def fuse(
     )
 
 
-def _systematic_deviations(spread: FloatArray) -> FloatArray:
+def _systematic_sigmas(spread: FloatArray) -> FloatArray:
     """(3,) of odometry's errors: constants, whose estimate at the last node uses everything."""
     return np.asarray(np.sqrt(np.maximum(np.diagonal(spread[-1])[POSE:], 0.0)))
 

@@ -31,7 +31,7 @@ _USUAL_RATES_QUANTILE = 0.9
 
 
 def systematic_sigmas(settings: FuseSettings) -> FloatArray:
-    """(3,) prior deviations of turn scale, turn per metre (rad) and distance scale."""
+    """(3,) prior standard deviations of turn scale, turn per metre (rad) and distance scale."""
     s = settings
     return np.array([s.turn_scale_sigma, s.turn_bias_per_metre_sigma, s.distance_scale_sigma])
 
@@ -69,18 +69,20 @@ def movements(odometry: PlanarPoses, node_times_s: FloatArray) -> tuple[FloatArr
     distance, turn = np.hypot(arcs[:, 0], arcs[:, 1]), arcs[:, 2]
     turned, _ = _within(odometry.times_s, turn, _DISTINCT_OVER_S)
     distinct = np.where(np.abs(turned) > _DISTINCT_RAD, turn, 0.0)
-    arcs = np.column_stack([arcs, distinct, _unseen(odometry.times_s, distance, turn)])
+    controls = np.column_stack([arcs, distinct])
+    hidden = _unseen(odometry.times_s, distance, turn)
     last = len(odometry) - 2
     at = np.clip(np.searchsorted(odometry.times_s, node_times_s[:-1], side="right") - 1, 0, last)
     share = np.diff(node_times_s) / (odometry.times_s[at + 1] - odometry.times_s[at])
-    shares = np.concatenate([np.zeros((1, 8)), share[:, None] * arcs[at]])
+    share, first = share[:, None], np.zeros((1, 4))
+    unseen = share * hidden[at]
     # What is not of the usual movement in a part of a pause is in the rest of it.
-    shares[1:, 6:] = np.square(np.minimum(share, 1.0 - share)[:, None] * arcs[at, 6:])
-    return shares[:, :4].copy(), shares[:, 4:].copy()
+    unseen[:, 2:] = np.square(np.minimum(share, 1.0 - share) * hidden[at, 2:])
+    return np.concatenate([first, share * controls[at]]), np.concatenate([first, unseen])
 
 
-def with_sag(poses: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
-    """Measured poses with the deviation of the path from odometry's arcs in their covariances.
+def with_interpolation_error(poses: PlanarPoses, odometry: PlanarPoses) -> PlanarPoses:
+    """Measured poses with the error of interpolating odometry by arcs in their covariances.
 
     Between two samples it is that of a parabola, as speeds before and after them differ.
     `odometry` has two or more samples at distinct times; in its pauses nothing is added.

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from redetect.angles import wrapped
 from redetect.array_types import BoolArray, FloatArray, IntArray
 from redetect.compiled import kernel
 
@@ -130,12 +131,6 @@ def predict(
     for i, j, value in ((0, 1, cross), (0, 2, of_turn * by_turn_x), (1, 2, of_turn * by_turn_y)):
         p[i, j] += value
         p[j, i] += value
-
-
-@kernel()
-def wrap(angle: float) -> float:
-    """The same angle in [-pi, pi)."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @kernel()
@@ -322,9 +317,9 @@ def filter_forward(
                 innovation[i] = measured.poses[m, i] - x[i]
             if points.shape[0] > 1:
                 ahead = points[k, 2] - x[2]
-                innovation[2] = ahead + wrap(innovation[2] - ahead)
+                innovation[2] = ahead + wrapped(innovation[2] - ahead)
             else:
-                innovation[2] = wrap(innovation[2])
+                innovation[2] = wrapped(innovation[2])
             lost = m > 0 and (cut or p[2, 2] > gating.lost_variance)
             if lost or rejections >= gating.restart_after:
                 _restart(x, p, innovation, gating.restart_variances)

@@ -28,10 +28,9 @@ from redetect.groundtruth.trajectories.streams import (
     interpolate_poses,
     moved_poses,
     planar_alignment,
-    pose_differences,
 )
 from redetect.landmarks import wrap_angle
-from redetect.plane import rotation
+from redetect.plane import pose_differences, rotation
 
 # Both models of odometry are compared on thinned measurements, if there are enough, and only if a
 # longer gap has to be bridged.

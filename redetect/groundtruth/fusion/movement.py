@@ -23,11 +23,8 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.fusion import inputs, kernels
 from redetect.groundtruth.fusion.slips import UNMEASURED_S, slip_variances
 from redetect.groundtruth.settings import FuseSettings
-from redetect.groundtruth.trajectories.streams import (
-    PlanarPoses,
-    last_of_each_time,
-    pose_differences,
-)
+from redetect.groundtruth.trajectories.streams import PlanarPoses, last_of_each_time
+from redetect.plane import pose_differences
 
 # Predictions of odometry over seconds are between measurements this far apart, or farther.
 _SPACING_S = 2.0

@@ -198,7 +198,7 @@ def acquire(
     differ by more than a symmetry of the outline, None is returned; with a symmetric outline it is
     one of the equivalent poses.
     """
-    seen = new_points(scans, fixed, np.zeros(2), math.inf, np.zeros(5))
+    seen = new_points(scans, fixed, np.zeros(2), math.inf, np.zeros(3), np.zeros(2))
     if len(seen.points) < _ACQUIRED_READINGS:
         return None
     found: list[tuple[float, FloatArray]] = []

@@ -34,9 +34,9 @@ from redetect.groundtruth.lasers.tracking_kernels import (
     refine_outline,
 )
 from redetect.groundtruth.settings import LaserSettings
-from redetect.groundtruth.trajectories.streams import PlanarPoses, pose_differences
+from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.landmarks import wrap_angle
-from redetect.plane import apply, compose, invert, rotation, with_heading
+from redetect.plane import apply, compose, invert, pose_differences, rotation, with_heading
 
 # Gains of the filter that predicts the start for the next set.
 _POSE_GAIN, _MOTION_GAIN = 0.4, 0.08
@@ -239,7 +239,7 @@ class Tracker:
         """New readings of set i where the robot may be."""
         centre = apply(pose, self.body.middle)
         reach = self.body.radius_m + self.settings.gate_m + self.speed * unseen_s
-        return new_points(self.sets[i], self.fixed, centre, reach, np.array([*motion, *pose[:2]]))
+        return new_points(self.sets[i], self.fixed, centre, reach, motion, pose[:2])
 
     def _refined(self, seen: NewReadings, start: FloatArray, prior_m: float) -> OutlinePose:
         return refine_outline(seen, self.body, start, self.fixed, self.settings.gate_m, prior_m)

@@ -102,15 +102,17 @@ class BeamCounts(NamedTuple):
 
 @kernel()
 def new_points(
-    scans: ScanSet, fixed: FixedScanners, centre: FloatArray, reach_m: float, motion: FloatArray
-) -> NewReadings:
+    scans: ScanSet, fixed: FixedScanners, centre: FloatArray, reach_m: float,
+    velocity: FloatArray, about: FloatArray,
+) -> NewReadings:  # fmt: skip
     """Points of a set that are nearer than the background and within reach of a position.
 
-    `centre` (2,): points farther than `reach_m` from here are ignored. `motion` (5,) of the robot:
-    velocity (m/s), turn rate (rad/s), and the point it turns about at the set's time. It is used to
-    propagate the points from their beam's time to the set's.
+    `centre` (2,): points farther than `reach_m` from here are ignored. Points are propagated from
+    their beam's time to the set's by the robot's `velocity` (3,) (m/s, m/s, rad/s), and turned
+    `about` (2,), its position at the set's time.
     """
     ranges_mm, rows, ages_s = scans
+    vx, vy, rate = velocity[0], velocity[1], velocity[2]
     most = rows.size * ranges_mm.shape[1]
     points = np.empty((most, 2))
     scanner = np.empty(most, dtype=np.int64)
@@ -130,13 +132,13 @@ def new_points(
             if dx * dx + dy * dy > reach_m * reach_m:
                 continue
             age = ages_s[s] - fixed.beam_times_s[s, i]
-            c, sn = math.cos(motion[2] * age), math.sin(motion[2] * age)
+            c, sn = math.cos(rate * age), math.sin(rate * age)
             # From where the robot was at the beam's time, along an arc.
-            ca, sa = math.cos(0.5 * motion[2] * age), math.sin(0.5 * motion[2] * age)
-            dx = x - motion[3] + (ca * motion[0] + sa * motion[1]) * age
-            dy = y - motion[4] + (ca * motion[1] - sa * motion[0]) * age
-            points[n, 0] = motion[3] + c * dx - sn * dy
-            points[n, 1] = motion[4] + sn * dx + c * dy
+            ca, sa = math.cos(0.5 * rate * age), math.sin(0.5 * rate * age)
+            dx = x - about[0] + (ca * vx + sa * vy) * age
+            dy = y - about[1] + (ca * vy - sa * vx) * age
+            points[n, 0] = about[0] + c * dx - sn * dy
+            points[n, 1] = about[1] + sn * dx + c * dy
             bx, by = fixed.direction[s, i, 0], fixed.direction[s, i, 1]
             direction[n, 0], direction[n, 1] = c * bx - sn * by, sn * bx + c * by
             scanner[n] = s

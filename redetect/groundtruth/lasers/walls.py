@@ -23,9 +23,8 @@ from scipy.spatial import cKDTree
 from redetect.array_types import FloatArray, IntArray
 from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.scanners import Scanner
-from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.landmarks import wrap_angle
-from redetect.plane import compose, rotation
+from redetect.plane import compose, pose_differences, rotation
 
 #: Least joint standard deviation of readings, wall and map (m).
 FLOOR_M = 0.001

@@ -20,10 +20,10 @@ from redetect.groundtruth.report.pictures import (
     series_figure,
     stages_figure,
 )
-from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams, pose_differences
+from redetect.groundtruth.trajectories.streams import PlanarPoses, matched_streams
 from redetect.groundtruth.validation import scoring
 from redetect.groundtruth.validation.reference_poses import Dimension, SurveyedFiducials
-from redetect.plane import apply, fitted
+from redetect.plane import apply, fitted, pose_differences
 from redetect.reporting.page import Part, Section, image_part, page_of
 
 # Colours and dashes, which distinguish streams without colour, too.

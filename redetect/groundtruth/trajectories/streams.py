@@ -19,8 +19,7 @@ from redetect.array_types import BoolArray, FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import PathLike, parse_numbers, read_rows
 from redetect.groundtruth.trajectories import se3
-from redetect.landmarks import wrap_angle
-from redetect.plane import fitted, rotation, with_heading
+from redetect.plane import fitted, pose_differences, rotation, with_heading
 from redetect.storage import write_bytes
 
 #: Half of the last digit of the covariances in RAWSEEDS' own files.
@@ -225,10 +224,3 @@ def moved_poses(poses: PlanarPoses, motion: FloatArray) -> PlanarPoses:
     turn = with_heading(rotation(motion[2]))
     covariances = None if poses.covariances is None else turn @ poses.covariances @ turn.T
     return PlanarPoses(poses.times_s, poses.poses @ turn.T + motion, covariances)
-
-
-def pose_differences(poses: FloatArray, truth: FloatArray) -> FloatArray:
-    """(..., 3) poses minus the truth's, headings wrapped."""
-    difference = poses - truth
-    difference[..., 2] = wrap_angle(difference[..., 2])
-    return difference

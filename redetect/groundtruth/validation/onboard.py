@@ -32,11 +32,9 @@ from redetect.groundtruth.lasers.walls import (
     wall_curves,
     walls_near,
 )
-from redetect.groundtruth.trajectories.streams import pose_differences
 from redetect.groundtruth.validation.reference_poses import DistancePose, DistanceStatus
 from redetect.landmarks import wrap_angle
-from redetect.least_squares.solver import Block, normal_equations, stack, whitening
-from redetect.plane import apply, compose, rotation
+from redetect.plane import apply, compose, pose_differences, rotation
 
 # The robot is assumed at rest for this long before and after the time of the distances.
 _STILL_S = 0.5
@@ -272,7 +270,7 @@ def refine_mounts(
     if len(every) < 3:
         return None
     priors = np.stack([r.distances.pose for r in used])
-    roots = whitening(np.stack([r.distances.covariance for r in used]))
+    of_priors = np.linalg.inv(np.stack([r.distances.covariance for r in used]))
     mounts = every[0].mounts
     poses, count = np.stack([r.pose for r in used]), len(mounts)
     along = segments[:, 2:] - segments[:, :2]
@@ -281,7 +279,8 @@ def refine_mounts(
     # The unknowns are the mounts, then the poses.
     unknowns, of_poses = 3 * (count + len(used)), 3 * (count + np.arange(len(used)))
     for gate in _GATES_M:
-        blocks = []
+        information, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        squares, readings = 0.0, 0
         for r, averaged in enumerate(every):
             for m, scan in enumerate(averaged.scans):
                 world = apply(compose(poses[r], mounts[m]), scan.points)
@@ -292,25 +291,25 @@ def refine_mounts(
                 about_mount = _moment(world - apply(poses[r], mounts[m, :2]), normal)
                 by_mount = np.column_stack([normal @ rotation(poses[r, 2]), about_mount])
                 by_pose = np.column_stack([normal, _moment(world - poses[r, :2], normal)])
-                by = [
-                    (np.full(len(error), 3 * m), by_mount[:, None]),
-                    (np.full(len(error), of_poses[r]), by_pose[:, None]),
-                ]
-                blocks.append(Block(error[:, None], by))
-        missing = (roots @ pose_differences(poses, priors)[..., None])[..., 0]
-        of_priors = normal_equations(stack([Block(missing, [(of_poses, roots)])], unknowns, 0))
-        walls = stack(blocks, unknowns, 0)
-        of_walls = normal_equations(walls)
-        variance = max(float(np.mean(walls.residual**2)), _LEAST_SIGMA_M**2)
-        information = (of_walls.matrix / variance + of_priors.matrix).toarray()
+                jacobian = np.hstack([by_mount, by_pose])
+                own = np.r_[3 * m : 3 * m + 3, of_poses[r] : of_poses[r] + 3]
+                information[np.ix_(own, own)] += jacobian.T @ jacobian
+                gradient[own] += jacobian.T @ error
+                squares, readings = squares + error @ error, readings + len(error)
+        variance = max(squares / max(readings, 1), _LEAST_SIGMA_M**2)
+        information /= variance
+        gradient /= variance
+        for at, prior, missing in zip(of_poses, of_priors, pose_differences(poses, priors)):
+            information[at : at + 3, at : at + 3] += prior
+            gradient[at : at + 3] += prior @ missing
         seen = np.diagonal(information)[: 3 * count].reshape(-1, 3).min(axis=1) > 0.0
         # The mounts of others stay as they are.
         information[np.arange(3 * count), np.arange(3 * count)] += np.repeat(~seen, 3)
         try:
-            covariance = np.linalg.inv(information)
+            covariance = np.asarray(np.linalg.inv(information), np.float64)
         except np.linalg.LinAlgError:
             return None
-        step = -covariance @ (of_walls.gradient / variance + of_priors.gradient)
+        step = -covariance @ gradient
         mounts = mounts + step.reshape(-1, 3)[:count]
         poses = poses + step.reshape(-1, 3)[count:]
     scanners = tuple(s for s, there in zip(every[0].scanners, seen) if there)

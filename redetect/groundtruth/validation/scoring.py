@@ -16,14 +16,10 @@ from scipy.special import chdtri
 from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.files import PathLike, read_table
-from redetect.groundtruth.trajectories.streams import (
-    PlanarPoses,
-    interpolate_poses,
-    pose_differences,
-)
+from redetect.groundtruth.trajectories.streams import PlanarPoses, interpolate_poses
 from redetect.groundtruth.validation.onboard import ReferencePose, Refused
 from redetect.landmarks import is_positive_definite, squared_mahalanobis
-from redetect.plane import between
+from redetect.plane import between, pose_differences
 
 #: Covariances rounded to six decimals in files are singular below this.
 LEAST_CORRELATION = 1e-9

@@ -73,7 +73,7 @@ def one_set(
 
 
 def seen_in(sets: ScanSets, tables: FixedScanners, pose: FloatArray, index: int = 0) -> NewReadings:
-    return new_points(sets[index], tables, pose[:2], 2.0, np.zeros(5))
+    return new_points(sets[index], tables, pose[:2], 2.0, np.zeros(3), np.zeros(2))
 
 
 def test_points_are_moved_on_with_the_robot() -> None:
@@ -94,8 +94,7 @@ def test_points_are_moved_on_with_the_robot() -> None:
         np.full((1, 1), 1e9), (ray / length)[None, None], origin[None], np.ones(1), np.eye(3),
         np.full((1, 1), -0.4 * age),
     )  # fmt: skip
-    about = np.array([*motion, *pose[:2]])
-    points, _, _, range_m = new_points(scan, fixed, pose[:2], 1.0, about)
+    points, _, _, range_m = new_points(scan, fixed, pose[:2], 1.0, motion, pose[:2])
     c, s = np.cos(pose[2]), np.sin(pose[2])
     expected = pose[:2] + np.array([c * mark[0] - s * mark[1], s * mark[0] + c * mark[1]])
     assert points[0] == pytest.approx(expected, abs=6e-4)  # readings are in millimetres

@@ -210,7 +210,7 @@ def test_a_straight_drive_is_a_trapezoid() -> None:
 def test_a_robot_drives_along_its_heading_within_its_limits_and_stands_at_stops() -> None:
     limits = DrivingLimits(0.8, 0.7, 0.5)
     corners = np.array([[0, 0], [3, 0], [4, 2], [2, 3], [0.5, 1.5], [-1, 3], [-3, 1]], float)
-    way = Curve(corners).way_of_waypoint(3)
+    way = Curve(corners).arc_length_at(3)
     route = Route(corners, [Stop(2.0, 1.5), Stop(way, 3.0)], limits, 0.0)
     step = 1e-3
     times = np.arange(0.0, route.end_s, step)

@@ -16,9 +16,9 @@ _GRID_M = 0.002
 
 @dataclass(frozen=True)
 class Stop:
-    """A place on the way where the robot stops."""
+    """A place on the route where the robot stops."""
 
-    way_m: float
+    distance_m: float
     length_s: float
 
 
@@ -32,20 +32,20 @@ class Route:
         speed = np.minimum(
             limits.speed_m_s, limits.turn_rad_s / np.maximum(np.abs(curve.bend), 1e-9)
         )
-        halts = [0.0, *(stop.way_m for stop in stops), float(curve.way[-1])]
-        speed[np.searchsorted(curve.way, halts).clip(0, len(speed) - 1)] = 0.0
-        speed = _reachable(speed, np.diff(curve.way), limits.acceleration_m_s2)
+        halts = [0.0, *(stop.distance_m for stop in stops), float(curve.arc_length[-1])]
+        speed[np.searchsorted(curve.arc_length, halts).clip(0, len(speed) - 1)] = 0.0
+        speed = _reachable(speed, np.diff(curve.arc_length), limits.acceleration_m_s2)
         # Speed changes linearly with time within a cell of the grid; two cells between stops.
-        lengths = 2.0 * np.diff(curve.way) / np.maximum(speed[1:] + speed[:-1], 1e-6)
+        lengths = 2.0 * np.diff(curve.arc_length) / np.maximum(speed[1:] + speed[:-1], 1e-6)
         waits = np.zeros(len(speed))
         for stop in stops:
-            waits[np.searchsorted(curve.way, stop.way_m)] += stop.length_s
+            waits[np.searchsorted(curve.arc_length, stop.distance_m)] += stop.length_s
         leave = np.concatenate([[0.0], np.cumsum(lengths + waits[1:])]) + start_s
         self._arrive, self._leave = leave - waits, leave
         self._curve, self._speed = curve, speed
         self.start_s, self.end_s = float(start_s), float(leave[-1])
         #: Begin and end of each stop.
-        at = [int(np.searchsorted(curve.way, stop.way_m)) for stop in stops]
+        at = [int(np.searchsorted(curve.arc_length, stop.distance_m)) for stop in stops]
         self.stands = [(float(self._arrive[i]), float(self._leave[i])) for i in at]
 
     def poses(self, times_s: ArrayLike) -> FloatArray:
@@ -58,12 +58,12 @@ class Route:
         length = self._arrive[cell + 1] - self._leave[cell]
         passed = np.clip(times - self._leave[cell], 0.0, length)
         gain = (self._speed[cell + 1] - self._speed[cell]) / length
-        way = self._curve.way[cell] + passed * (self._speed[cell] + 0.5 * gain * passed)
-        return self._curve.poses(np.minimum(way, self._curve.way[cell + 1]))
+        distance = self._curve.arc_length[cell] + passed * (self._speed[cell] + 0.5 * gain * passed)
+        return self._curve.poses(np.minimum(distance, self._curve.arc_length[cell + 1]))
 
 
 class Curve:
-    """A cubic spline through waypoints by its length; `way` (M,) and `bend` (M,) on a fine grid."""
+    """A cubic spline through waypoints; `arc_length` (M,) and `bend` (M,) on a fine grid."""
 
     def __init__(self, waypoints: FloatArray, grid_m: float = _GRID_M) -> None:
         chords = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints, axis=0).T))])
@@ -72,22 +72,22 @@ class Curve:
         rate = np.hypot(*self._spline(u, 1).T)
         steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(u)
         self._chords = chords
-        self._u, self.way = u, np.concatenate([[0.0], np.cumsum(steps)])
+        self._u, self.arc_length = u, np.concatenate([[0.0], np.cumsum(steps)])
         # Straight pieces between the grid's points would make the speed jump.
-        self._u_of_way = CubicHermiteSpline(self.way, u, 1.0 / rate)
+        self._u_of_arc_length = CubicHermiteSpline(self.arc_length, u, 1.0 / rate)
         d1, d2 = self._spline(u, 1), self._spline(u, 2)
         self.bend = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]) / rate**3
         self._heading = np.unwrap(np.arctan2(d1[:, 1], d1[:, 0]))
 
-    def way_of_waypoint(self, index: int) -> float:
-        """Length of the way from the start to a waypoint (m)."""
-        return float(np.interp(self._chords[index], self._u, self.way))
+    def arc_length_at(self, index: int) -> float:
+        """Length of the curve from the start to a waypoint (m)."""
+        return float(np.interp(self._chords[index], self._u, self.arc_length))
 
-    def poses(self, way_m: FloatArray) -> FloatArray:
-        """(N, 3) poses at ways from the start; theta is the curve's direction, continuous."""
-        u = self._u_of_way(way_m)
+    def poses(self, distance_m: FloatArray) -> FloatArray:
+        """(N, 3) poses at distances from the start; theta is the curve's direction, continuous."""
+        u = self._u_of_arc_length(distance_m)
         d1 = self._spline(u, 1)
-        near = np.interp(way_m, self.way, self._heading)
+        near = np.interp(distance_m, self.arc_length, self._heading)
         theta = np.arctan2(d1[:, 1], d1[:, 0])
         theta += 2.0 * np.pi * np.rint((near - theta) / (2.0 * np.pi))
         return np.column_stack([self._spline(u), theta])
@@ -108,18 +108,18 @@ def measured_path(poses: FloatArray, errors: WheelErrors, rng: np.random.Generat
     turn = np.diff(poses[:, 2])
     step = np.diff(poses[:, :2], axis=0)
     middle = poses[:-1, 2] + 0.5 * turn
-    way = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
-    noise = rng.standard_normal((4, len(way)))
-    way_m = errors.scale * way + errors.sigma_m * np.sqrt(np.abs(way)) * noise[0]
-    turn_rad = errors.turn_scale * turn + errors.turn_per_m * way
+    distance = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
+    noise = rng.standard_normal((4, len(distance)))
+    driven_m = errors.scale * distance + errors.sigma_m * np.sqrt(np.abs(distance)) * noise[0]
+    turn_rad = errors.turn_scale * turn + errors.turn_per_m * distance
     turn_rad += errors.sigma_turn * np.sqrt(np.abs(turn)) * noise[1]
-    turn_rad += errors.sigma_turn_per_m * np.sqrt(np.abs(way)) * noise[2]
+    turn_rad += errors.sigma_turn_per_m * np.sqrt(np.abs(distance)) * noise[2]
     theta = np.concatenate([[0.0], np.cumsum(turn_rad)])
     middle = 0.5 * (theta[1:] + theta[:-1])
     ahead = np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     aside = np.stack([-np.sin(middle), np.cos(middle)], axis=-1)
-    side_m = errors.sigma_side_m * np.sqrt(np.abs(way)) * noise[3]
-    xy = np.cumsum(way_m[:, None] * ahead + side_m[:, None] * aside, axis=0)
+    side_m = errors.sigma_side_m * np.sqrt(np.abs(distance)) * noise[3]
+    xy = np.cumsum(driven_m[:, None] * ahead + side_m[:, None] * aside, axis=0)
     return np.column_stack([np.vstack([np.zeros((1, 2)), xy]), theta])
 
 

@@ -34,7 +34,7 @@ _PASSER_APART_M = 0.9
 _CROSSING_M = 0.65
 _TRIES = 20_000
 _STUCK = 40
-#: The shortest way from door to door outside, and once more round the room, at full speed.
+#: The shortest route from door to door outside, and once more round the room, at full speed.
 _SHORTEST_AWAY_S = 36.0
 _ROUND_S = 62.0
 
@@ -136,31 +136,31 @@ def _drive(
     points: list[tuple[float, float]] = [*_WEST_DOOR]
     parks: list[int] = []
     for visit in range(settings.visits):
-        inside = _ways_inside(settings, random_for(seed, f"way {visit}"), site)
+        inside = _routes_inside(settings, random_for(seed, f"way {visit}"), site)
         points += [*((float(x), float(y)) for x, y in inside), *_EAST_DOOR]
         if visit + 1 < settings.visits:
             points += [*_NORTH, *(_RING * rounds), *_WEST_DOOR]
             parks.append(len(points) - len(_WEST_DOOR))
     waypoints = np.array(points)
     curve = Curve(waypoints)
-    covered = is_covered(curve.poses(curve.way)[:, :2]).astype(int)
-    enter = curve.way[np.flatnonzero(np.diff(covered) == 1)]
-    leave = curve.way[np.flatnonzero(np.diff(covered) == -1)]
+    covered = is_covered(curve.poses(curve.arc_length)[:, :2]).astype(int)
+    enter = curve.arc_length[np.flatnonzero(np.diff(covered) == 1)]
+    leave = curve.arc_length[np.flatnonzero(np.diff(covered) == -1)]
     stops = []
     for visit in range(settings.visits):
         count = len(range(visit, settings.references, settings.visits))
-        ways = np.linspace(enter[visit] + 1.0, leave[visit] - 1.0, count + 2)[1:-1]
-        stops += [Stop(float(way), settings.stand_s) for way in ways]
-    references = [stop.way_m for stop in stops]
+        distances = np.linspace(enter[visit] + 1.0, leave[visit] - 1.0, count + 2)[1:-1]
+        stops += [Stop(float(distance), settings.stand_s) for distance in distances]
+    references = [stop.distance_m for stop in stops]
     # If it comes too early, it waits at the western door.
     route = Route(waypoints, stops, settings.driving, EPOCH_S)
     visits = _visits(route)
     for (_, left), (entered, _), park in zip(visits, visits[1:], parks):
         if (rest := settings.between_s - (entered - left)) > 0.0:
-            stops.append(Stop(curve.way_of_waypoint(park), rest))
-    stops.sort(key=lambda stop: stop.way_m)
+            stops.append(Stop(curve.arc_length_at(park), rest))
+    stops.sort(key=lambda stop: stop.distance_m)
     route = Route(waypoints, stops, settings.driving, EPOCH_S)
-    stands = [span for span, stop in zip(route.stands, stops) if stop.way_m in references]
+    stands = [span for span, stop in zip(route.stands, stops) if stop.distance_m in references]
     return route, tuple(_visits(route)), tuple(stands)
 
 
@@ -184,7 +184,7 @@ _RING = ((-_OUT, _Y - 0.4), (-_OUT, DOOR_Y_M), (-_OUT, 0.4), (-0.9, -1.3), (0.5,
          (_X + _OUT, DOOR_Y_M), (_X + _OUT, _Y - 0.4), *_NORTH)  # fmt: skip
 
 
-def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) -> FloatArray:
+def _routes_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) -> FloatArray:
     """Waypoints of a visit, between the doors: random, but clear of the furniture."""
     if settings.straight:
         return np.array([[x, DOOR_Y_M] for x in (3.0, 5.0, 7.0)])
@@ -192,15 +192,15 @@ def _ways_inside(settings: LaserSettings, rng: np.random.Generator, site: Site) 
     stop = settings.stand_s + driving.speed_m_s / driving.acceleration_m_s2
     standing = stop * settings.references / settings.visits
     longest = driving.speed_m_s * max(settings.visit_s - standing, 0.0)
-    # Sometimes no long way is found: then a shorter one is searched.
+    # Sometimes no long route is found: then a shorter one is searched.
     for share in _SHARES_OF_TIME:
-        if (points := _random_way(share * longest, rng, site)) is not None:
+        if (points := _random_route(share * longest, rng, site)) is not None:
             return points
-    raise GroundTruthError("no way through the room was found: try another seed")
+    raise GroundTruthError("no route through the room was found: try another seed")
 
 
-def _random_way(wanted: float, rng: np.random.Generator, site: Site) -> FloatArray | None:
-    """Waypoints of a way of at least this length (m), or None if many tries find none."""
+def _random_route(wanted: float, rng: np.random.Generator, site: Site) -> FloatArray | None:
+    """Waypoints of a route of at least this length (m), or None if many tries find none."""
     before, after = np.array(_WEST_DOOR[-2:]), np.array(_EAST_DOOR[:2])
     points, failed, dead_ends = [*before], 0, 0
     for _ in range(_TRIES):
@@ -224,7 +224,7 @@ def _random_way(wanted: float, rng: np.random.Generator, site: Site) -> FloatArr
 
 
 def _bends_softly(points: list[FloatArray], new: FloatArray) -> bool:
-    """Whether the way to a new point is neither short nor turns by more than about 110 degrees."""
+    """Whether the leg to a new point is neither short nor turns by more than about 110 degrees."""
     came, goes = points[-1] - points[-2], new - points[-1]
     lengths = np.linalg.norm(came) * np.linalg.norm(goes)
     return bool(np.linalg.norm(goes) > 1.2 and came @ goes > -0.35 * lengths)
@@ -232,7 +232,7 @@ def _bends_softly(points: list[FloatArray], new: FloatArray) -> bool:
 
 def _is_clear(waypoints: FloatArray, site: Site) -> bool:
     curve = Curve(waypoints, grid_m=0.1)
-    places = curve.poses(curve.way)[:, :2]
+    places = curve.poses(curve.arc_length)[:, :2]
     near = site.solid.reshape(-1, 2, 2)
     near = site.solid[np.any((near > -0.2) & (near < np.array(ROOM_M) + 0.2), axis=1).all(axis=1)]
     in_door = np.abs(places[:, 1] - DOOR_Y_M) < 0.3

@@ -26,7 +26,7 @@ class SurfaceArrays(NamedTuple):
     starts: IntArray  # (S,) Where each texture begins in `texels`.
     texels: Float32Array  # All textures, row by row; NaN is a hole.
     smooth: ByteArray  # (S,) Whether it is interpolated: then only its outline is an edge.
-    given: IntArray  # (S,) Number of each surface among those given.
+    given: IntArray  # (S,) Index of each surface in the input.
 
 
 #: Side of the square tiles for which the surfaces that may be seen are gathered, pixels.

@@ -144,7 +144,7 @@ def _reduced(texture: Texture, pixels: float) -> Texture:
     return Texture(np.asarray(values, dtype=np.float32), smooth=True)
 
 
-# Blurs wider than this are all but the same on whole pixels, and cheaper, pixels.
+# Wider blurs, pixels, are applied to whole pixels: cheaper, and nearly the same.
 _FINE_BELOW_PX = 1.0
 _COARSE = 4
 
@@ -184,7 +184,7 @@ def exact_grey(
     sigma = imaging.blur_px
     pixels = light
     if imaging.fine:
-        # So narrow a blur is no Gaussian when taken at whole pixels only.
+        # Sampled at whole pixels, so narrow a kernel would not be Gaussian.
         rows, columns = light.shape
         blurred = _blurred(light, 2.0 * sigma) if sigma > 0.0 else light
         size = columns // 2, rows // 2

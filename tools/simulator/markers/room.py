@@ -146,7 +146,7 @@ def room_cameras(
 
 
 def looking_at(position: FloatArray, target: FloatArray, roll_rad: float = 0.0) -> FloatArray:
-    """world_from_camera of a camera that looks at a point, all but upright."""
+    """world_from_camera of a camera that looks at a point, almost upright."""
     forward = target - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
