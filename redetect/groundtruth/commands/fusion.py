@@ -120,6 +120,7 @@ def perform_fuse(options: Fuse) -> int:
         "slips_s": fusion.slips_s,
         "restarts_s": fusion.restarts_s,
         "odometry_pauses_s": fusion.pauses_s,
+        "odometry_resets_s": fusion.resets_s,
         "rejected": fusion.rejected,
     }
     write_planar_poses(options.output, fusion.poses, overwrite=options.force)
@@ -191,6 +192,11 @@ def _print_contradictions(options: Fuse, fusion: Fusion) -> None:
                 f"{options.odometry}: the robot {moved} {1.0 + scale:.2f} times as much as it "
                 f"says: {advice}"
             )
+    if fusion.resets_s:
+        warn(
+            f"{options.odometry}: {counted(len(fusion.resets_s), 'step')} that no robot can make, "
+            f"the first at {fusion.resets_s[0][1]:.3f} s, left out (a driver that restarted?)"
+        )
     if fusion.slips_s:
         warn(
             f"{options.odometry}: contradicts the measured poses "

@@ -28,9 +28,15 @@ from redetect.groundtruth.fusion.inputs import (
 )
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.localisation import LocalisationErrors, as_localisation
-from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.fusion.movement import MovementProblem, Smoothed, movement_problem
+from redetect.groundtruth.fusion.resets import continuous_odometry
 from redetect.groundtruth.fusion.slips import UNMEASURED_S, slipped_intervals
-from redetect.groundtruth.fusion.stream_errors import with_jitter_covered, with_usable_covariances
+from redetect.groundtruth.fusion.stream_errors import (
+    rounding_sigmas,
+    with_common,
+    with_jitter_covered,
+    with_usable_covariances,
+)
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -97,16 +103,21 @@ def maximum_likelihood_noise(problem: MovementProblem) -> FloatArray:
     return scaled(logarithms)
 
 
-def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
+def variance_inflation(
+    problem: MovementProblem,
+    noise: FloatArray,
+    systematic: tuple[FloatArray, FloatArray] | None = None,
+) -> float:
     """Factor of odometry's variances over seconds to those expected from single samples.
 
     A localisation, or filtered odometry, has smooth errors: small from sample to sample, but large
     over a gap. So its predictions between measurements seconds apart are compared with these. The
-    factor is 1 unless the errors are significantly larger.
+    factor is 1 unless the errors are significantly larger. `systematic`: as for
+    `MovementProblem.innovations`.
     """
     short = problem.shortened(_MOST_NODES_TO_LEARN_FROM)
     # Outliers would look like odometry's errors, more so where few others are left.
-    short = short.with_only(short.innovations(noise).accepted)
+    short = short.with_only(short.innovations(noise, systematic).accepted)
     some = [part.thinned() for part in short.split(_LONGEST_GAP_TO_LEARN_FROM_S)]
     numbers = POSE * sum(len(part.streams) - 1 for part in some)
     if numbers == 0:
@@ -114,8 +125,8 @@ def variance_inflation(problem: MovementProblem, noise: FloatArray) -> float:
     inflation = 1.0
     for _ in range(_LOOSENING_ROUNDS):
         # The first one of each part gives no information on odometry.
-        tried = (part.innovations(math.sqrt(inflation) * noise).squared[1:] for part in some)
-        squared = sum(float(np.sum(np.minimum(values, problem.gate()))) for values in tried)
+        tried = (part.innovations(math.sqrt(inflation) * noise, systematic) for part in some)
+        squared = sum(float(np.minimum(one.squared[1:], problem.gate()).sum()) for one in tried)
         if inflation == 1.0 and squared < chdtri(numbers, _DOUBT):
             return 1.0
         inflation *= max(squared / numbers, 1.0)
@@ -222,6 +233,8 @@ class Fusion:
     # wheels or a reset, and its pauses: the covariances do not rely on it there.
     slips_s: tuple[tuple[float, float], ...]
     pauses_s: tuple[tuple[float, float], ...]
+    # Times before and after steps of odometry that no robot can make: they are left out.
+    resets_s: tuple[tuple[float, float], ...]
 
 
 def fuse(
@@ -246,8 +259,14 @@ def fuse(
     usable = {name: with_usable_covariances(name, one) for name, one in streams.items()}
     covered = {name: with_jitter_covered(stream) for name, (stream, _) in usable.items()}
     own = last_of_each_time(odometry)
-    streams = {name: with_interpolation_error(stream, own) for name, (stream, _) in covered.items()}
-    problem = movement_problem(odometry, streams, settings)
+    driven, resets_s = continuous_odometry(own)
+    of_x, of_y, of_heading = rounding_sigmas(own)
+    rounding = np.diag(np.square([max(of_x, of_y)] * 2 + [of_heading]))
+    streams = {
+        name: with_common(with_interpolation_error(stream, driven), rounding)
+        for name, (stream, _) in covered.items()
+    }
+    problem = movement_problem(driven, streams, settings, own.times_s)
     wrong = wrong_starts(problem)
     rejected = _rejected(problem, wrong, wrong > 0.0)
     problem = problem.with_only(wrong == 0.0)
@@ -273,35 +292,37 @@ def fuse(
     # Before the errors over seconds, to which slips would contribute.
     problem = problem.with_slips(noise)
     if settings.learn_noise:
-        inflation = variance_inflation(replace(learn, slips=problem.slips), noise)
-    smoothed, spread, innovations = problem.smooth(noise, inflation)
+        systematic = _systematic(problem.smooth(noise))
+        inflation = variance_inflation(replace(learn, slips=problem.slips), noise, systematic)
+    smoothed = problem.smooth(noise, inflation)
     # Again without the systematic errors that do not improve predictions over seconds.
     over_seconds = math.sqrt(inflation) * noise
-    kept = useful_terms(problem, over_seconds, smoothed[-1, 3:], _systematic_sigmas(spread))
+    kept = useful_terms(problem, over_seconds, *_systematic(smoothed))
     if not np.all(kept):
         names = ("turn_scale_sigma", "turn_bias_per_metre_sigma", "distance_scale_sigma")
         fewer: dict[str, Any] = {name: 0.0 for name, keep in zip(names, kept) if not keep}
         problem = replace(problem, settings=replace(settings, **fewer)).with_slips(noise)
-        smoothed, spread, innovations = problem.smooth(noise, inflation)
+        smoothed = problem.smooth(noise, inflation)
 
     # Smoothed and filtered path at the samples of odometry.
     at = np.searchsorted(problem.times_s, inside)
-    path = _path(inside, smoothed[at], spread[at])
+    path = with_common(_path(inside, smoothed.states[at], smoothed.covariances[at]), rounding)
     states, spreads = problem.filtered(noise)
-    restarted = innovations.restarted > 0
+    innovations, restarted = smoothed.innovations, smoothed.innovations.restarted > 0
     # The errors of a localisation are stationary.
     localisation = None
     if settings.learn_noise:
-        found = as_localisation(own, problem, over_seconds, path)
+        accepted = problem.with_only(innovations.accepted)
+        found = as_localisation(own, accepted, over_seconds, smoothed.states[-1, POSE:], path)
         if found is not None:
             path, localisation = found
             restarted[:] = False
     rejected += _rejected(problem, innovations.squared, ~innovations.accepted)
-    numbers = [smoothed[-1, 3:], _systematic_sigmas(spread), noise, np.array([inflation])]
-    pauses = pauses_of(own)
+    numbers = [*_systematic(smoothed), noise, np.array([inflation])]
+    pauses = pauses_of(driven)
     return Fusion(
         poses=path,
-        filtered=_path(inside, states[at], spreads[at]),
+        filtered=with_common(_path(inside, states[at], spreads[at]), rounding),
         rejected=tuple(sorted(rejected, key=lambda one: one.time_s)),
         restarts_s=tuple(float(time) for time in problem.times_s[restarted]),
         used={
@@ -314,12 +335,17 @@ def fuse(
         jitter={name: jitter for name, (_, jitter) in covered.items()},
         slips_s=slipped_intervals(problem.times_s, problem.slips),
         pauses_s=tuple(pause for pause in pauses if pause[1] > first and pause[0] < last),
+        resets_s=tuple(reset for reset in resets_s if reset[1] > first and reset[0] < last),
     )
 
 
-def _systematic_sigmas(spread: FloatArray) -> FloatArray:
-    """(3,) of odometry's errors: constants, whose estimate at the last node uses everything."""
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(spread[-1])[POSE:], 0.0)))
+def _systematic(smoothed: Smoothed) -> tuple[FloatArray, FloatArray]:
+    """(3,) odometry's systematic errors and their standard deviations.
+
+    They are constants, whose estimate at the last node uses everything.
+    """
+    variances = np.diagonal(smoothed.covariances[-1])[POSE:]
+    return smoothed.states[-1, POSE:], np.sqrt(np.maximum(variances, 0.0))
 
 
 def _path(times_s: FloatArray, states: FloatArray, covariances: FloatArray) -> PlanarPoses:

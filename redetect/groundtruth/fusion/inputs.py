@@ -114,18 +114,22 @@ def _within(times_s: FloatArray, steps: FloatArray, margin_s: float) -> tuple[Fl
     return np.asarray(np.subtract(*ends)), to_s - from_s
 
 
+def usual_rate(times_s: FloatArray, steps: FloatArray) -> float:
+    """A robot's usual rate of steps (N - 1,) between samples, over a second, outside pauses."""
+    total, passed = _within(times_s, steps, 0.5 * _USUAL_RATES_OVER_S)
+    rates = (np.abs(total) / passed)[~_paused(times_s)]
+    return float(np.quantile(rates, _USUAL_RATES_QUANTILE))
+
+
 def _unseen(times_s: FloatArray, distance: FloatArray, turn: FloatArray) -> FloatArray:
     """(N - 1, 4) distance and turn that pauses may hide beyond the arcs over them; usual ones."""
     paused = _paused(times_s)
     hidden = np.zeros((len(distance), 4))
     if not np.any(paused) or np.all(paused):
         return hidden
-    usual = []
-    for steps in (distance, turn):
-        total, passed = _within(times_s, steps, 0.5 * _USUAL_RATES_OVER_S)
-        usual.append(float(np.quantile((np.abs(total) / passed)[~paused], _USUAL_RATES_QUANTILE)))
     passed = np.diff(times_s)[paused]
-    for column, (rate, steps) in enumerate(zip(usual, (distance, turn))):
+    for column, steps in enumerate((distance, turn)):
+        rate = usual_rate(times_s, steps)
         hidden[paused, column] = np.maximum(rate * passed - np.abs(steps[paused]), 0.0)
         hidden[paused, 2 + column] = rate * passed
     # Some odometry is written on change only: if all digits are equal, the robot was at rest.

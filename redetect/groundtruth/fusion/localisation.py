@@ -12,7 +12,7 @@ better than the movements between its poses.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from redetect.array_types import BoolArray, FloatArray
+from redetect.groundtruth.fusion.inputs import systematic_sigmas
 from redetect.groundtruth.fusion.kernels import POSE
 from redetect.groundtruth.fusion.movement import MovementProblem
 from redetect.groundtruth.fusion.slips import UNMEASURED_S
@@ -68,13 +69,18 @@ class LocalisationErrors:
 
 
 def as_localisation(
-    odometry: PlanarPoses, problem: MovementProblem, noise: FloatArray, path: PlanarPoses
+    odometry: PlanarPoses,
+    problem: MovementProblem,
+    noise: FloatArray,
+    systematic: FloatArray,
+    path: PlanarPoses,
 ) -> tuple[PlanarPoses, LocalisationErrors] | None:
     """The path from odometry that is a localisation, if it is one.
 
-    `problem` has the same odometry, with distinct times; `noise` (4,): its random errors over
-    seconds. `path` is the one from movements, with covariances: it is kept where poses were
-    measured, and the gaps in between are bridged again.
+    `problem` has the same odometry, with distinct times, and accepted measurements. As movements,
+    it has random errors over seconds, `noise` (4,), and `systematic` (3,) ones. `path` is the one
+    from movements, with covariances: it is kept where poses were measured, and the gaps in between
+    are bridged again.
     """
     # A gyroscope, whose headings come without positions, is no localisation.
     if np.max(np.ptp(odometry.poses[:, :2], axis=0)) < _LEAST_EXTENT_M:
@@ -111,7 +117,10 @@ def as_localisation(
         _HEADING_CORRELATION_S,
     )
     deviance = position.deviance + heading.deviance + _OUTLIER_DEVIANCE * np.count_nonzero(~usual)
-    by_movements = (part.innovations(noise).deviance for part in thin.split(math.inf))
+    # A contradiction after a gap costs two outliers, not all those until the next one.
+    parts = replace(thin, restart_after=2).split(math.inf)
+    errors_of_movements = systematic, systematic_sigmas(problem.settings)
+    by_movements = (part.innovations(noise, errors_of_movements).deviance for part in parts)
     if not deviance < sum(by_movements):
         return None
     aligned = moved_poses(odometry, motion)

@@ -29,8 +29,7 @@ from redetect.plane import pose_differences
 # Predictions of odometry over seconds are between measurements this far apart, or farther.
 _SPACING_S = 2.0
 _TURN_PER_METRE = 4
-# The filter restarts after this number of consecutive rejections, with these variances.
-_RESTART_AFTER = 40
+# The filter restarts with these variances.
 _RESTART_VARIANCES = np.array([25.0, 25.0, math.pi**2])
 # Variance of the heading (rad^2) beyond which another number of full turns is possible.
 _LOST_VARIANCE = 1.0
@@ -113,6 +112,7 @@ class MovementProblem:
     measured: kernels.MeasuredPoses
     streams: NDArray[np.str_]  # (M,): their streams
     settings: FuseSettings
+    restart_after: int = 40  # consecutive rejections after which the filter restarts
 
     @property
     def measured_s(self) -> FloatArray:
@@ -291,7 +291,7 @@ class MovementProblem:
             self.measured,
             kernels.Gating(
                 self.gate(),
-                _RESTART_AFTER,
+                self.restart_after,
                 _RESTART_VARIANCES,
                 _LOST_VARIANCE if points is None else math.inf,
                 np.zeros(len(self.times_s), dtype=np.bool_) if cuts is None else cuts,
@@ -302,15 +302,21 @@ class MovementProblem:
 
 
 def movement_problem(
-    odometry: PlanarPoses, streams: Mapping[str, PlanarPoses], settings: FuseSettings
+    odometry: PlanarPoses,
+    streams: Mapping[str, PlanarPoses],
+    settings: FuseSettings,
+    times_s: FloatArray | None = None,
 ) -> MovementProblem:
     """Combine odometry and measured poses with covariances on common nodes, from the first
     measurement within the odometry's time to the last.
+
+    Odometry's nodes are at its own times, or at `times_s` (K,), which it covers.
     """
     found, names = inputs.measured_poses(odometry, streams)
     assert found.covariances is not None
     odometry = last_of_each_time(odometry)
-    inside = odometry.times_s[odometry.during(found.times_s[0], found.times_s[-1])]
+    own_s = odometry.times_s if times_s is None else times_s
+    inside = own_s[(own_s >= found.times_s[0]) & (own_s <= found.times_s[-1])]
     node_times = np.union1d(inside, found.times_s)
     controls, unseen = inputs.movements(odometry, node_times)
     nodes = np.searchsorted(node_times, found.times_s)

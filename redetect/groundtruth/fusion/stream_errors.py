@@ -8,6 +8,7 @@ and they are added to the fused path, which has the same error.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,16 @@ def white_noise_sigmas(poses: PlanarPoses) -> FloatArray:
     weights = _divided_differences(poses.times_s, _NOISE_ORDER)
     third = np.sum(weights * _neighbours(poses.continuous, _NOISE_ORDER), axis=0)
     return np.asarray(np.median(np.abs(third), axis=0) / _MEDIAN_OF_NORMAL)
+
+
+def rounding_sigmas(poses: PlanarPoses) -> FloatArray:
+    """(3,) standard deviations of x, y and the heading that are due to their rounding."""
+    found = np.zeros(3)
+    for k, levels in enumerate(np.unique(np.round(values, 9)) for values in poses.poses.T):
+        step = min(np.diff(levels), default=0.0)
+        if step > 0.0 and np.all(np.abs(levels - step * np.rint(levels / step)) < 0.01 * step):
+            found[k] = step / math.sqrt(12.0)
+    return found
 
 
 def _divided_differences(times_s: FloatArray, order: int) -> FloatArray:

@@ -175,7 +175,7 @@ def _segment(
     measured = segment.only(segment.during(own.times_s[0] + reach, own.times_s[-1] - reach))
     if len(measured) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
-    jittered = _with_jitter(measured, own, _rounding(odometry.only(near)))
+    jittered = _with_jitter(measured, own, stream_errors.rounding_sigmas(odometry.only(near)))
     best = _fit_of_segment(own, jittered, start, bounds, measured.covariances is not None)
     if best is None:
         note = f"its turns show no offset with a drift within {bounds.largest_drift:g} "
@@ -362,16 +362,6 @@ def _parabola(
             minimum = np.clip(-root @ c[:2], -1.0, 1.0)
             return at + scale * steps * minimum, scale * steps * sigmas
     return None
-
-
-def _rounding(odometry: PlanarPoses) -> FloatArray:
-    """(3,) standard deviations of x, y and the heading that are due to their rounding."""
-    found = np.zeros(3)
-    for k, levels in enumerate(np.unique(np.round(values, 9)) for values in odometry.poses.T):
-        step = min(np.diff(levels), default=0.0)
-        if step > 0.0 and np.all(np.abs(levels - step * np.rint(levels / step)) < 0.01 * step):
-            found[k] = step / math.sqrt(12.0)
-    return found
 
 
 def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatArray) -> PlanarPoses:

@@ -392,6 +392,7 @@ def _rejected(inputs: Inputs) -> list[Part]:
     for key, what in (
         ("slips_s", "contradicts the measured poses, as after a slip of the wheels"),
         ("odometry_pauses_s", "pauses"),
+        ("odometry_resets_s", "makes steps that no robot can make"),
     ):
         if spans := [span for span in _entry(fused, key, list) if isinstance(span, list)]:
             times = "; ".join(

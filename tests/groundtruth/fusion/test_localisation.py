@@ -48,6 +48,20 @@ def visits(rng: np.random.Generator, truth: PlanarPoses) -> PlanarPoses:
     return measure(rng, truth, times, LASER)
 
 
+def test_wheels_are_no_localisation_if_another_stream_is_late() -> None:
+    """What contradicts both models says nothing of odometry."""
+    rng = np.random.default_rng(5)
+    wheels = FuseSettings(distance_sigma=0.006, lateral_sigma=0.001, turn_sigma=0.008)
+    truth, odometry = drive(rng, 322.0, wheels)
+    laser = visits(rng, truth)
+    times_s = np.concatenate([np.arange(begin, end, 0.1) for begin, end in VISITS])
+    seen = measure(rng, truth, times_s, np.diag(np.square([0.03, 0.03, 0.03])))
+    late = PlanarPoses(times_s + 0.3, seen.poses, seen.covariances)
+    fusion = fuse(odometry, {"laser": laser, "camera": late})
+    assert fusion.localisation is None
+    assert sum(one.stream == "camera" for one in fusion.rejected) > 0.5 * len(late)
+
+
 def test_a_localisation_bridges_gaps_without_drift() -> None:
     found = []
     for seed in range(3):

@@ -299,12 +299,17 @@ def test_the_same_session_gives_the_same_page(
 
 
 def test_slips_and_pauses_of_odometry_are_said(session: Path) -> None:
-    fused = {"slips_s": [[20.0, 21.5]], "odometry_pauses_s": [[1.0, 4.0], [7.0, 9.0]]}
+    fused = {
+        "slips_s": [[20.0, 21.5]],
+        "odometry_pauses_s": [[1.0, 4.0], [7.0, 9.0]],
+        "odometry_resets_s": [[12.0, 12.02]],
+    }
     (session / "fused.json").write_text(json.dumps(fused))
     assert main(["report", str(session)]) == 0
     text = Page((session / "report.html").read_bytes()).text
     assert "slip of the wheels, 1 times (s): 20.000 to 21.500." in text
     assert "pauses, 2 times (s): 1.000 to 4.000; 7.000 to 9.000." in text
+    assert "steps that no robot can make, 1 times (s): 12.000 to 12.020." in text
 
 
 def test_streams_without_covariances_or_truth_in_common(session: Path) -> None:
