@@ -120,7 +120,7 @@ def doubts_of(check: OdometryCheck, mapped: MappedRun) -> list[str]:
             f"steps with errors beyond chance: {check.outliers}; odometry slipped there, or rows "
             f"are wrong, most at {mapped.prefixes[check.worst_step + 1]}"
         )
-    if check.rows_factor > MOST_FACTOR:
+    if check.rows_factor > MOST_FACTOR and not check.odometry_factor > check.rows_factor:
         without = ", and --loss geman-mcclure maps without them"
         lines.append(
             f"errors of rows are {math.sqrt(check.rows_factor):.1f} times as large as their "

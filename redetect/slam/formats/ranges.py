@@ -169,9 +169,9 @@ def _with_own_noise(
         # The share of the numbers of rows that the others check.
         redundant = table.discs / check.rows_factor / (2.0 * table.measurements)
         variance = np.mean(error[inliers] ** 2, axis=0) / redundant
-        of_steps = noise.steps * math.sqrt(check.odometry_factor)
+        of_steps = max(noise.steps * math.sqrt(check.odometry_factor), 1.0 / _MOST_FACTOR)
         factors = np.append(np.sqrt(variance), of_steps)
-        _demand_shown(np.all((factors > 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)))
+        _demand_shown(np.all((factors >= 1.0 / _MOST_FACTOR) & (factors < _MOST_FACTOR)))
         alike = np.clip(_products(error[inliers], visits[inliers]) / variance, 0.0, 1.0)
         outliers = int(np.count_nonzero(~inliers))
         noise = Noise._make([*factors[:2].tolist(), *alike.tolist(), of_steps, outliers])

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from redetect.array_types import FloatArray
 from redetect.least_squares.covariance import by_shared, marginal_covariances
@@ -26,8 +26,8 @@ from redetect.slam.models import between_jacobians
 
 #: Fewest redundant numbers from which a factor is meaningful.
 FEWEST_NUMBERS = 10.0
-# Largest squared error of a step by chance.
-_MOST_SQUARED = float(chdtri(3, 1e-6))
+_CHANCE = 1e-6  # Probability of what is taken for impossible by chance.
+_MOST_SQUARED = float(chdtri(3, _CHANCE))  # Largest squared error of a step by chance.
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,10 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     """
     graph, estimate, weighting = mapped.graph, mapped.estimate, mapped.weighting
     problem, count = linearise(graph, estimate, weighting), len(graph.steps)
+    # Of each pose with the next, without systematic errors; the first pose is known.
+    pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
+    first_pose = (3, np.zeros(1, dtype=np.int64))
+    found, _ = marginal_covariances(normal_equations(problem), [pairs, first_pose])
     border = np.zeros((len(problem.residual), 3))
     if not weighting.calibrate:
         by_change, along = np.zeros((count, 3, 3)), _adjusted_movements(graph.steps, estimate.poses)
@@ -66,10 +70,6 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
         by_change[1:-1, :, 2] = 0.5 * (graph.steps[:-2] - graph.steps[2:])
         border[: 3 * count] = (graph.step_whitening @ by_change).reshape(-1, 3)
         problem = problem._replace(border=border[:, :2])
-    equations = normal_equations(problem)
-    # Of each pose with the next; the first one is known.
-    pairs = (6, 3 * np.arange(count - 1, dtype=np.int64))
-    found, spread = marginal_covariances(equations, [pairs, (3, np.zeros(1, dtype=np.int64))])
     jacobians = between_jacobians(estimate.poses[:-1], estimate.poses[1:])
     by_poses = graph.step_whitening @ np.concatenate(jacobians, axis=2)
     first, others = by_poses[:1, :, 3:], by_poses[1:]
@@ -82,9 +82,11 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     of_steps = np.sum(error.odometry**2, axis=1)
     change, variance = np.full(3, math.nan), np.full(3, math.nan)
     if not weighting.calibrate:
+        equations = normal_equations(problem)
         with_lag = normal_equations(problem._replace(border=border))
         change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
-        variance = np.append(np.diag(spread), by_shared(with_lag)[1][2, 2])
+        variances = (np.diag(by_shared(each)[1]) for each in (equations, with_lag))
+        variance = np.append(next(variances), next(variances)[2])
     # Without redundancy, the systematic errors are not determined, and nothing else is checked.
     if mapped.table.expected <= 0 or np.any(variance < 0.0):
         odometry = rows = 0.0
@@ -93,8 +95,8 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
     change = np.where(np.isnan(sigma), math.nan, change)
     (length, turn, lag), (length_sigma, turn_sigma, lag_sigma) = change.tolist(), sigma.tolist()
     return OdometryCheck(
-        odometry_factor=squared[0] / odometry if odometry >= FEWEST_NUMBERS else math.nan,
-        rows_factor=sum(squared[1:]) / rows if rows >= FEWEST_NUMBERS else math.nan,
+        odometry_factor=_factor(squared[0], odometry),
+        rows_factor=_factor(sum(squared[1:]), rows),
         length=length,
         length_sigma=length_sigma,
         turn_per_metre=turn,
@@ -104,6 +106,12 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
         outliers=int(np.count_nonzero(of_steps > _MOST_SQUARED)),
         worst_step=int(np.argmax(of_steps)),
     )
+
+
+def _factor(squared: float, redundant: float) -> float:
+    """Squared errors over their expectation; NaN from few numbers, unless it is beyond chance."""
+    known = redundant >= FEWEST_NUMBERS or redundant > 0.0 and chdtrc(redundant, squared) < _CHANCE
+    return squared / redundant if known else math.nan
 
 
 def _adjusted_movements(steps: FloatArray, poses: FloatArray) -> FloatArray:
