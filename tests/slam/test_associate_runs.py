@@ -304,6 +304,17 @@ def test_a_corridor_with_regular_pairs_of_discs_is_not_laid_on_itself(seed: int)
     assert score.pair_recall > 0.99
 
 
+@pytest.mark.parametrize(("seed", "scatter_m"), [(1, 0.0), (2, 0.004), (3, 0.01)])
+def test_a_grid_of_discs_is_not_closed_a_cell_off(seed: int, scatter_m: float) -> None:
+    """Discs on the corners of tiles: each cell looks like all others."""
+    grid = np.stack(np.meshgrid(*[1.2 * np.arange(-4, 14)] * 2), axis=-1).reshape(-1, 2)
+    discs = grid + np.random.default_rng(seed).normal(0.0, scatter_m, grid.shape)
+    recording = drive(circuit(2.0, 10.0), discs, NO_LINES, seed)
+    found = associate_run(recording)
+    score = score_association(found.circle_labels, ids_of(recording))
+    assert score.pair_precision > 0.999
+
+
 def test_clutter_does_not_keep_the_labels_of_a_disc_apart() -> None:
     path = chain_steps(np.tile([0.0, -0.1, 0.0], (12, 1)))
     discs = np.array([[0.5 * (i % 3), -3.0 - 0.5 * (i // 3)] for i in range(8)])

@@ -45,6 +45,8 @@ _LONG_AGO = 4
 MOST_COMPARED = 80
 # Labels with fewer rows than this share of what a typical row's label has may be clutter.
 _LEAST_SHARE = 0.2
+# Largest share of the agreeing landmarks with which another motion may fit.
+_RIVAL_SHARE = 0.7
 #: Largest systematic error of each step of odometry, in standard deviations.
 SYSTEMATIC_SIGMAS = 2.0
 #: Submaps that share at least this many landmarks are known to be the same place.
@@ -282,14 +284,16 @@ def find_matches(submaps: list[Submap], search: Search) -> list[Match]:
             if min(len(fixed.labels), len(moved.labels)) >= search.least_agreeing:
                 candidates.append((fixed, moved, motion_onto(moved.xy, fixed.xy, search)))
     tried = sum(motion.tried for _, _, motion in candidates)
-    matches = [
-        _refined(earlier, later, motion.pose, tried, search)
-        for earlier, later, motion in candidates
-        if motion.agreeing >= search.least_agreeing
-    ]
-    most = np.log10(search.false_alarms)
-    significant = (match for match in matches if match and match.log10_false_alarms <= most)
-    return sorted(significant, key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame))
+    matches = []
+    for fixed, moved, motion in candidates:
+        if motion.agreeing < search.least_agreeing:
+            continue
+        match = _refined(fixed, moved, motion.pose, tried, search)
+        if match is None or match.log10_false_alarms > np.log10(search.false_alarms):
+            continue
+        if not has_rival(moved.xy, fixed.xy, match.motion, len(match.pairs), search):
+            matches.append(match)
+    return sorted(matches, key=lambda m: (m.log10_false_alarms, m.later_frame, m.earlier_frame))
 
 
 class Motion(NamedTuple):
@@ -315,6 +319,17 @@ def motion_onto(
     turn, x, y, agreeing, tried = _best_motion(moved, equal, search, known)
     pose = np.array([*(centre + np.array([x, y]) - rotation(turn) @ centre), turn])
     return Motion(pose, agreeing, tried)
+
+
+def has_rival(
+    moved: FloatArray, fixed: FloatArray, pose: FloatArray, agreeing: int, search: Search
+) -> bool:
+    """Whether another motion than a pose (3,) puts nearly as many landmarks on others, as in a
+    regular pattern of discs: more than seven tenths of those that agree with it.
+    """
+    enough = max(math.floor(_RIVAL_SHARE * agreeing) + 1, search.least_agreeing)
+    rival = motion_onto(moved, fixed, search._replace(least_agreeing=enough), excluding=pose)
+    return rival.agreeing > 0
 
 
 def refined_motion(

@@ -29,8 +29,6 @@ from redetect.slam.recording import Recording
 _FEWEST_FRAMES, _GROWTH, _MOST_FRAMES = 5, 1.5, 400
 #: Rows closer together than this belong to one disc (m).
 ONE_DISC_M = 0.25
-#: Largest share of the agreeing discs with which another place may fit.
-_RIVAL_SHARE = 0.7
 #: Least standard deviation of a disc (m): that of raw rows from a leaning camera.
 _DISC_SIGMA_M = 0.25
 ANYWHERE = loops.Search(math.inf, math.inf, least_agreeing=5)
@@ -112,8 +110,7 @@ def located(
     if alarms > math.log10(false_alarms):
         return None
     # Also one on the same discs: pairs in a corridor look alike from both ends, and a period on.
-    rival = loops.motion_onto(discs, disc_xy, ANYWHERE, excluding=pose)
-    return None if rival.agreeing > _RIVAL_SHARE * len(pairs) else (pose, pairs)
+    return None if loops.has_rival(discs, disc_xy, pose, len(pairs), ANYWHERE) else (pose, pairs)
 
 
 def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> FloatArray:
