@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.model import COUNT
-from camera.rotations import cross_matrices
+from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import covariance_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
 from redetect.slam.errors import SlamError
@@ -67,6 +67,12 @@ def rows_as_recorded(
     by_robot = by_ray @ unturn
     by_mounting = np.concatenate([by_robot @ cross_matrices(from_centre), -by_robot], axis=2)
     return camera.centre[:2] - height * slope, by_robot[:, :, :2], by_mounting
+
+
+def levelled_camera(camera: Camera, levelled_by: tuple[float, float]) -> Camera:
+    """The camera as rows show it that a pitch and roll (rad) have levelled."""
+    turn = rotation_of(np.array([*levelled_by, 0.0]))
+    return with_pose(camera, turn @ np.array(camera.robot_from_camera))
 
 
 def mounting_change(camera: Camera, mounting: FloatArray) -> FloatArray:

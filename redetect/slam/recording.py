@@ -110,6 +110,7 @@ class Recording:
     lines: LineRows  # none if they were not requested
     unstated_steps: int = 0  # number of steps with an assumed covariance
     tilted: bool = False  # whether covariances of discs include that of an unknown tilt
+    levelled_by: tuple[float, float] = (0.0, 0.0)  # mean pitch and roll of frames with discs (rad)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -176,7 +177,13 @@ def joined(runs: Sequence[Recording]) -> Recording:
         LineRows.of(row for some in lines for row in zip(*vars(some).values())),
         sum(run.unstated_steps for run in runs),
         any(run.tilted for run in runs),
+        _mean_tilt([run.levelled_by for run in runs for _ in range(len(run))]),
     )
+
+
+def _mean_tilt(tilts: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    pitch, roll = np.mean(tilts or [(0.0, 0.0)], axis=0).tolist()
+    return pitch, roll
 
 
 def landmark_files(
@@ -306,6 +313,7 @@ def recording_of_frames(
         circles=_circle_rows(frames, name),
         lines=_line_rows(frames, name),
         unstated_steps=int(np.count_nonzero(unstated)),
+        levelled_by=_mean_tilt([f.levelled_by or (0.0, 0.0) for f in frames if f.circles]),
     )
 
 

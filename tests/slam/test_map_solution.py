@@ -23,7 +23,7 @@ from redetect.slam.mapping.run_map import MappedRun, map_run
 from redetect.slam.mapping.solve import solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
 from redetect.slam.models import disc_in_robot, move
-from redetect.slam.mounting import mounted_camera, rows_through_mounting
+from redetect.slam.mounting import levelled_camera, mounted_camera, rows_through_mounting
 from redetect.slam.recording import (
     LineRows,
     Recording,
@@ -185,6 +185,27 @@ def test_calibration_recovers_a_wrong_mounting(published_camera: Camera, row_err
     assert plain.table.chi_squared > 10.0
     np.testing.assert_allclose(mapped.estimate.poses, run.poses, atol=2e-4)
     assert mapped.table.expected == plain.table.expected - 6
+
+
+def test_the_mounting_contains_what_has_levelled_the_rows(published_camera: Camera) -> None:
+    """Whether frames were levelled or not, the camera is mounted the same way."""
+    true, levelled_by = np.array([-0.03, 0.012, 0.0, 0.02, 0.07, -0.03]), (-0.025, 0.008)
+    turn = rotation_of(true[:3])
+    mounting = np.column_stack(
+        [turn @ published_camera.rotation, published_camera.centre + true[3:]]
+    )
+    run = _only_discs(small_run(7, noise=0.0, steps=90, weave_rad=0.2))
+    certain = replace(run.circles, covariance=1e-6 * run.circles.covariance)
+    run = replace(run, circles=certain, step_covariance=1e-6 * run.step_covariance)
+    level = levelled_camera(published_camera, levelled_by)
+    changes = []
+    for camera, by in ((published_camera, (0.0, 0.0)), (level, levelled_by)):
+        rows = replace(written_when_mounted(run, camera, mounting), levelled_by=by)
+        mapped = map_run(rows, published_camera, Weighting(calibrate=True))
+        assert mapped.mounting is not None
+        changes.append(mapped.mounting.change)
+    np.testing.assert_allclose(changes[0], true, atol=2e-5)
+    np.testing.assert_allclose(changes[1], changes[0], atol=2e-5)
 
 
 def test_errors_of_a_mounting_are_as_its_covariance_says(published_camera: Camera) -> None:

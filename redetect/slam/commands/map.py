@@ -67,6 +67,10 @@ def perform(command: Map) -> int:
     if (found := mapped.mounting) is not None and mapped.graph.camera is not None:
         mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
+        if mounted.covariance is None:
+            print(
+                "the .cam file has no covariance of the lens: that of the mounting is left out"
+            )
     print(f"{output}: {', '.join(names)}")
     return 0
 
@@ -143,6 +147,11 @@ def _mounting_lines(mounting: Mounting) -> list[str]:
         for name, value, spread, unit in zip(names, mounting.change, sigma, ["rad"] * 3 + ["m"] * 3)
         if spread > 0.0
     ]
+    if any(mounting.levelled_by):
+        pitch, roll = np.degrees(mounting.levelled_by)
+        lines.append(
+            f"it contains {pitch:.2f}, {roll:.2f} degrees by which rows are levelled (mean)"
+        )
     return [*lines, f"{'gained by the mounting':<28}{mounting.gain:>12,.2f}"]
 
 

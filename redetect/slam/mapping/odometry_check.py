@@ -110,7 +110,9 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
 
 def _factor(squared: float, redundant: float) -> float:
     """Squared errors over their expectation; NaN from few numbers, unless it is beyond chance."""
-    known = redundant >= FEWEST_NUMBERS or redundant > 0.0 and chdtrc(redundant, squared) < _CHANCE
+    known = redundant >= FEWEST_NUMBERS or (
+        redundant > 0.0 and chdtrc(redundant, squared) < _CHANCE
+    )
     return squared / redundant if known else math.nan
 
 

@@ -33,7 +33,7 @@ from redetect.slam.mapping.graph import (
 from redetect.slam.mapping.graph_terms import Weighting, errors
 from redetect.slam.mapping.solve import Marginals, joint_covariance, marginals, solve
 from redetect.slam.mapping.solve_gtsam import solve_gtsam
-from redetect.slam.mounting import check_rows_fit_camera, mounting_change
+from redetect.slam.mounting import check_rows_fit_camera, levelled_camera, mounting_change
 from redetect.slam.options import Map
 from redetect.slam.recording import Recording, camera_of_run
 from redetect.slam.settings import MOST_FACTOR, Solver
@@ -133,7 +133,8 @@ class Mounting:
     change: FloatArray  # (6,): rotation vector (rad) and position (m), true minus calibrated
     covariance: FloatArray  # (6, 6), zero for numbers that were not estimated
     robot_from_camera: FloatArray  # (3, 4)
-    gain: float  # decrease of the sum of squares from the mounting as calibrated
+    gain: float  # decrease of the sum of squares from the mounting that the rows have
+    levelled_by: tuple[float, float]  # mean pitch and roll that have levelled the rows (rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +206,10 @@ def map_run(
     """
     wanted = weighting or Weighting()
     _check_usable(recording, camera, wanted, name)
-    graph = graph_of_recording(recording, camera)
+    seen_by = camera
+    if camera and wanted.calibrate:  # rows do not show what has levelled them
+        seen_by = levelled_camera(camera, recording.levelled_by)
+    graph = graph_of_recording(recording, seen_by)
     begin = _parts_registered(recording, graph, first_sight(graph, start), name)
     plain_only = not len(recording.lines) and wanted == Weighting() and solver == "separable"
     # First odometry and discs, then with lines.
@@ -238,6 +242,7 @@ def map_run(
             covariance=covariance.mounting,
             robot_from_camera=estimate.mounting,
             gain=minima[-2].costs[-1] - minima[-1].costs[-1],
+            levelled_by=recording.levelled_by,
         )
     return MappedRun(
         prefixes=("start", *recording.prefixes),
