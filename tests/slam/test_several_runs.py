@@ -115,6 +115,23 @@ def test_runs_whose_identifiers_agree_are_mapped_at_once(
     assert f'"expected": {known - unknown},' in (tmp_path / "map" / "table.json").read_text()
 
 
+def test_runs_that_were_numbered_apart_are_refused(
+    runs: list[Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each run's discs are numbered from 0 in the order of first sight."""
+    files = []
+    for k, run in enumerate(runs):
+        _, first, order = np.unique(run.circles.ids, return_index=True, return_inverse=True)
+        ids = np.argsort(np.argsort(first))[order]
+        apart = replace(run, circles=replace(run.circles, ids=ids))
+        files.append(write_run(tmp_path / f"{k}.circles", apart, known=True))
+    assert main(["map", *files, "-o", str(tmp_path / "both")]) == 1
+    assert (
+        "the same identifiers: expected common ones, as `slam associate" in capsys.readouterr().err
+    )
+    assert not (tmp_path / "both").exists()
+
+
 @pytest.mark.parametrize("discs", [DISCS, DISCS[:0]], ids=["with discs", "alone"])
 def test_verticals_of_runs_whose_identifiers_agree_are_one(
     tmp_path: Path, discs: FloatArray

@@ -68,9 +68,7 @@ def perform(command: Map) -> int:
         mounted = mounted_camera(mapped.graph.camera, found.robot_from_camera, found.covariance)
         write_camera(mounted, output / CAMERA_NAME, overwrite=command.force)
         if mounted.covariance is None:
-            print(
-                "the .cam file has no covariance of the lens: that of the mounting is left out"
-            )
+            print("the .cam file has no covariance of the lens: that of the mounting is left out")
     print(f"{output}: {', '.join(names)}")
     return 0
 

@@ -40,6 +40,9 @@ from redetect.slam.settings import MOST_FACTOR, Solver
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
+# Identifiers of parts do not agree if landmarks of the same ones are farther apart than this share
+# of their distance from their centre (medians).
+_MOST_OFF = 0.2
 # Tolerance before the final optimisation.
 _COARSE = 1e-3
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
@@ -336,7 +339,16 @@ def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name:
         waiting.remove(k)
         known = known | lines[k]
         if counts[k][0] >= _FEWEST_SHARED:
-            motion = fitted(places[k, shared[k]], xy[shared[k]])
+            there, target = places[k, shared[k]], xy[shared[k]]
+            motion = fitted(there, target)
+            off = np.hypot(*(apply(motion, there) - target).T)
+            apart = np.hypot(*(target - target.mean(axis=0)).T)
+            if np.median(off) > _MOST_OFF * np.median(apart):
+                begins = next(p for p in recording.prefixes[lost[k - 1] :] if p != "start")
+                raise SlamError(
+                    f"{name}: the part from {begins} on has other landmarks with the same "
+                    "identifiers: expected common ones, as `slam associate RUN_A RUN_B` gives them"
+                )
             here = slice(lost[k - 1] + 1, lost[k] + 1 if k < len(lost) else None)
             poses[here, :2] = apply(motion, poses[here, :2])
             poses[here, 2] += motion[2]
