@@ -121,14 +121,14 @@ def _all(command: All, run: Run) -> Job:
 def _with_radius(settings: CircleSettings, run: Run) -> CircleSettings:
     """The settings with the radius estimated from some of the images."""
     from detect.lean import leaning_as
-    from detect.radius import find_radius
+    from detect.radius import LARGEST_M, SMALLEST_M, find_radius
 
     images = list(some_images(run))
     found = find_radius(images, leaning_as(images, run.camera), settings)
     if found is None:
         raise DetectError(
             f"{len(images)} images: the radius of the discs cannot be estimated from them: "
-            "expected some discs on the floor, or --radius-m"
+            f"expected some of {SMALLEST_M:g} to {LARGEST_M:g} m on the floor, or --radius-m"
         )
     print(
         f"discs have a radius of {found.radius_m:.4f} +- {found.sigma_m:.4f} m, estimated from "

@@ -26,7 +26,7 @@ from redetect.groundtruth.settings import (
 class Rig:
     """Estimate the poses of the markers on the robot, from images that show several of them.
 
-    Example: groundtruth rig calibration/rig/* --width-m 0.2 --robot known.json -o rig.json
+    Example: groundtruth rig calibration/rig/*/ --width-m 0.2 --robot known.json -o rig.json
     """
 
     runs: Positional[tuple[Path, ...]]  # Run folders with detected.markers and a calibration.

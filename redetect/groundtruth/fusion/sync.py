@@ -168,6 +168,9 @@ def _segment(
     turned = float(np.sum(np.abs(np.diff(means))))
     reach = bounds.largest_offset_s + bounds.largest_drift * float(np.ptp(segment.times_s))
     near = odometry.during(segment.times_s[0] - 2.0 * reach, segment.times_s[-1] + 2.0 * reach)
+    if len(segment) < _FEWEST_SAMPLES:
+        few = f"{len(segment)} poses of the ground truth: expected {_FEWEST_SAMPLES} or more"
+        return [_undetermined(segment, turned, few)]
     if np.count_nonzero(near) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
     own = _smoothed(odometry.only(near))

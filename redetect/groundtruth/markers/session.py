@@ -217,12 +217,17 @@ def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[Ma
     """
     times_path = run / f"{run.resolve().name}.times"
     times = read_times(times_path) if timed else {}
-    frames = []
+    frames, at = [], dict[float, str]()
     for number, frame in enumerate(read_frames(run / DETECTED_NAME)):
         prefix = frame.step.prefix
         if timed and prefix not in times:
             raise GroundTruthError(f"{times_path}: no time of image {prefix}")
         time_s = times[prefix] if timed else float(number)
+        if (other := at.setdefault(time_s, prefix)) != prefix:
+            raise GroundTruthError(
+                f"{times_path}: images {other} and {prefix} have one time, {time_s:.6f} s: expected "
+                "when each was taken, with all digits"
+            )
         frames.append(MarkerFrame(camera, prefix, time_s, frame.markers))
     if not frames:
         raise GroundTruthError(f"{run / DETECTED_NAME}: no STEP row: expected those of images")

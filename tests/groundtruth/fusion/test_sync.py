@@ -206,6 +206,16 @@ def test_nothing_is_found_where_nothing_jumped() -> None:
         assert found.status == "ok"
 
 
+def test_a_few_poses_are_no_segment() -> None:
+    """They overlap with odometry; there are not enough of them."""
+    odometry, truth = simulate(Clocks(), seed=1)
+    first = truth.times_s[0]
+    few = joined([truth.only(np.arange(10) + k) for k in (0, len(truth) // 2, len(truth) - 10)])
+    found = synchronise(odometry, few)
+    assert found[0].from_s == first
+    assert {one.note for one in found} == {"10 poses of the ground truth: expected 20 or more"}
+
+
 def test_streams_that_never_meet_are_refused() -> None:
     odometry, truth = simulate(Clocks(), seed=1)
     late = PlanarPoses(odometry.times_s + 5000.0, odometry.poses)
