@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from redetect import __version__
 from redetect.array_types import FloatArray
 from redetect.groundtruth.commands.outputs import check_outputs, provenance, remove_old, warn
-from redetect.groundtruth.errors import GroundTruthError
+from redetect.groundtruth.errors import GeometryError, GroundTruthError
 from redetect.groundtruth.files import write_json
 from redetect.groundtruth.fusion.clock import read_clock
 from redetect.groundtruth.lasers.building import find_building, read_building
@@ -26,10 +27,12 @@ from redetect.groundtruth.report.page import report_page
 from redetect.groundtruth.report.pictures import draw_errors, draw_scans
 from redetect.groundtruth.trajectories.streams import read_planar_poses, write_planar_poses
 from redetect.groundtruth.validation import onboard, reference_poses, scoring
+from redetect.plane import pose_differences
 from redetect.storage import write_bytes
 
 #: Files written to the folder.
 OUTPUTS = ("table.csv", "reference.csv", "errors.png", "scans.png", "validation.json")
+_BY_CHANCE = 1e-6  #: A mount is wrong if its error is less probable than this.
 
 
 def perform_validate(options: Validate) -> int:
@@ -120,12 +123,27 @@ def _scanners_on_board(
         row = {"from_deg": low, "to_deg": high, "readings": len(inside), "mean_m": mean}
         rows.append({**row, "sigma_m": scoring.sigma_of(inside)})
     content: dict[str, Any] = {"incidence": rows}
-    if (found := onboard.refine_mounts(references, segments)) is not None:
+    try:
+        found = onboard.refine_mounts(references, segments)
+    except GeometryError as error:
+        warn(str(error))
+        return content
+    if found is not None:
         sigma = np.sqrt(np.diagonal(found.covariance)).reshape(-1, 3)
         content["mounts"] = [
             {"name": s.name, "given": s.pose.tolist(), "refined": m.tolist(), "sigma": e.tolist()}
             for s, m, e in zip(found.scanners, found.poses, sigma)
         ]
+        for k, (scanner, mount) in enumerate(zip(found.scanners, found.poses)):
+            own = slice(3 * k, 3 * k + 3)
+            off = pose_differences(mount, scanner.pose)
+            spread = scanner.covariance + found.covariance[own, own]
+            if chdtrc(3, float(off @ np.linalg.solve(spread, off))) < _BY_CHANCE:
+                warn(
+                    f"scanner {scanner.name}: by the walls, it is mounted "
+                    f"{1e3 * math.hypot(off[0], off[1]):.0f} mm and {math.degrees(off[2]):.2f} "
+                    "degrees off what is stated"
+                )
         on_board = next(r.averaged.scanners for r in references if r.averaged is not None)
         for scanner in on_board:
             if scanner not in found.scanners:

@@ -225,8 +225,8 @@ def read_marker_frames(run: Path, camera: int, *, timed: bool = True) -> list[Ma
         time_s = times[prefix] if timed else float(number)
         if (other := at.setdefault(time_s, prefix)) != prefix:
             raise GroundTruthError(
-                f"{times_path}: images {other} and {prefix} have one time, {time_s:.6f} s: expected "
-                "when each was taken, with all digits"
+                f"{times_path}: images {other} and {prefix} have one time, {time_s:.6f} s: "
+                "expected when each was taken, with all digits"
             )
         frames.append(MarkerFrame(camera, prefix, time_s, frame.markers))
     if not frames:

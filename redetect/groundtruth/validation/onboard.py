@@ -51,9 +51,10 @@ _DISAGREEMENT_PROBABILITY = 1e-4
 OF_A_WALL_M = 0.2
 #: Ends of the bins of incidence (deg).
 INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
-# Gates of the rounds in which mounts are refined, and the least deviation of a point from a wall.
-_GATES_M = (0.2, 0.1, 0.05, 0.05, 0.05, 0.05)
-_LEAST_SIGMA_M = 1e-3
+# Gates of the rounds in which mounts are refined, the least deviation of a point from a wall, and
+# the largest root mean square of them: with a wrong mount, they are all over the last gate.
+_GATES_M = (*[0.4] * 10, *[0.2] * 6, 0.1, 0.1, *[0.05] * 4)
+_LEAST_SIGMA_M, _LARGEST_RMS_M = 1e-3, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +263,7 @@ def refine_mounts(
     Least squares over the mounts and all poses. Only the poses from distances, with their
     covariances, tie the mounts to the robot's frame; the measured mounts are not a prior.
     None if fewer than three poses have both distances and scans, or readings determine no mount.
+    Raises `GeometryError` if the readings do not fit the walls in the end.
     """
     # With wrong mounts, scans disagree with distances: those are used, too.
     accepted = [r for r in references if r.distances.status == DistanceStatus.OK]
@@ -312,6 +314,11 @@ def refine_mounts(
         step = -covariance @ gradient
         mounts = mounts + step.reshape(-1, 3)[:count]
         poses = poses + step.reshape(-1, 3)[count:]
+    if (rms_m := math.sqrt(squares / max(readings, 1))) > _LARGEST_RMS_M:
+        raise GeometryError(
+            f"mounts are not refined: readings on walls are {1e3 * rms_m:.0f} mm off (rms); are "
+            "the scanners mounted as stated, within some centimetres and degrees?"
+        )
     scanners = tuple(s for s, there in zip(every[0].scanners, seen) if there)
     own = np.flatnonzero(np.repeat(seen, 3))
     return RefinedMounts(scanners, mounts[seen], covariance[np.ix_(own, own)])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from redetect.groundtruth.errors import GeometryError
 from redetect.groundtruth.lasers.walls import first_walls
 from redetect.groundtruth.validation.onboard import (
     ReferencePose,
@@ -17,7 +18,7 @@ from redetect.groundtruth.validation.onboard import (
     refine_mounts,
 )
 from redetect.groundtruth.validation.reference_poses import poses_from_distances
-from redetect.plane import compose
+from redetect.plane import compose, pose_differences
 from tests.groundtruth.validation.test_validate_references import (
     ROOM,
     measured,
@@ -79,6 +80,22 @@ def test_mounts_come_back_with_their_covariance() -> None:
         total += float(error.ravel() @ np.linalg.solve(found.covariance, error.ravel()))
     low, high = chi2.ppf([0.001, 0.999], 36)
     assert low < total < high
+
+
+@pytest.mark.parametrize("shift", [(0.1, -0.05, 0.0), (0.02, 0.0, 0.087), (0.0, 0.0, -0.087)])
+def test_mounts_that_are_far_off_come_back(shift: tuple[float, float, float]) -> None:
+    """Both scanners 11 cm or five degrees off, with which their scans contradict the distances."""
+    found = refine_mounts(references(np.random.default_rng(6), np.array(shift), 8), ROOM)
+    assert found is not None
+    given = np.array([[0.3, 0.0, 0.0], [-0.4, 0.0, math.pi]])
+    off = pose_differences(found.poses, compose(np.broadcast_to(shift, given.shape), given))
+    assert np.abs(off[:, :2]).max() < 0.006
+    assert np.abs(off[:, 2]).max() < 0.01
+
+
+def test_mounts_that_do_not_fit_the_walls_are_refused() -> None:
+    with pytest.raises(GeometryError, match="mounts are not refined"):
+        refine_mounts(references(np.random.default_rng(6), np.array([0.6, 0.5, 0.7]), 8), ROOM)
 
 
 def test_a_scanner_without_readings_costs_no_other_its_mount() -> None:
