@@ -125,6 +125,29 @@ def test_without_known_landmarks_depths_are_too_long_by_the_usual_factor(
     assert abs(found.speed / found.depth - SPEED / DEPTH) < 0.03
 
 
+@pytest.mark.parametrize(
+    ("late_s", "times", "told"),
+    [
+        (2.0, 1.0, ("clocks of odometry and measurements differ", "rows contradict the others")),
+        (0.0, 1000.0, ("times as large as usual: are clocks, units and signs",)),
+        (0.0, 1.0, ()),
+    ],
+)
+def test_clocks_and_units_that_cannot_be_right_are_told(
+    late_s: float, times: float, told: tuple[str, ...], utias: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    shutil.copytree(utias, tmp_path, dirs_exist_ok=True)
+    seen = tmp_path / "Robot1_Measurement.dat"
+    rows = np.loadtxt(seen) * [1.0, 1.0, times, 1.0] + [late_s, 0.0, 0.0, 0.0]
+    np.savetxt(seen, rows, fmt=("%.3f", "%d", "%.3f", "%.3f"))
+    log = str(tmp_path / "Robot1_Odometry.dat")
+    assert main(["import", log, "-o", str(tmp_path / "again.circles")]) == 0
+    said = capsys.readouterr().err
+    assert said.count("warning: ") == len(told)
+    assert all(words in said for words in told)
+
+
 def test_a_robot_that_shows_nothing_of_its_response_has_the_usual_one(tmp_path: Path) -> None:
     for name, rows in (
         ("Robot1_Odometry", "4 0 0\n6 0 0\n"),

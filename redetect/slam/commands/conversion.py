@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -154,9 +155,12 @@ def _import_data_set(command: Import) -> None:
         note = f", {repeated} of them outside the true ones: the nearest" if repeated else ""
         _write_path(command, path, note)
     elif file.name.endswith(utias.ODOMETRY):
-        run, *found = utias.read_run(file, *sigmas, calibrated=command.calibrated)
-        notes = [some.sentence() for some in found if some is not None]
+        run, response, noise = utias.read_run(file, *sigmas, calibrated=command.calibrated)
+        notes = [some.sentence() for some in (response, noise) if some is not None]
         _write_run(command, run, "measurements", *notes)
+        doubts = response and response.doubt(), noise and noise.doubt(len(run.circles))
+        for doubt in filter(None, doubts):
+            print(f"warning: {doubt}", file=sys.stderr)
     elif file.name == victoria_park.DRIVE:
         _write_run(command, victoria_park.read_run(file, *sigmas), "measurements")
     else:

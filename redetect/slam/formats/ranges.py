@@ -28,6 +28,8 @@ from redetect.slam.recording import ASSUMED, UNKNOWN_ID, CircleRows, Recording
 _OUT_OF_VIEW_S = 2.5
 # Largest factor by which errors may differ from usual ones, and smallest.
 _MOST_FACTOR = 20.0
+# Larger shares of wrong rows are doubtful, and larger errors than this many times the usual ones.
+_MANY_WRONG, _VERY_LARGE = 0.1, 8.0
 # Fewest redundant numbers of a run that show its noise.
 _FEWEST_NUMBERS = 100
 # Maps in which the noise is learned: least squares of the rows that fit a robust map.
@@ -68,6 +70,16 @@ class Noise(NamedTuple):
             f"{self.range_correlation:.2f}, {self.bearing_correlation:.2f}; {self.outliers} rows "
             "are wrong"
         )
+
+    def doubt(self, rows: int) -> str | None:
+        """What may be wrong if many rows contradict the others, or errors are very large."""
+        if self.outliers > _MANY_WRONG * rows:
+            found = f"{self.outliers} of {rows} rows contradict the others"
+        elif max(self.ranges, self.bearings) > _VERY_LARGE:
+            found = f"errors are {max(self.ranges, self.bearings):.0f} times as large as usual"
+        else:
+            return None
+        return f"{found}: are clocks, units and signs those of the data set?"
 
 
 USUAL = Noise()

@@ -53,6 +53,7 @@ _SHORT_STOP_S = 0.1
 #: How a robot follows its commands: lags that are tried, and the longest time between two sightings
 #: of landmarks that show it, seconds.
 _LAGS_S, _NEXT_SIGHTING_S = np.arange(-0.5, 1.05, 0.1), 1.0
+_NEAR_S = 0.02  #: A lag this near an end may be beyond it.
 #: Step of the derivatives of residuals with respect to a response.
 _STEP = 1e-3
 #: Standard deviation of the lag: a robot of data set 6 starts after 0.32 s, stops after 0.17 s.
@@ -109,6 +110,12 @@ class Response(NamedTuple):
             f"times as fast, and to turn {self.turn:.3f} times; depths are taken to be "
             f"too long by a factor of {self.depth:.3f}"
         )
+
+    def doubt(self) -> str | None:
+        """What may be wrong if the response is at the end of what was searched."""
+        if not _LAGS_S[0] + _NEAR_S < self.lag_s < _LAGS_S[-1] - _NEAR_S:
+            return "the clocks of odometry and measurements differ by more than was searched"
+        return None
 
 
 #: How much responses vary.
