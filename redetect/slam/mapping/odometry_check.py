@@ -85,8 +85,8 @@ def check_odometry(mapped: MappedRun) -> OdometryCheck:
         equations = normal_equations(problem)
         with_lag = normal_equations(problem._replace(border=border))
         change = np.append(equations.step(0.0)[1], with_lag.step(0.0)[1][2])
-        variances = (np.diag(by_shared(each)[1]) for each in (equations, with_lag))
-        variance = np.append(next(variances), next(variances)[2])
+        of_both, of_lag = (by_shared(each)[1] for each in (equations, with_lag))
+        variance = np.append(np.diag(of_both), of_lag[2, 2])
     # Without redundancy, the systematic errors are not determined, and nothing else is checked.
     if mapped.table.expected <= 0 or np.any(variance < 0.0):
         odometry = rows = 0.0
