@@ -56,7 +56,7 @@ SENTENCES: list[tuple[str, str, list[float]]] = [
     ("docs/discs.md", r"the rim is traced in # directions", [DIRECTIONS]),
     ("docs/discs.md", r"at # directions times # pixels", [SPARSE_DIRECTIONS, len(SPARSE_RADII)]),
     ("docs/discs.md", r"the best # centres of either polarity", [_MOST_DOUBTFUL]),
-    ("docs/discs.md", r"at least #°. If fewer than # of them", [USUAL_TILT_DEG, LEAST_FRAMES]),
+    ("docs/discs.md", r"fewer than # of them .*? at least #°", [LEAST_FRAMES, USUAL_TILT_DEG]),
     ("docs/verticals.md", r"by voting within ±#°", [LINES.largest_tilt_deg]),
     ("docs/markers.md", r"takes #, #, #, # and #", list(MARKERS.thresholds)),
     ("docs/camera.md", r"leave it open by more than #", [_ASPECT_SIGMA]),

@@ -17,7 +17,7 @@ from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.plane import between, compose, log_motion
 
 # A step is impossible if it exceeds this movement (m, rad) plus that at several times the usual
-# rates, or at these (m/s, rad/s) if a robot mostly stands.
+# rates, or at these (m/s, rad/s) if it is mostly at rest.
 _LEAST, _TIMES, _LEAST_RATES = 0.2, 5.0, (0.3, 0.5)
 _FEWEST = 10
 

@@ -52,7 +52,7 @@ OF_A_WALL_M = 0.2
 #: Ends of the bins of incidence (deg).
 INCIDENCES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0)
 # Gates of the rounds in which mounts are refined, the least deviation of a point from a wall, and
-# the largest root mean square of them: with a wrong mount, they are all over the last gate.
+# the largest root mean square of them: with a wrong mount, they fill the last gate.
 _GATES_M = (*[0.4] * 10, *[0.2] * 6, 0.1, 0.1, *[0.05] * 4)
 _LEAST_SIGMA_M, _LARGEST_RMS_M = 1e-3, 0.01
 
