@@ -109,6 +109,11 @@ def _localized(command: Localize, recording: Recording) -> _Result:
         if landmark_map.joint_covariance is None:
             name = map_file.covariance_file(command.map).name
             said.append(f"errors of the map are assumed independent: no {name}")
+    else:
+        said.append(
+            "poses and covariances are relative to the map, as if it was exact: with identifiers, "
+            "--association known includes its errors"
+        )
     run = localize_by_flags(command, recording, landmark_map)
     if (found := run.located) is not None:
         x, y, heading = found.pose
