@@ -27,6 +27,7 @@ from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, ClockSta
 from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, best_split
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
+from redetect.groundtruth.fusion.resets import continuous_odometry
 from redetect.groundtruth.settings import FuseSettings, SyncSettings
 from redetect.groundtruth.trajectories.streams import (
     PlanarPoses,
@@ -95,7 +96,8 @@ def synchronise(
     GroundTruthError
         If a stream has fewer than 20 poses, or they do not overlap.
     """
-    odometry, groundtruth = last_of_each_time(odometry), last_of_each_time(groundtruth)
+    odometry = continuous_odometry(last_of_each_time(odometry)).poses
+    groundtruth = last_of_each_time(groundtruth)
     for name, poses in (("odometry", odometry), ("ground truth", groundtruth)):
         if len(poses) < _FEWEST_SAMPLES:
             raise GroundTruthError(

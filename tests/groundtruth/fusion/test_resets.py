@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from redetect.array_types import FloatArray
 from redetect.groundtruth.fusion.fuse import fuse
 from redetect.groundtruth.fusion.resets import continuous_odometry
+from redetect.groundtruth.fusion.sync import synchronise
 from redetect.groundtruth.settings import FuseSettings
 from redetect.groundtruth.trajectories.streams import PlanarPoses
 from redetect.plane import between, compose
@@ -56,6 +57,19 @@ def test_a_restart_in_a_gap_is_no_movement(start: tuple[float, float, float]) ->
     off = errors_m(fusion.poses, truth).max()
     assert off < errors_m(expected.poses, truth).max() + 0.02
     assert np.mean(normalised_error(fusion.poses, truth)) / 3.0 < 1.6
+
+
+@pytest.mark.parametrize("at_s", [15.0, 45.0])
+def test_clocks_do_not_depend_on_a_restart(at_s: float) -> None:
+    """Neither while the robot is measured, nor in a gap."""
+    _, own, laser = with_gap(35)
+    own = PlanarPoses(own.times_s + 0.2, own.poses)
+    odometry = restarted(own, at_s, np.zeros(3))
+    found, expected = (synchronise(each, laser) for each in (odometry, own))
+    assert [one.status for one in found] == [one.status for one in expected] == ["ok", "ok"]
+    for one, other in zip(found, expected):
+        assert one.offset_s == pytest.approx(0.2, abs=0.02)
+        assert one.offset_s == pytest.approx(other.offset_s, abs=5e-3)
 
 
 @pytest.mark.parametrize("from_s", [10.0, 40.0])
