@@ -74,8 +74,13 @@ def dense(
     recording: Recording,
     some: LandmarkMap,
     joint: FloatArray | None = None,
+    *,
+    exact: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses and covariances by full matrices of pose and map, the map's gain set to zero."""
+    """Poses and covariances by full matrices of pose and map, the map's gain set to zero.
+
+    With the gains of an exact map, the covariances are still those of a map with errors.
+    """
     places = np.concatenate([some.discs.xy, some.lines.xy])
     size = 3 + 2 * len(places)
     pose, P = np.zeros(3), np.zeros((size, size))
@@ -85,6 +90,8 @@ def dense(
     P += blocks
     if joint is not None:
         P[3:, 3:] = joint
+    # The covariance from which the gain is calculated.
+    Q = np.zeros((size, size)) if exact else P
     predicted = pose
     poses, covariances = [pose], [P[:3, :3]]
     for k, rows in enumerate(frames_of(recording)):
@@ -92,11 +99,12 @@ def dense(
         pose = move(pose, recording.steps[k])
         F = np.eye(size)
         F[:3, :3] = by_pose
-        if np.any(P[3:, 3:]):
+        if np.any(Q[3:, 3:]):
             F[0, 2], F[1, 2] = predicted[1] - pose[1], pose[0] - predicted[0]
             predicted = pose
-        P = F @ P @ F.T
-        P[:3, :3] += by_step @ recording.step_covariance[k] @ by_step.T
+        added = np.zeros((size, size))
+        added[:3, :3] = by_step @ recording.step_covariance[k] @ by_step.T
+        P, Q = (F @ C @ F.T + added for C in (P, Q))
         H, v, R = [], [], []
         for j, number in enumerate(rows.circles.ids.tolist()):
             i = number - 10
@@ -123,11 +131,11 @@ def dense(
         for block in R:
             noise[at : at + len(block), at : at + len(block)] = block
             at += len(block)
-        gain = P @ stacked.T @ np.linalg.inv(stacked @ P @ stacked.T + noise)
+        gain = Q @ stacked.T @ np.linalg.inv(stacked @ Q @ stacked.T + noise)
         gain[3:] = 0.0
         pose = pose + gain[:3] @ np.concatenate(v)
         keep = np.eye(size) - gain @ stacked
-        P = keep @ P @ keep.T + gain @ noise @ gain.T
+        P, Q = (keep @ C @ keep.T + gain @ noise @ gain.T for C in (P, Q))
         poses.append(pose)
         covariances.append(P[:3, :3])
     return np.array(poses), np.array(covariances)
@@ -137,7 +145,7 @@ def dense(
 def test_the_localizer_is_the_plain_dense_filter(exact: bool) -> None:
     recording, some, _ = drive(1)
     run = run_filter(recording, Localizer(some, camera_xy=CAMERA_XY, exact=exact))
-    poses, covariances = dense(recording, some, np.zeros((40, 40)) if exact else None)
+    poses, covariances = dense(recording, some, exact=exact)
     np.testing.assert_allclose(run.path.poses, poses, rtol=0, atol=1e-10)
     assert run.path.covariance is not None
     np.testing.assert_allclose(run.path.covariance, covariances, rtol=0, atol=1e-12)

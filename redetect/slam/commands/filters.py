@@ -104,16 +104,10 @@ def perform(command: Localize | Ekf) -> int:
 def _localized(command: Localize, recording: Recording) -> _Result:
     landmark_map = map_file.read_map(command.map)
     said: list[str] = []
-    if command.association == "known":
-        landmark_map = map_file.with_joint_covariance(landmark_map, command.map)
-        if landmark_map.joint_covariance is None:
-            name = map_file.covariance_file(command.map).name
-            said.append(f"errors of the map are assumed independent: no {name}")
-    else:
-        said.append(
-            "poses and covariances are relative to the map, as if it was exact: with identifiers, "
-            "--association known includes its errors"
-        )
+    landmark_map = map_file.with_joint_covariance(landmark_map, command.map)
+    if landmark_map.joint_covariance is None:
+        name = map_file.covariance_file(command.map).name
+        said.append(f"errors of the map are assumed independent: no {name}")
     run = localize_by_flags(command, recording, landmark_map)
     if (found := run.located) is not None:
         x, y, heading = found.pose

@@ -5,6 +5,16 @@ were added to that of each measurement, the filter would wrongly average them ou
 *considers* them instead: it propagates the correlation of the pose with each landmark's error
 without estimating the landmarks again (Schmidt-Kalman filter).
 
+A filter that considers the map's errors is slow to converge to the map after a stretch of wrong
+odometry. That does little harm if rows have identifiers, but loses track if landmarks have to be
+found. Then the gains are those of an exact map, and the covariance is that of a filter with such
+gains: with S the derivatives of the pose's error by the errors of the landmarks, F and H those of a
+step and of the measurements, K the gain, and C the covariance of the map, S C S^T is added, where
+
+    S <- F S    at a step, and    S <- (I - K H_pose) S - K H_map    at a measurement
+
+(covariance analysis: P. S. Maybeck, Stochastic Models, Estimation and Control 1, 1979, chapter 6).
+
 Landmarks of a map made by driving share most of their error with their neighbours. The joint
 covariance describes this (`LandmarkMap.joint_covariance`); without it landmarks are
 assumed to be independent of each other.
@@ -18,13 +28,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
+from redetect.array_types import FloatArray
 from redetect.landmarks.map_file import LandmarkMap
 from redetect.slam.association.registration import localise_globally
 from redetect.slam.errors import SlamError
 from redetect.slam.filters.base import POSE_SIZE, Filter, FrameRows
 from redetect.slam.filters.run import BY_IDENTIFIERS, Associator, FilterRun, run_filter
+from redetect.slam.models import move_jacobians
 from redetect.slam.options import Localize
 from redetect.slam.recording import NO_CAMERA, Recording, camera_xy_of
+
+# Least effect of a landmark's error on the pose, m or rad per metre.
+_NEGLIGIBLE = 1e-6
 
 
 class Localizer(Filter):
@@ -37,7 +52,7 @@ class Localizer(Filter):
     start, start_covariance, camera_xy, common_tilt_variance : array_like
         As in `Filter`; the pose is in the map.
     exact : bool
-        Assume that the map is exact, whatever its covariances.
+        Use the gains of a map without errors; the covariance of the pose includes these.
     """
 
     def __init__(
@@ -60,13 +75,36 @@ class Localizer(Filter):
         self._grow(len(places))
         self.size = len(self._state)
         self._state[first:] = self._linearised[first:] = places
+        joint = landmark_map.joint_covariance
+        if joint is None:
+            joint = block_diag(*discs.covariance, *lines.covariance)[: len(places), : len(places)]
+        #: Derivatives of the pose's error by the errors of the map, if the gains ignore these.
+        self._by_map: FloatArray | None = None
+        self._map_covariance, self._first = joint, first
         if exact:  # such a map has a known orientation: Jacobians are those at the latest pose
             self._linearised = self._state
+            if np.any(joint):
+                self._by_map = np.zeros((POSE_SIZE, len(places)))
         elif len(places):
-            joint = landmark_map.joint_covariance
-            if joint is None:
-                joint = block_diag(*discs.covariance, *lines.covariance)
             self._covariance[first:, first:] = joint
+
+    @property
+    def pose_covariance(self) -> FloatArray:
+        """(3, 3), including the effect of the map's errors."""
+        own = super().pose_covariance
+        if self._by_map is None:
+            return own
+        # Landmarks that were not seen for long have no effect any more.
+        seen = np.flatnonzero(np.any(np.abs(self._by_map) > _NEGLIGIBLE, axis=0))
+        by_seen = self._by_map[:, seen]
+        return own + by_seen @ self._map_covariance[np.ix_(seen, seen)] @ by_seen.T
+
+    def predict(self, step: FloatArray, noise: FloatArray) -> FloatArray:
+        """As of `Filter`."""
+        if self._by_map is not None:
+            by_pose, _ = move_jacobians(self._state[:POSE_SIZE], step)
+            self._by_map = by_pose @ self._by_map
+        return super().predict(step, noise)
 
     def measure(self, rows: FrameRows) -> None:
         """Update with the rows of a frame whose landmarks are in the map; others are ignored."""
@@ -75,12 +113,20 @@ class Localizer(Filter):
         self.count.leave_out("line not in the map", len(others.lines))
         if not len(known.circles) and not len(known.lines):
             return
+        innovation = self.innovation_of(known)
         factor, last = self._whitened(known)
         self.count.use(known, last)
         # The pose alone is corrected.
         self._state[:POSE_SIZE] += factor[:POSE_SIZE] @ last
         corrected = self._covariance[:POSE_SIZE] - factor[:POSE_SIZE] @ factor.T
         self._covariance[:POSE_SIZE], self._covariance[:, :POSE_SIZE] = corrected, corrected.T
+        if self._by_map is not None:
+            _, jacobian, index, noise = innovation
+            gain = np.linalg.solve(noise, jacobian @ self._covariance[index, :POSE_SIZE]).T
+            self._by_map -= gain @ jacobian[:, :POSE_SIZE] @ self._by_map
+            of_map = index >= self._first
+            by_rows = gain @ jacobian[:, of_map]
+            np.subtract.at(self._by_map.T, index[of_map] - self._first, by_rows.T)
 
 
 def localize_run(
@@ -115,8 +161,6 @@ def localize_run(
         covariance,
         camera_xy,
         common_tilt_variance=recording.common_tilt_variance,
-        # Considering the map's errors makes the filter slow to converge to it, which does little
-        # harm with known pairs, but loses track if pairs have to be found.
         exact=pairing.method != "known",
     )
     run = run_filter(recording, localizer, pairing)

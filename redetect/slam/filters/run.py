@@ -24,7 +24,7 @@ from redetect.slam.association.compatibility import (
 )
 from redetect.slam.association.registration import GlobalPose
 from redetect.slam.errors import SlamError
-from redetect.slam.filters.base import Filter, FrameRows, RowCount
+from redetect.slam.filters.base import POSE_SIZE, Filter, FrameRows, RowCount
 from redetect.slam.recording import UNKNOWN_ID, CircleRows, LineRows, Recording
 from redetect.slam.settings import DEFAULT_GATE_PROBABILITY, Association
 
@@ -172,7 +172,7 @@ def after_slip(
 def _near_discs(seen_xy: FloatArray, estimate: Filter) -> IntArray:
     """The discs near any of the rows."""
     names, slots = np.array([*estimate.disc_slots.items()], dtype=np.int64).reshape(-1, 2).T
-    state, spread = estimate.state, estimate.pose_covariance
+    state, spread = estimate.state, estimate.block(np.arange(POSE_SIZE))
     away = np.linalg.norm(state[slots[:, None, None] + _XY] - apply(state[:3], seen_xy), axis=2)
     reach = np.sqrt(spread[0, 0] + spread[1, 1]) + np.sqrt(spread[2, 2]) * np.hypot(*seen_xy.T)
     return names[np.any(away < _NEAR_M + _NEAR_SIGMAS * reach, axis=1)]
