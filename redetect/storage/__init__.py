@@ -4,6 +4,7 @@ All packages write their files with `write_whole`, or `write_bytes` if the conte
 """
 
 from redetect.storage.parts import OutputExistsError as OutputExistsError
+from redetect.storage.parts import demand_distinct as demand_distinct
 from redetect.storage.parts import demand_free as demand_free
 from redetect.storage.parts import demand_place as demand_place
 from redetect.storage.parts import demand_writable as demand_writable

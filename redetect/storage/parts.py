@@ -60,18 +60,23 @@ def demand_writable(path: Path) -> None:
 
 def demand_free(paths: Iterable[Path], *, overwrite: bool) -> None:
     """Reject outputs that could not be written later; folders may be created later."""
-    taken = set[Path]()
     for path in paths:
-        if path.resolve() in taken:
-            reason = (
-                "two of the outputs would be written there: expected different names or endings"
-            )
-            raise OSError(errno.EINVAL, reason, str(path))
-        taken.add(path.resolve())
         if path.parent.is_dir():
             demand_place(path, overwrite=overwrite)
         else:
             demand_writable(path)
+
+
+def demand_distinct(paths: Iterable[Path]) -> None:
+    """Reject outputs of which two are the same file."""
+    taken = set[Path]()
+    for path in paths:
+        if path.resolve() in taken:
+            raise OSError(
+                f"{path}: two of the outputs would be written there: expected different names or "
+                "endings"
+            )
+        taken.add(path.resolve())
 
 
 class PartFile(AbstractContextManager["PartFile"]):

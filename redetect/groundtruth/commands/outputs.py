@@ -13,14 +13,16 @@ from rich.console import Console
 from rich.progress import track
 
 from redetect import __version__
-from redetect.storage import demand_free
+from redetect.storage import demand_distinct, demand_free
 
 T = TypeVar("T")
 
 
 def check_outputs(paths: Sequence[Path | None], force: bool) -> None:
     """Raise an error if an output exists and must not be replaced, or two are the same file."""
-    demand_free([path for path in paths if path is not None], overwrite=force)
+    given = [path for path in paths if path is not None]
+    demand_distinct(given)
+    demand_free(given, overwrite=force)
 
 
 def remove_old(paths: Sequence[Path | None], force: bool) -> None:

@@ -30,7 +30,7 @@ from redetect.slam.recording import (
     joined,
     landmark_files,
 )
-from redetect.storage import demand_free
+from redetect.storage import demand_distinct, demand_free
 
 #: Share of steps with slips beyond which odometry is doubted; of run e less than one in a hundred.
 _MANY_SLIPS = 0.1
@@ -47,6 +47,7 @@ def perform(options: Associate) -> int:
     if len(set(targets)) < len(targets):
         raise SlamError(f"{targets[0]} for several runs: expected each in its folder, or -o")
     report = (options.output or targets[0]).with_suffix(".json")
+    demand_distinct([*targets, report])
     demand_free([*targets, report], overwrite=options.force)
     runs = files.recordings_of(options)
     recording = joined(runs)

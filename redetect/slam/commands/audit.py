@@ -17,7 +17,7 @@ from redetect.slam.mapping.audit import Audit, audit_run, audited_rows
 from redetect.slam.options import Audit as Options
 from redetect.slam.pictures import Crop, draw_crops, picture_of_frame
 from redetect.slam.recording import Recording, camera_of_run, landmark_files
-from redetect.storage import demand_free, write_bytes
+from redetect.storage import demand_distinct, demand_free, write_bytes
 
 _COLUMNS = (
     *("frame", "prefix", "line", "id", "kind", "new_id", "x_m", "y_m"),
@@ -30,6 +30,7 @@ def perform(options: Options) -> int:
     (source,) = landmark_files(options.run, stem=options.stem)
     target = options.output or source.with_name("audited.circles")
     listed = target.with_suffix(".csv")
+    demand_distinct((target, listed))
     demand_free((target, listed), overwrite=options.force)
     recording = recording_of(options)
     camera = None
