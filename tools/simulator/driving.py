@@ -41,9 +41,7 @@ _REVERSAL_RAD = np.radians(150.0)
 class DriveStyle:
     """How the robot drives."""
 
-    step_m: float = (
-        0.172  # Mean distance between frames when driving straight (m); shorter in turns.
-    )
+    step_m: float = 0.172  # Mean distance between frames on straight stretches (m).
     step_spread: float = 0.08  # Slow change of the speed, as a share (standard deviation).
     weave_m: float = 0.12  # Slow sideways deviation from the route (m, standard deviation).
     corner_m: float = 0.8  # Radius of rounded corners (m).
