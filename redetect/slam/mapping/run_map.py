@@ -40,9 +40,9 @@ from redetect.slam.settings import MOST_FACTOR, Solver
 
 # Parts of a run are connected if they share this many landmarks; one leaves a rotation free.
 _FEWEST_SHARED = 2
-# Identifiers of parts do not agree if landmarks of the same ones are farther apart than this share
-# of their distance from their centre (medians).
-_MOST_OFF = 0.2
+# Identifiers of parts do not agree if this many landmarks of the same ones, or more, are farther
+# apart than this share of their distance from their centre (medians).
+_FEWEST_COMPARED, _MOST_OFF = 5, 0.2
 # Tolerance before the final optimisation.
 _COARSE = 1e-3
 # Multiples of the scale of a non-convex loss, from nearly least squares down.
@@ -343,7 +343,7 @@ def _parts_registered(recording: Recording, graph: Graph, begin: Estimate, name:
             motion = fitted(there, target)
             off = np.hypot(*(apply(motion, there) - target).T)
             apart = np.hypot(*(target - target.mean(axis=0)).T)
-            if np.median(off) > _MOST_OFF * np.median(apart):
+            if len(off) >= _FEWEST_COMPARED and np.median(off) > _MOST_OFF * np.median(apart):
                 begins = next(p for p in recording.prefixes[lost[k - 1] :] if p != "start")
                 raise SlamError(
                     f"{name}: the part from {begins} on has other landmarks with the same "
