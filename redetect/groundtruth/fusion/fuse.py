@@ -227,10 +227,10 @@ class Fusion:
     localisation: LocalisationErrors | None  # Errors of odometry treated as a localisation
     repaired: dict[str, int]  # Number of covariances that were not positive definite, by stream
     # Short-term scatter of the poses over their stated standard deviations, by stream; 1 if these
-    # may be right. Smaller ones were raised, larger ones lowered to learn odometry's noise.
+    # may be right. They were raised to it; to learn odometry's noise, too large ones were lowered.
     jitter: dict[str, float]
     # Intervals in which odometry contradicts the measured poses for good, as after a slip of its
-    # wheels or a reset, and its pauses: the covariances do not rely on it there.
+    # wheels, and its pauses: the covariances do not rely on it there.
     slips_s: tuple[tuple[float, float], ...]
     pauses_s: tuple[tuple[float, float], ...]
     # Times before and after steps of odometry that no robot can make: they are left out.

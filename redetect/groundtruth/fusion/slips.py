@@ -1,4 +1,4 @@
-"""Slips of odometry while the robot is measured: wheels that spin, a push, poses that were reset.
+"""Slips of odometry while the robot is measured: wheels that spin, a push, small resets.
 
 After a slip the measured poses contradict odometry for good, although they agree with each other.
 Without more, a filter rejects them until it gives up. So odometry's variances are increased where

@@ -102,9 +102,8 @@ def perform(command: Localize | Ekf) -> int:
 
 
 def _localized(command: Localize, recording: Recording) -> _Result:
-    landmark_map = map_file.read_map(command.map)
     said: list[str] = []
-    landmark_map = map_file.with_joint_covariance(landmark_map, command.map)
+    landmark_map = map_file.with_joint_covariance(map_file.read_map(command.map), command.map)
     if landmark_map.joint_covariance is None:
         name = map_file.covariance_file(command.map).name
         said.append(f"errors of the map are assumed independent: no {name}")

@@ -257,16 +257,16 @@ class Filter(ABC):
         return rows.only(of_discs & discs, of_lines & lines), others
 
     def _whitened(
-        self, rows: FrameRows, before: FloatArray | None = None
+        self, innovation: Innovation, before: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Cross-covariance of state and innovation (n, m), and the innovation (m,), both whitened.
 
         That is, divided by a root of the innovation's covariance; `SlamError` if there is none.
         `before` is the state of the innovation, if linearised at the current one.
         """
-        error, jacobian, index, noise = self.innovation_of(rows)
+        error, jacobian, index, noise = innovation
         if before is not None:
-            error += jacobian @ (self._state - before)[index]
+            error = error + jacobian @ (self._state - before)[index]
         projected = self._covariance[:, index] @ jacobian.T
         try:
             root = np.linalg.cholesky(jacobian @ projected[index] + noise)

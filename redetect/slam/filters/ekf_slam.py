@@ -161,7 +161,7 @@ class EkfSlam(base.Filter):
         before, tilt = self._state.copy(), self._covariance[self._tilt, self._tilt].copy()
         inverse = base.indices_from([*self.line_slots.values()], self.line_size)[:, 3]
         for _ in range(_MOST_ITERATIONS if len(rows.lines) else 1):
-            factor, last = self._whitened(rows, before)
+            factor, last = self._whitened(self.innovation_of(rows), before)
             change = before + factor @ last - self._state
             change[self._tilt] = 0.0
             nearer = np.abs(change[inverse])

@@ -114,7 +114,7 @@ class Localizer(Filter):
         if not len(known.circles) and not len(known.lines):
             return
         innovation = self.innovation_of(known)
-        factor, last = self._whitened(known)
+        factor, last = self._whitened(innovation)
         self.count.use(known, last)
         # The pose alone is corrected.
         self._state[:POSE_SIZE] += factor[:POSE_SIZE] @ last

@@ -35,9 +35,7 @@ def stalled(own: PlanarPoses, from_s: float, to_s: float) -> PlanarPoses:
     return PlanarPoses(own.times_s, poses)
 
 
-def with_gap(
-    seed: int,
-) -> tuple[PlanarPoses, PlanarPoses, PlanarPoses]:
+def with_gap(seed: int) -> tuple[PlanarPoses, PlanarPoses, PlanarPoses]:
     """A true path, odometry, and poses measured except from 30 s to 60 s."""
     rng = np.random.default_rng(seed)
     truth, own = drive(rng, 90.0, WHEELS)
