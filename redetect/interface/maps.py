@@ -243,15 +243,10 @@ def localize(
     in_memory = isinstance(landmarks, RunMap)
     in_file = path_of("the map" if in_memory else landmarks, "a RunMap, or its map.csv", SlamError)
     command = Localize(map=in_file, **_flags(run, circles, lines, options, LocalizeOptions))
-    # Otherwise the map is assumed to be exact.
-    known = command.association == "known"
     if isinstance(landmarks, RunMap):
-        mapped = landmarks.result
-        places = mapped.landmarks_to_write() if known else mapped.landmarks
+        places = landmarks.result.landmarks_to_write()
     else:
-        places = map_file.read_map(in_file)
-        if known:
-            places = map_file.with_joint_covariance(places, in_file)
+        places = map_file.with_joint_covariance(map_file.read_map(in_file), in_file)
     result = localize_by_flags(command, joined(read_runs(command)), places)
     return Localization(result.path, result, places)
 
